@@ -1,0 +1,45 @@
+PYTHON ?= python3
+BIN := .venv/bin
+CORE := .venv/.installed-core
+DEV := .venv/.installed-dev
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+RUN := runs/foam_cylinder
+
+.PHONY: help solve test check bench clean
+
+help: ## list these targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' Makefile
+
+solve: $(CORE) ## identify the foam cylinder's parameters
+	@$(BIN)/collocation-sysid solve problems/foam_cylinder/problem.toml --out $(RUN)
+	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
+
+test: $(DEV) ## run the tests
+	@$(BIN)/python -m pytest
+
+check: $(DEV) ## lint, formatting and types
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: $(CORE) ## time the constraint Jacobian
+	@$(BIN)/python scripts/benchmark_jacobian.py
+
+clean: ## remove the environment and caches; runs stay
+	@rm -rf .venv build dist .pytest_cache .ruff_cache
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/pip:
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("Python 3.11 or newer is needed, $(PYTHON) is " + sys.version.split()[0] + ": make PYTHON=python3.12 ...")'
+	@echo "Creating .venv"
+	@$(PYTHON) -m venv --clear .venv
+
+$(CORE): pyproject.toml | $(BIN)/pip
+	@echo "Installing collocation-sysid into .venv"
+	@$(PIP) -e .
+	@touch $@
+
+$(DEV): pyproject.toml | $(BIN)/pip
+	@echo "Installing collocation-sysid with the test and development tools into .venv"
+	@$(PIP) -e '.[test,dev]'
+	@touch $(CORE) $@

@@ -1,0 +1,51 @@
+"""The two ways in which a run is refused: bad input, and a simulation that cannot go on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used; the message says what, where and what was expected.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, and the remedy.
+    source : str or Path, optional
+        The file it was found in.
+    where : str, optional
+        The key, line or column in that file.
+    """
+
+    def __init__(
+        self, message: str, source: str | Path | None = None, where: str | None = None
+    ) -> None:
+        self.message = message
+        self.source = source
+        self.where = where
+        super().__init__(": ".join(str(part) for part in (source, where, message) if part))
+
+    def located(self, source: str | Path | None = None, where: str | None = None) -> InputError:
+        """Return the same error with file and key filled in where they were missing."""
+        return InputError(self.message, self.source or source, self.where or where)
+
+
+class SimulationError(RuntimeError):
+    """The equations of motion could not be solved.
+
+    Parameters
+    ----------
+    message : str
+        What failed and what to change.
+    time_s : float
+        Time of the step that failed.
+    element : int or None
+        The element that is worst deformed there, where one is to blame.
+    """
+
+    def __init__(self, message: str, time_s: float, element: int | None = None) -> None:
+        self.time_s = time_s
+        self.element = element
+        at = f"t = {time_s:.6g} s" + (f", element {element}" if element is not None else "")
+        super().__init__(f"{message} ({at})")

@@ -1,0 +1,61 @@
+"""Array fields of the immutable classes: copied, checked against a shape, and made read-only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def read_only_floats(
+    values: ArrayLike, shape: tuple[int | None, ...], name: str, finite: bool = True
+) -> FloatArray:
+    """Return a read-only copy of `values`, whose shape must match `shape` (None: any length).
+
+    Raises
+    ------
+    InputError
+        If the values are not numbers, their shape differs, or one that must be finite is not.
+    """
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must hold numbers: {error}") from error
+    _require_shape(array.shape, shape, name)
+    if finite and not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(f"{name}{list(index)} is {array[index]}; it must be a finite number")
+    array.setflags(write=False)
+    return array
+
+
+def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> IntArray:
+    """Return a read-only int64 copy of node numbers, whose shape must match `shape`.
+
+    Raises
+    ------
+    InputError
+        If the values are not whole numbers from 0 upwards, or their shape differs.
+    """
+    given = np.asarray(values)
+    if given.size and not np.issubdtype(given.dtype, np.integer):
+        raise InputError(f"{name} must hold node numbers (integers), not {given.dtype}")
+    _require_shape(given.shape, shape, name)
+    nodes = given.astype(np.int64)
+    if nodes.size and nodes.min() < 0:
+        raise InputError(f"{name} must hold node numbers from 0 upwards, not {nodes.min()}")
+    nodes.setflags(write=False)
+    return nodes
+
+
+def _require_shape(found: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:
+    matches = len(found) == len(expected) and all(
+        want is None or have == want for have, want in zip(found, expected, strict=True)
+    )
+    if not matches:
+        wanted = ", ".join("any" if want is None else str(want) for want in expected)
+        raise InputError(f"{name} has the shape {found}; expected ({wanted})")

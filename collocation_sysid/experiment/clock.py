@@ -1,0 +1,78 @@
+"""Sample times: whether they are evenly spaced, and how far printing has rounded them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from .arrays import FloatArray
+
+STEP_TOLERANCE = 0.01
+# Rounding of printed times is forgiven up to this part of a step, so that no lost frame passes.
+_ROUNDING_LIMIT = 0.3
+_PRINTED_DECIMALS = range(10)
+
+
+def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = None) -> float:
+    """Return the time between samples, which must be the same throughout.
+
+    Steps may differ by 1 %, and by what rounding to the decimals in the file explains.
+
+    Parameters
+    ----------
+    t_s : (T,) array
+        At least two sample times.
+    what : str
+        What was sampled, for messages.
+    source : str or Path, optional
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two samples, or the spacing jumps; the row is named, from 1.
+    """
+    times = np.asarray(t_s, dtype=np.float64)
+    if times.ndim != 1 or len(times) < 2:
+        raise InputError(f"{what}: a sample interval needs at least two samples", source)
+    steps = np.diff(times)
+    mean_s = float(times[-1] - times[0]) / len(steps)
+    if not steps.min() > 0.0:
+        row = int(np.argmax(~(steps > 0.0))) + 1
+        raise InputError(f"{what}: time does not increase", source, f"row {row + 1}")
+    uneven = np.abs(steps - mean_s) > STEP_TOLERANCE * mean_s + rounding_s(times)
+    if uneven.any():
+        # A lost frame also shifts the mean, and with it every other step: name the worst.
+        typical_s = float(np.median(steps))
+        row = int(np.argmax(np.abs(steps - typical_s)))
+        raise InputError(
+            f"{what}: the time jumps by {steps[row]:.6g} s from t_s = {times[row]:.9g} to "
+            f"{times[row + 1]:.9g}, where other steps are {typical_s:.6g} s; samples must be "
+            "evenly spaced: fill lost frames with blank rows, or set resample_hz",
+            source,
+            f"row {row + 2}",
+        )
+    return mean_s
+
+
+def even_times_s(t_s: FloatArray) -> FloatArray:
+    """Return as many exactly even times between the same first and last time."""
+    return np.linspace(t_s[0], t_s[-1], len(t_s))
+
+
+def rounding_s(t_s: FloatArray) -> float:
+    """Return the unit of the last decimal if rounding to it made even times uneven, else 0.
+
+    Times of 30 Hz printed as 0.033, 0.067, 0.1 give 0.001; times 0.01, 0.02, 0.03 are even as
+    they stand and give 0.
+    """
+    mean_s = float(t_s[-1] - t_s[0]) / max(len(t_s) - 1, 1)
+    if np.abs(t_s - even_times_s(t_s)).max() <= 1e-6 * mean_s:
+        return 0.0
+    for decimals in _PRINTED_DECIMALS:
+        if np.allclose(t_s, np.round(t_s, decimals), rtol=1e-13, atol=1e-13):
+            return min(10.0**-decimals, _ROUNDING_LIMIT * mean_s)
+    return 0.0

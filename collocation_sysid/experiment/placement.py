@@ -1,0 +1,223 @@
+"""Where markers sit on the body: fixed weights on the nodes of one element each.
+
+A marker outside the body belongs to the tetrahedron nearest to it, whose shape functions are
+extrapolated to the marker; the distance bridged is reported and limited.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from .arrays import FloatArray, IntArray, read_only_floats, read_only_nodes
+
+if TYPE_CHECKING:
+    from ..fem.body import Body
+
+Attachment = Literal["auto", "vertex", "embedded"]
+
+# "auto" takes a mesh vertex for the marker when it is this near, in mean edge lengths.
+VERTEX_SNAP = 0.05
+_INSIDE_TOLERANCE = 1e-9
+_EMBEDDING_ITERATIONS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Markers as fixed linear combinations of node positions.
+
+    Parameters
+    ----------
+    nodes : (M, npe) int array
+        Nodes each marker depends on; no repeats within a row.
+    weights : (M, npe) array
+        Their weights; each row sums to one.
+    distance_m : (M,) array
+        Distance bridged: from the marker to the surface if it was outside the body, to the node
+        if it was attached to a vertex, otherwise 0.
+    node_count : int
+        Number of nodes of the body.
+    """
+
+    nodes: IntArray
+    weights: FloatArray
+    distance_m: FloatArray
+    node_count: int
+
+    def __post_init__(self) -> None:
+        nodes = read_only_nodes(self.nodes, (None, None), "nodes of the placement")
+        if nodes.size and nodes.max() >= self.node_count:
+            raise InputError(
+                f"the placement refers to node {nodes.max()}, but the body has {self.node_count}"
+            )
+        weights = read_only_floats(self.weights, nodes.shape, "weights of the placement")
+        distance = read_only_floats(self.distance_m, (len(nodes),), "distance_m of the placement")
+        object.__setattr__(self, "nodes", nodes)
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "distance_m", distance)
+
+
+def place_markers(
+    points_m: ArrayLike,
+    node_positions_m: ArrayLike,
+    body: Body,
+    attach: Attachment = "auto",
+    max_distance_m: float | None = None,
+    names: Sequence[str] | None = None,
+) -> Placement:
+    """Find each marker's place on the body.
+
+    Parameters
+    ----------
+    points_m : (M, 3) array
+        Marker positions.
+    node_positions_m : (n, 3) array
+        Node positions at that moment.
+    body : Body
+        Provides `cells` and `element`.
+    attach : {"auto", "vertex", "embedded"}
+        "vertex": the nearest node. "embedded": the tetrahedron holding the marker, or nearest to
+        it. "auto": the nearest node if within 5 % of the mean edge length, else embedded.
+    max_distance_m : float, optional
+        Largest distance that may be bridged; by default the mean edge length.
+    names : sequence of str, optional
+        Marker names for messages.
+
+    Raises
+    ------
+    InputError
+        If a marker has no position or is too far from the body.
+    """
+    points = read_only_floats(points_m, (None, 3), "marker positions", finite=False)
+    nodes_m = read_only_floats(node_positions_m, (None, 3), "node positions")
+    labels = [str(k) for k in range(len(points))] if names is None else list(names)
+    if len(labels) != len(points):
+        raise InputError(f"{len(labels)} marker names for {len(points)} marker positions")
+    if attach not in get_args(Attachment):
+        raise InputError(f"attach is {attach!r}; expected one of {', '.join(get_args(Attachment))}")
+    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if lost.size:
+        raise InputError(
+            f"marker '{labels[lost[0]]}' has no position from which to find its place on the body; "
+            "give its reference_m"
+        )
+    shape = _Shape(nodes_m, body)
+    snap_m = {"auto": VERTEX_SNAP * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[attach]
+    limit_m = shape.mean_edge_m if max_distance_m is None else max_distance_m
+
+    nodes = np.empty((len(points), body.cells.shape[1]), dtype=np.int64)
+    weights = np.empty(nodes.shape)
+    distance = np.empty(len(points))
+    for k, point in enumerate(points):
+        node_distance = np.linalg.norm(nodes_m - point, axis=1)
+        vertex = int(np.argmin(node_distance))
+        if node_distance[vertex] <= snap_m:
+            nodes[k], weights[k] = shape.vertex(vertex)
+            distance[k] = node_distance[vertex]
+        else:
+            nodes[k], weights[k], distance[k] = shape.embed(point)
+        if distance[k] > limit_m:
+            raise InputError(
+                f"marker '{labels[k]}' at {np.array2string(point, precision=4)} m is "
+                f"{distance[k]:.4g} m away from the body, more than the {limit_m:.4g} m allowed; "
+                "check length_unit, the frame of the poses and the marker's reference_m, "
+                "or raise max_distance_m"
+            )
+    return Placement(nodes, weights, distance, len(nodes_m))
+
+
+class _Shape:
+    """The body in one configuration, prepared for locating points."""
+
+    def __init__(self, nodes_m: FloatArray, body: Body) -> None:
+        self.nodes_m = nodes_m
+        self.body = body
+        corners = body.cells[:, :4]
+        pairs = np.concatenate([corners[:, pair] for pair in combinations(range(4), 2)])
+        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+        self.mean_edge_m = float(
+            np.linalg.norm(nodes_m[pairs[:, 0]] - nodes_m[pairs[:, 1]], axis=1).mean()
+        )
+        self.origin = nodes_m[corners[:, 0]]
+        edges = nodes_m[corners[:, 1:]] - self.origin[:, None]
+        self.inverse = np.linalg.inv(edges)  # L1..L3 = (x − origin) @ inverse
+        faces, self.face_owner = _boundary_faces(corners)
+        self.triangles = nodes_m[faces]
+
+    def vertex(self, node: int) -> tuple[IntArray, FloatArray]:
+        """Nodes and weights of a marker on a node: an element around it, all weight on the node."""
+        cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
+        return cell, (cell == node).astype(np.float64)
+
+    def embed(self, point: FloatArray) -> tuple[IntArray, FloatArray, float]:
+        """Nodes, weights and distance to the surface of a marker inside or outside the body."""
+        depth = self._barycentric(point, slice(None)).min(axis=1)
+        cell = int(np.argmax(depth))
+        distance = 0.0
+        if depth[cell] < -_INSIDE_TOLERANCE:
+            to_faces = _distance_to_triangles(point, self.triangles)
+            distance = float(to_faces.min())
+            # Where an edge or corner is nearest, extrapolate from the element that must the least.
+            nearest = self.face_owner[to_faces <= distance + 1e-9 * self.mean_edge_m]
+            cell = int(nearest[np.argmax(depth[nearest])])
+        return self.body.cells[cell], self._weights(point, cell), distance
+
+    def _barycentric(self, point: FloatArray, cells: slice | IntArray) -> FloatArray:
+        rest = np.einsum("ei,eij->ej", point - self.origin[cells], self.inverse[cells])
+        return np.column_stack([1.0 - rest.sum(axis=1), rest])
+
+    def _weights(self, point: FloatArray, cell: int) -> FloatArray:
+        """Shape functions at the point.
+
+        The corners' barycentric coordinates are exact for straight sides. Where deformation has
+        curved a quadratic element they are corrected until the element maps them to the point.
+        """
+        one = np.array([cell])
+        local = self._barycentric(point, one)
+        best, best_miss = self.body.element.shape_functions(local)[0], np.inf
+        for _ in range(_EMBEDDING_ITERATIONS):
+            weights = self.body.element.shape_functions(local)[0]
+            miss = point - weights @ self.nodes_m[self.body.cells[cell]]
+            if not np.linalg.norm(miss) < best_miss:
+                break
+            best, best_miss = weights, np.linalg.norm(miss)
+            step = miss @ self.inverse[cell]
+            local = local + np.concatenate([[-step.sum()], step])
+        return best
+
+
+def _boundary_faces(corners: IntArray) -> tuple[IntArray, IntArray]:
+    """Triangles that belong to one tetrahedron only, and that tetrahedron."""
+    faces = np.concatenate([corners[:, triple] for triple in combinations(range(4), 3)])
+    owner = np.tile(np.arange(len(corners)), 4)
+    _, first, uses = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    outer = first[uses == 1]
+    return faces[outer], owner[outer]
+
+
+def _distance_to_triangles(point: FloatArray, triangles: FloatArray) -> FloatArray:
+    """Distance from a point (3,) to each triangle (F, 3, 3)."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normal = np.cross(b - a, c - a)
+    area_squared = np.einsum("fi,fi->f", normal, normal)
+    in_c = np.einsum("fi,fi->f", np.cross(b - a, point - a), normal) / area_squared
+    in_b = np.einsum("fi,fi->f", np.cross(point - a, c - a), normal) / area_squared
+    above = (in_b >= 0.0) & (in_c >= 0.0) & (in_b + in_c <= 1.0)
+    to_plane = np.abs(np.einsum("fi,fi->f", point - a, normal)) / np.sqrt(area_squared)
+    to_edges = np.min([_distance_to_segments(point, p, q) for p, q in ((a, b), (b, c), (c, a))], 0)
+    return np.where(above, to_plane, to_edges)
+
+
+def _distance_to_segments(point: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+    along = end - start
+    fraction = np.einsum("fi,fi->f", point - start, along) / np.einsum("fi,fi->f", along, along)
+    nearest = start + np.clip(fraction, 0.0, 1.0)[:, None] * along
+    return np.linalg.norm(point - nearest, axis=1)

@@ -1,0 +1,48 @@
+"""What is evaluated over all timesteps and elements, independent of how."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..expressions import PointKernel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """A kernel on a mesh, and where its outputs are added up.
+
+    Attributes
+    ----------
+    kernel : PointKernel
+    cells : ndarray
+        (E, nodes) node numbers.
+    geometry : ndarray
+        (E, q, 3·nodes + 1), see `elements.reference_geometry`.
+    destinations : ndarray
+        (E, outputs) position of every output entry in the result row of its timestep.
+    width : int
+        Length of that row.
+    """
+
+    kernel: PointKernel
+    cells: NDArray[np.int64]
+    geometry: Array
+    destinations: NDArray[np.int64]
+    width: int
+
+
+class Evaluator(Protocol):
+    """Sums a batch's kernel over elements and quadrature points, for each timestep."""
+
+    def __call__(
+        self, fields: Sequence[Array], theta: Array, out: Array, threads: int
+    ) -> None:
+        """Overwrite `out` (T, width) from `fields`, each (T, 3n) contiguous, and θ (3,)."""
+        ...

@@ -1,0 +1,38 @@
+"""The reference evaluator: `casadi.Function.map` over the elements, one timestep at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+
+from .batch import Array, Batch
+
+
+class CasadiEvaluator:
+    """Evaluate a `Batch` by CasADi's own virtual machine; slower, available everywhere."""
+
+    def __init__(self, batch: Batch) -> None:
+        count, points, size = batch.geometry.shape
+        kernel = batch.kernel
+        self._theta_slot = len(kernel.fields) + 1
+        self._mapped = kernel.function.map(
+            f"{kernel.function.name()}_map", "serial", count * points, [self._theta_slot], []
+        )
+        self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
+        dofs = 3 * batch.cells[:, :, None] + np.arange(3)
+        self._dofs = np.repeat(dofs.reshape(count, -1), points, axis=0).T
+        destinations = np.repeat(batch.destinations, points, axis=0).ravel()
+        self._sum = sp.csr_array(
+            (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
+            shape=(batch.width, len(destinations)),
+        )
+
+    def __call__(self, fields: Sequence[Array], theta: Array, out: Array, threads: int) -> None:
+        """Add up the kernel over elements and points into `out` (T, width), overwriting it."""
+        for t in range(len(out)):
+            inputs = [field[t][self._dofs] for field in fields]
+            outputs = self._mapped.call([*inputs, self._geometry, theta])
+            stacked = np.concatenate([value.full() for value in outputs])
+            out[t] = self._sum @ stacked.ravel(order="F")

@@ -1,0 +1,297 @@
+"""A deformable body: mesh, material and mass, and its forces and derivatives over all timesteps.
+
+Signs: Ψ(x) elastic energy, f_e = −∂Ψ/∂x, K = ∂²Ψ/∂x² = −∂f_e/∂x, and the internal force
+
+    f(x, v; θ) = f_e(x) − γ_r K(x) v − γ_m M v.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from .batched import Batch, Evaluator, available_threads, make_evaluator
+from .elements import Element, element_named, reference_geometry
+from .expressions import KERNELS
+from .materials import Energy, material_named
+from .mesh import TetMesh
+from .pattern import SymmetricPattern, element_destinations
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """The internal force and its first derivatives at T states; m = `pattern.entries`.
+
+    Attributes
+    ----------
+    force : (T, 3n) f(x, v; θ) [N]
+    by_position : (T, m) lower triangles of ∂f/∂x = −K − γ_r D_vK [N/m]
+    by_velocity : (T, m) lower triangles of ∂f/∂v = −γ_r K − γ_m M [N·s/m]
+    by_theta : (T, 3n, 4) ∂f/∂(λ, μ, γ_r, γ_m)
+    """
+
+    force: Array
+    by_position: Array
+    by_velocity: Array
+    by_theta: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """Second derivatives of φ = wᵀ f(x, v; θ) at T states; ∂²φ/∂v² is zero.
+
+    Attributes
+    ----------
+    position_position, position_velocity : (T, m) lower triangles
+    position_theta, velocity_theta : (T, 3n, 4)
+    theta_theta : (T, 4, 4)
+    """
+
+    position_position: Array
+    position_velocity: Array
+    position_theta: Array
+    velocity_theta: Array
+    theta_theta: Array
+
+
+class Body:
+    """A tetrahedral finite-element body.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    material : str or callable, default "neo-hookean"
+        A name in `materials.MATERIALS` or an energy function ``(F, λ, μ) -> ψ`` in CasADi SX.
+    density_kg_m3, mass_kg : float
+        Exactly one of them; the density is uniform.
+    element : str, default "tet4"
+        A name in `elements.ELEMENTS`.
+    evaluator : {"auto", "simd", "casadi"}
+        How element kernels are evaluated, see `batched`.
+    threads : int, optional
+        Threads for evaluations over several timesteps; the available cores by default.
+
+    Attributes
+    ----------
+    nodes_m : (n, 3) undeformed node positions
+    cells : (E, nodes per element) node numbers
+    node_mass : (n,) lumped mass [kg]
+    pattern : SymmetricPattern of K
+
+    Raises
+    ------
+    InputError
+        For unknown names or a mass that is not positive.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        material: str | Energy = "neo-hookean",
+        density_kg_m3: float | None = None,
+        element: str = "tet4",
+        *,
+        mass_kg: float | None = None,
+        evaluator: str = "auto",
+        threads: int | None = None,
+    ) -> None:
+        self.mesh = mesh
+        self.material: Energy = material_named(material) if isinstance(material, str) else material
+        self.element: Element = element_named(element)
+        self.nodes_m: Array = mesh.points_m
+        self.cells: NDArray[np.int64] = mesh.tetrahedra
+        self.threads = threads or available_threads()
+        self.evaluator = evaluator
+        density = _density(mesh.volume_m3, density_kg_m3, mass_kg)
+        shares = density * mesh.volumes_m3[:, None] * self.element.mass_shares
+        self.node_mass: Array = np.bincount(
+            self.cells.ravel(), shares.ravel(), minlength=len(self.nodes_m)
+        )
+        self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
+        self._evaluators: dict[str, Evaluator] = {}
+
+    @property
+    def mass_kg(self) -> float:
+        """Total mass."""
+        return float(self.node_mass.sum())
+
+    @cached_property
+    def dof_mass(self) -> Array:
+        """(3n,) lumped mass of every degree of freedom [kg]."""
+        return np.repeat(self.node_mass, 3)
+
+    @cached_property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity of the stiffness matrix."""
+        return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
+
+    # One state ------------------------------------------------------------------------------
+
+    def energy(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> float:
+        """Elastic energy Ψ [J] at (n, 3) node positions [m]."""
+        x = self._states(positions)
+        return float(self._evaluate("energy", [x], (lambda_pa, mu_pa, 0.0))[0, 0])
+
+    def elastic_force(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> Array:
+        """Elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m]."""
+        x = self._states(positions)
+        force = self._evaluate("force", [x, np.zeros_like(x)], (lambda_pa, mu_pa, 0.0))
+        return force.reshape(-1, 3)
+
+    def stiffness(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> sp.csc_array:
+        """Stiffness K = ∂²Ψ/∂x², (3n, 3n) sparse [N/m]; row 3i + j is coordinate j of node i."""
+        x = self._states(positions)
+        theta = (lambda_pa, mu_pa, 0.0, 0.0)
+        return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
+
+    # Many states ----------------------------------------------------------------------------
+
+    def force(self, positions: ArrayLike, velocities: ArrayLike, theta: Sequence[float]) -> Array:
+        """Internal force f(x, v; θ), (T, 3n) [N].
+
+        Parameters
+        ----------
+        positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
+        theta : (λ [Pa], μ [Pa], γ_r [s], γ_m [1/s])
+        """
+        x, v = self._states(positions), self._states(velocities)
+        return self._evaluate("force", [x, v], theta[:3]) - theta[3] * self.dof_mass * v
+
+    def linearise(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        theta: Sequence[float],
+        out: Array | None = None,
+    ) -> Linearisation:
+        """Internal force and first derivatives at T states, see `Linearisation`.
+
+        The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
+        """
+        x, v = self._states(positions), self._states(velocities)
+        rows = self._evaluate("linearisation", [x, v], theta[:3], out)
+        size, entries = self.pattern.size, self.pattern.entries
+        force, by_position, by_velocity, by_theta = np.split(
+            rows, np.cumsum([size, entries, entries]), axis=1
+        )
+        drag = self.dof_mass * v
+        force -= theta[3] * drag
+        by_velocity[:, self.pattern.diagonal] -= theta[3] * self.dof_mass
+        by_theta = by_theta.reshape(len(x), size, 4)
+        by_theta[:, :, 3] = -drag
+        return Linearisation(force, by_position, by_velocity, by_theta)
+
+    @property
+    def linearisation_width(self) -> int:
+        """Length of one timestep's row of `linearise`."""
+        return 5 * self.pattern.size + 2 * self.pattern.entries
+
+    def curvature(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        weights: ArrayLike,
+        theta: Sequence[float],
+        out: Array | None = None,
+    ) -> Curvature:
+        """Second derivatives of wᵀ f at T states, see `Curvature`; `weights` like `positions`."""
+        x, v, w = (self._states(field) for field in (positions, velocities, weights))
+        rows = self._evaluate("curvature", [x, v, w], theta[:3], out)
+        size, entries = self.pattern.size, self.pattern.entries
+        xx, xv, x_theta, v_theta, theta_theta = np.split(
+            rows, np.cumsum([entries, entries, 4 * size, 4 * size]), axis=1
+        )
+        v_theta = v_theta.reshape(len(x), size, 4)
+        v_theta[:, :, 3] = -self.dof_mass * w
+        return Curvature(
+            xx, xv, x_theta.reshape(len(x), size, 4), v_theta, theta_theta.reshape(len(x), 4, 4)
+        )
+
+    @property
+    def curvature_width(self) -> int:
+        """Length of one timestep's row of `curvature`."""
+        return 8 * self.pattern.size + 2 * self.pattern.entries + 16
+
+    def volume_ratios(self, positions: ArrayLike) -> Array:
+        """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
+        x = self._states(positions).reshape(-1, len(self.nodes_m), 3)
+        gradients = self.geometry[..., :-1].reshape(
+            len(self.cells), -1, self.element.nodes, 3
+        )
+        return np.linalg.det(np.einsum("teai,eqaj->teqij", x[:, self.cells], gradients))
+
+    # Assembly -------------------------------------------------------------------------------
+
+    def _states(self, field: ArrayLike) -> Array:
+        states = np.ascontiguousarray(field, dtype=float).reshape(-1, 3 * len(self.nodes_m))
+        return states
+
+    def _evaluate(
+        self, name: str, fields: Sequence[Array], theta: Sequence[float], out: Array | None = None
+    ) -> Array:
+        if name not in self._evaluators:
+            batch = self._batch(name)
+            self._evaluators[name] = make_evaluator(batch, self.evaluator)
+        width = self._width(name)
+        if out is None:
+            out = np.empty((len(fields[0]), width))
+        values = np.array(theta, dtype=float)
+        self._evaluators[name](fields, values, out, self.threads)
+        return out
+
+    def _width(self, name: str) -> int:
+        return {
+            "energy": 1,
+            "force": self.pattern.size,
+            "linearisation": self.linearisation_width,
+            "curvature": self.curvature_width,
+        }[name]
+
+    def _batch(self, name: str) -> Batch:
+        """Lay a kernel's outputs out in one row: vectors, lower triangles, 4 columns for θ."""
+        kernel = KERNELS[name](self.element, self.material)
+        vector, lower = element_destinations(self.pattern, self.cells)
+        columns = np.arange(3)  # the kernel's λ, μ, γ_r; column 3 is γ_m, which needs no elements
+        by_theta = (columns[:, None] + 4 * vector[:, None, :]).reshape(len(self.cells), -1)
+        square = np.broadcast_to(
+            (columns[:, None] + 4 * columns).ravel(), (len(self.cells), 9)
+        )
+        whole = np.zeros((len(self.cells), 1), dtype=np.int64)
+        places = {
+            "energy": (whole, 1),
+            "force": (vector, self.pattern.size),
+            "by_position": (lower, self.pattern.entries),
+            "by_velocity": (lower, self.pattern.entries),
+            "by_theta": (by_theta, 4 * self.pattern.size),
+            "position_position": (lower, self.pattern.entries),
+            "position_velocity": (lower, self.pattern.entries),
+            "position_theta": (by_theta, 4 * self.pattern.size),
+            "velocity_theta": (by_theta, 4 * self.pattern.size),
+            "theta_theta": (square, 16),
+        }
+        used = [places[output] for output in kernel.outputs]
+        starts = np.cumsum([0] + [length for _, length in used])
+        destinations = np.hstack(
+            [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
+        )
+        return Batch(kernel, self.cells, self.geometry, destinations, self._width(name))
+
+
+def _density(
+    volume_m3: float, density_kg_m3: float | None, mass_kg: float | None
+) -> float:
+    if (density_kg_m3 is None) == (mass_kg is None):
+        raise InputError("give exactly one of density_kg_m3 and mass_kg")
+    density = density_kg_m3 if density_kg_m3 is not None else (mass_kg or 0.0) / volume_m3
+    if not density > 0:
+        name = "density_kg_m3" if density_kg_m3 is not None else "mass_kg"
+        raise InputError(f"{name} must be positive")
+    return density

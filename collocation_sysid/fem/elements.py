@@ -1,0 +1,106 @@
+"""Finite elements as table entries: shape functions, quadrature and mass lumping.
+
+A new element is a new entry of `ELEMENTS`; kernels, assembly and marker embedding read the
+table and know nothing else about the element.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """A tetrahedral element in barycentric coordinates L = (L0, L1, L2, L3), ΣL = 1.
+
+    Attributes
+    ----------
+    name : str
+    nodes : int
+        Nodes per element, the four corners first.
+    shape_functions : callable
+        (k, 4) barycentric points to (k, nodes) values.
+    shape_gradients : callable
+        (k, 4) barycentric points to (k, nodes, 4) derivatives with respect to L.
+    points, weights : ndarray
+        Quadrature, (q, 4) barycentric and (q,) fractions of the volume (they sum to one).
+    mass_shares : ndarray
+        (nodes,) share of the element's mass lumped at each node, all positive, sum one.
+    meshio_type : str
+        Cell name for writing files.
+    """
+
+    name: str
+    nodes: int
+    shape_functions: Callable[[Array], Array]
+    shape_gradients: Callable[[Array], Array]
+    points: Array
+    weights: Array
+    mass_shares: Array
+    meshio_type: str
+
+
+def _linear_gradients(barycentric: Array) -> Array:
+    return np.broadcast_to(np.eye(4), (len(barycentric), 4, 4))
+
+
+ELEMENTS: dict[str, Element] = {
+    # One point integrates the constant deformation gradient exactly; equal mass shares.
+    "tet4": Element(
+        name="tet4",
+        nodes=4,
+        shape_functions=lambda barycentric: np.asarray(barycentric, dtype=float),
+        shape_gradients=_linear_gradients,
+        points=np.full((1, 4), 0.25),
+        weights=np.ones(1),
+        mass_shares=np.full(4, 0.25),
+        meshio_type="tetra",
+    ),
+}
+
+
+def element_named(name: str) -> Element:
+    """Look an element up in the table.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    if name not in ELEMENTS:
+        raise InputError(f"no element {name!r}; available: {', '.join(ELEMENTS)}")
+    return ELEMENTS[name]
+
+
+def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Element) -> Array:
+    """Shape gradients and volumes at every quadrature point of the undeformed mesh.
+
+    Parameters
+    ----------
+    points_m : (n, 3) undeformed node positions
+    cells : (E, nodes) node numbers, corners first; sides are straight
+    element : Element
+
+    Returns
+    -------
+    (E, q, 3 * nodes + 1) ndarray
+        ∂N_a/∂X_j at column 3a + j, then the point's share of the volume [m³].
+    """
+    corners = points_m[cells[:, :4]]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # columns are edge vectors
+    inverse = np.linalg.inv(edges)  # rows are ∂L1..L3/∂X
+    barycentric_gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+    volumes = np.linalg.det(edges) / 6.0
+    gradients = np.einsum(
+        "qal,elj->eqaj", element.shape_gradients(element.points), barycentric_gradients
+    )
+    flat = gradients.reshape(len(cells), len(element.points), 3 * element.nodes)
+    return np.concatenate([flat, (volumes[:, None] * element.weights)[..., None]], axis=2)

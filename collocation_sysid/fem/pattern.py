@@ -1,0 +1,93 @@
+"""The sparsity of matrices on the mesh graph: one lower triangle shared by all timesteps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetricPattern:
+    """Positions of the lower triangle of a symmetric (3n, 3n) matrix.
+
+    Row and column 3i + j belong to coordinate j of node i. Entries are sorted by column,
+    then row, and every diagonal entry is present.
+
+    Attributes
+    ----------
+    size : int
+        3n.
+    rows, columns : ndarray
+        (m,) with rows >= columns.
+    """
+
+    size: int
+    rows: Index
+    columns: Index
+
+    @classmethod
+    def of_cells(cls, cells: Index, nodes: int) -> SymmetricPattern:
+        """The pattern of a stiffness matrix on the mesh."""
+        dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(len(cells), -1)
+        row = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
+        column = np.tile(dofs, dofs.shape[1]).ravel()
+        lower = row >= column
+        codes = np.unique(column[lower] * (3 * nodes) + row[lower])
+        return cls(3 * nodes, codes % (3 * nodes), codes // (3 * nodes))
+
+    @property
+    def entries(self) -> int:
+        """Number m of entries in the lower triangle."""
+        return len(self.rows)
+
+    @cached_property
+    def diagonal(self) -> Index:
+        """(3n,) position of each diagonal entry."""
+        return np.flatnonzero(self.rows == self.columns)
+
+    def position(self, row: Index, column: Index) -> Index:
+        """Position of entries given in either triangle."""
+        low, high = np.minimum(row, column), np.maximum(row, column)
+        codes = self.columns * self.size + self.rows
+        wanted = low * self.size + high
+        found = np.searchsorted(codes, wanted)
+        if (found >= len(codes)).any() or (codes[found] != wanted).any():
+            raise IndexError("an entry lies outside the mesh graph")
+        return found
+
+    @cached_property
+    def full(self) -> tuple[Index, Index, Index]:
+        """Rows, columns and lower-triangle positions of the whole matrix, sorted by column."""
+        strict = self.rows != self.columns
+        rows = np.concatenate([self.rows, self.columns[strict]])
+        columns = np.concatenate([self.columns, self.rows[strict]])
+        source = np.concatenate([np.arange(self.entries), np.flatnonzero(strict)])
+        order = np.lexsort((rows, columns))
+        return rows[order], columns[order], source[order]
+
+    def matrix(self, values: NDArray[np.float64]) -> sp.csc_array:
+        """The full symmetric matrix of (m,) lower-triangle values."""
+        rows, columns, source = self.full
+        return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
+
+
+def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index, Index]:
+    """Where an element's vector and lower-triangle entries go.
+
+    Returns
+    -------
+    vector : (E, 3·nodes) ndarray
+        Global row of each local one.
+    lower : (E, 3·nodes·(3·nodes + 1)/2) ndarray
+        Position in `pattern` of each local lower-triangle entry, column after column.
+    """
+    dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(len(cells), -1)
+    size = dofs.shape[1]
+    local_columns, local_rows = np.triu_indices(size)
+    return dofs, pattern.position(dofs[:, local_rows], dofs[:, local_columns])
