@@ -33,6 +33,18 @@ def read_only_floats(
     return array
 
 
+def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> FloatArray:
+    """Return a read-only copy of marker positions (T, M, 3).
+
+    A sample with a coordinate that is not finite is missing: all three become NaN.
+    """
+    tracks = read_only_floats(values, shape, name, finite=False)
+    whole = np.isfinite(tracks).all(axis=2, keepdims=True)
+    tracks = np.where(whole, tracks, np.nan)
+    tracks.setflags(write=False)
+    return tracks
+
+
 def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> IntArray:
     """Return a read-only int64 copy of node numbers, whose shape must match `shape`.
 

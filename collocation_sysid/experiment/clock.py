@@ -38,11 +38,10 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
         raise InputError(f"{what}: a sample interval needs at least two samples", source)
+    if fault := first_time_fault(times):
+        raise InputError(f"{what}: {fault[1]}", source, f"row {fault[0] + 1}")
     steps = np.diff(times)
     mean_s = float(times[-1] - times[0]) / len(steps)
-    if not steps.min() > 0.0:
-        row = int(np.argmax(~(steps > 0.0))) + 1
-        raise InputError(f"{what}: time does not increase", source, f"row {row + 1}")
     uneven = np.abs(steps - mean_s) > STEP_TOLERANCE * mean_s + rounding_s(times)
     if uneven.any():
         # A lost frame also shifts the mean, and with it every other step: name the worst.
@@ -56,6 +55,15 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
             f"row {row + 2}",
         )
     return mean_s
+
+
+def first_time_fault(t_s: FloatArray) -> tuple[int, str] | None:
+    """Return the index of the first time that does not follow the one before, and say so."""
+    faulty = np.flatnonzero(~(np.diff(t_s) > 0.0))
+    if not faulty.size:
+        return None
+    row = int(faulty[0]) + 1
+    return row, f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase"
 
 
 def even_times_s(t_s: FloatArray) -> FloatArray:

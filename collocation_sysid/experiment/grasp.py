@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from .arrays import FloatArray, IntArray, read_only_floats, read_only_nodes
+from .clock import first_time_fault
 
 Interpolation = Literal["linear", "hold"]
 
@@ -108,7 +109,7 @@ class PoseSequence:
         fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
         step_m = self.positions_m[k + 1] - self.positions_m[k]
         turn = Rotation.from_rotvec(fraction * self._turns[k])
-        rotations = (self._rotations[k] * turn).as_matrix()
+        rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
         return rotations, self.positions_m[k] + fraction * step_m
 
     def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> FloatArray:
@@ -194,10 +195,8 @@ def first_pose_fault(
     finite = np.isfinite(np.column_stack([t_s, positions_m, quaternions_xyzw])).all(axis=1)
     if not finite.all():
         return int(np.argmin(finite)), "the pose holds a value that is not a finite number"
-    backwards = np.flatnonzero(np.diff(t_s) <= 0.0)
-    if backwards.size:
-        row = int(backwards[0]) + 1
-        return row, f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase"
+    if fault := first_time_fault(t_s):
+        return fault
     norms = np.linalg.norm(quaternions_xyzw, axis=1)
     off = np.flatnonzero(np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE)
     if off.size:

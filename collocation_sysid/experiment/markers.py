@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from ..errors import InputError
-from .arrays import FloatArray, IntArray, read_only_floats
+from .arrays import FloatArray, IntArray, read_only_floats, read_only_tracks
 from .placement import Placement, place_markers
 
 __all__ = ["Markers", "Placement", "place_markers"]
@@ -53,7 +53,7 @@ class Markers:
             raise InputError(f"the marker name '{repeated}' is given more than once")
         t_s = read_only_floats(self.t_s, (None,), "t_s of the markers")
         shape = (len(t_s), m, 3)
-        positions = read_only_floats(self.positions_m, shape, "marker positions", finite=False)
+        positions = read_only_tracks(self.positions_m, shape, "marker positions")
         sigma = read_only_floats(
             np.broadcast_to(self.sigma_m, (m,)) if np.ndim(self.sigma_m) == 0 else self.sigma_m,
             (m,),
@@ -61,7 +61,9 @@ class Markers:
         )
         if not (sigma > 0.0).all():
             worst = int(np.argmin(sigma))
-            raise InputError(f"sigma_m of marker '{names[worst]}' is {sigma[worst]:g}; expected > 0")
+            raise InputError(
+                f"sigma_m of marker '{names[worst]}' is {sigma[worst]:g}; expected > 0"
+            )
         if len(self.placement.nodes) != m:
             raise InputError(f"{len(self.placement.nodes)} places on the body for {m} markers")
         object.__setattr__(self, "names", names)
@@ -72,7 +74,7 @@ class Markers:
     @cached_property
     def present(self) -> NDArray[np.bool_]:
         """(T, M) mask of samples with all three coordinates."""
-        return np.isfinite(self.positions_m).all(axis=2)
+        return np.asarray(np.isfinite(self.positions_m[:, :, 0]))
 
     @property
     def missing(self) -> IntArray:

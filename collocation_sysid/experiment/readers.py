@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from .arrays import FloatArray, read_only_floats
+from .arrays import FloatArray, read_only_floats, read_only_tracks
+from .clock import first_time_fault
 from .grasp import PoseSequence, first_pose_fault
 
 POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -49,13 +50,10 @@ class MarkerTable:
     def __post_init__(self) -> None:
         names = tuple(self.names)
         t_s = read_only_floats(self.t_s, (None,), "t_s of the markers")
-        if (row := _first_backwards(t_s)) is not None:
-            raise InputError(_backwards(t_s, row), where=f"row {row + 1}")
-        positions = np.array(self.positions_m, dtype=np.float64)
-        if positions.ndim == 3:
-            positions[~np.isfinite(positions).all(axis=2)] = np.nan
+        if fault := first_time_fault(t_s):
+            raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(t_s), len(names), 3)
-        positions = read_only_floats(positions, shape, "marker positions", finite=False)
+        positions = read_only_tracks(self.positions_m, shape, "marker positions")
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "t_s", t_s)
         object.__setattr__(self, "positions_m", positions)
@@ -114,8 +112,8 @@ def read_markers_csv(
     taken = there if names is None else _asked_for(path, there, names)
     columns = [header.index(f"{name}_{axis}") for name in taken for axis in _AXES]
     t_s = _numbers(path, header, lines, rows, [header.index("t_s")], blank_allowed=False)[:, 0]
-    if (row := _first_backwards(t_s)) is not None:
-        raise InputError(_backwards(t_s, row), path, f"line {lines[row]}")
+    if fault := first_time_fault(t_s):
+        raise InputError(fault[1], path, f"line {lines[fault[0]]}")
     values = _numbers(path, header, lines, rows, columns, blank_allowed=True)
     positions = values.reshape(len(rows), len(taken), 3) * METRES_PER_UNIT[length_unit]
     return MarkerTable(t_s, tuple(taken), positions)
@@ -239,15 +237,6 @@ def _write_csv(path: str | Path, header: Sequence[str], values: FloatArray) -> N
         os.replace(draft, target)
     finally:
         draft.unlink(missing_ok=True)
-
-
-def _first_backwards(t_s: FloatArray) -> int | None:
-    backwards = np.flatnonzero(np.diff(t_s) <= 0.0)
-    return int(backwards[0]) + 1 if backwards.size else None
-
-
-def _backwards(t_s: FloatArray, row: int) -> str:
-    return f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase"
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -53,6 +53,7 @@ class Curvature:
     position_position, position_velocity : (T, m) lower triangles
     position_theta, velocity_theta : (T, 3n, 4)
     theta_theta : (T, 4, 4)
+    theta : (T, 4) first derivative ∂φ/∂θ
     """
 
     position_position: Array
@@ -60,6 +61,7 @@ class Curvature:
     position_theta: Array
     velocity_theta: Array
     theta_theta: Array
+    theta: Array
 
 
 class Body:
@@ -206,19 +208,18 @@ class Body:
         x, v, w = (self._states(field) for field in (positions, velocities, weights))
         rows = self._evaluate("curvature", [x, v, w], theta[:3], out)
         size, entries = self.pattern.size, self.pattern.entries
-        xx, xv, x_theta, v_theta, theta_theta = np.split(
-            rows, np.cumsum([entries, entries, 4 * size, 4 * size]), axis=1
+        xx, xv, x_theta, v_theta, theta_theta, by_theta = np.split(
+            rows, np.cumsum([entries, entries, 4 * size, 4 * size, 16]), axis=1
         )
-        v_theta = v_theta.reshape(len(x), size, 4)
+        x_theta, v_theta = (part.reshape(len(x), size, 4) for part in (x_theta, v_theta))
         v_theta[:, :, 3] = -self.dof_mass * w
-        return Curvature(
-            xx, xv, x_theta.reshape(len(x), size, 4), v_theta, theta_theta.reshape(len(x), 4, 4)
-        )
+        by_theta[:, 3] = np.einsum("ti,ti->t", v_theta[:, :, 3], v)
+        return Curvature(xx, xv, x_theta, v_theta, theta_theta.reshape(len(x), 4, 4), by_theta)
 
     @property
     def curvature_width(self) -> int:
         """Length of one timestep's row of `curvature`."""
-        return 8 * self.pattern.size + 2 * self.pattern.entries + 16
+        return 8 * self.pattern.size + 2 * self.pattern.entries + 20
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
@@ -276,6 +277,7 @@ class Body:
             "position_theta": (by_theta, 4 * self.pattern.size),
             "velocity_theta": (by_theta, 4 * self.pattern.size),
             "theta_theta": (square, 16),
+            "theta": (np.broadcast_to(columns, (len(self.cells), 3)), 4),
         }
         used = [places[output] for output in kernel.outputs]
         starts = np.cumsum([0] + [length for _, length in used])

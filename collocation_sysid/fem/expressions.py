@@ -159,7 +159,7 @@ def linearisation_kernel(element: Element, energy: Energy) -> PointKernel:
 
 
 def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
-    """Second derivatives of φ = wᵀ f(x, v; θ).
+    """Second derivatives of φ = wᵀ f(x, v; θ), and ∂φ/∂θ, which the chain rule needs.
 
     ∂²φ/∂v² vanishes and ∂²φ/∂x∂v = −γ_r D_wK is symmetric, so two lower triangles hold the
     position–velocity part.
@@ -175,9 +175,10 @@ def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
         ca.jacobian(by_f, point.theta),
         ca.jacobian(by_rate, point.theta),
         ca.jacobian(by_theta, point.theta),
+        by_theta,
     ]
     w_gradient = _material_gradient(point, point.w)
-    xx, xv, x_theta, v_theta, theta_theta = (
+    xx, xv, x_theta, v_theta, theta_theta, first = (
         ca.substitute(_at(point, law, piece), W, w_gradient) for piece in pieces
     )
     outputs = {
@@ -186,6 +187,7 @@ def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
         "position_theta": _to_nodes(point, x_theta),
         "velocity_theta": _to_nodes(point, v_theta),
         "theta_theta": theta_theta,
+        "theta": first,
     }
     return _function("curvature", point, ("x", "v", "w"), outputs)
 

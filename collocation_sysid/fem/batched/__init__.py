@@ -11,11 +11,20 @@ from importlib.util import find_spec
 
 from ...errors import InputError
 from .batch import Batch, Evaluator
+from .combine import Combiner, Plan, combine_natively, combine_with_numpy
 from .threads import available_threads, in_slices
 
 EVALUATORS = ("auto", "simd", "casadi")
 
-__all__ = ["EVALUATORS", "Batch", "Evaluator", "available_threads", "in_slices", "make_evaluator"]
+__all__ = [
+    "EVALUATORS",
+    "Batch",
+    "Evaluator",
+    "available_threads",
+    "in_slices",
+    "make_combiner",
+    "make_evaluator",
+]
 
 
 def make_evaluator(batch: Batch, choice: str = "auto") -> Evaluator:
@@ -46,3 +55,8 @@ def make_evaluator(batch: Batch, choice: str = "auto") -> Evaluator:
     from .simd import SimdEvaluator
 
     return SimdEvaluator(batch)
+
+
+def make_combiner(plan: Plan) -> Combiner:
+    """The loop that fills sparse values from a plan, compiled where llvmlite is there."""
+    return combine_natively(plan) if find_spec("llvmlite") else combine_with_numpy(plan)

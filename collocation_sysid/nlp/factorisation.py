@@ -1,0 +1,125 @@
+"""Factorise symmetric matrices on the mesh graph, again and again with one pattern.
+
+Reverse Cuthill–McKee makes the mesh graph a narrow band; a banded Cholesky factorisation then
+also tells whether the matrix is positive definite. Wide bands and indefinite matrices go to
+SuperLU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import splu
+
+from ..fem.pattern import SymmetricPattern
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Above this share of the matrix size SuperLU's fill-in is cheaper than the band's.
+WIDE_BAND = 0.4
+
+
+class Factor(Protocol):
+    """A factorised matrix on the free degrees of freedom."""
+
+    positive_definite: bool
+
+    def solve(self, right: Array) -> Array:
+        """Solve for (k,) or (k, m) right-hand sides in the order of the free dofs."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _BandFactor:
+    band: Array
+    order: Index
+    positive_definite: bool = True
+
+    def solve(self, right: Array) -> Array:
+        permuted = right[self.order]
+        solved, _ = lapack.dpbtrs(self.band, permuted, lower=1)
+        result = np.empty_like(right)
+        result[self.order] = solved.reshape(right.shape)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _SparseFactor:
+    lu: object
+    positive_definite: bool
+
+    def solve(self, right: Array) -> Array:
+        return self.lu.solve(right)  # type: ignore[attr-defined]
+
+
+class Factoriser:
+    """Symbolic analysis of a symmetric pattern restricted to free degrees of freedom.
+
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+    free : (k,) sorted degrees of freedom kept
+    """
+
+    def __init__(self, pattern: SymmetricPattern, free: Index) -> None:
+        position = np.full(pattern.size, -1)
+        position[free] = np.arange(len(free))
+        rows, columns = position[pattern.rows], position[pattern.columns]
+        self._kept = np.flatnonzero((rows >= 0) & (columns >= 0))
+        rows, columns = rows[self._kept], columns[self._kept]
+        self._size = len(free)
+        ones = np.ones(len(rows))
+        graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
+        self._order = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True).astype(np.int64)
+        rank = np.empty(self._size, dtype=np.int64)
+        rank[self._order] = np.arange(self._size)
+        low, high = np.minimum(rank[rows], rank[columns]), np.maximum(rank[rows], rank[columns])
+        self.half_bandwidth = int((high - low).max(initial=0))
+        self._band_rows, self._band_columns = high - low, low
+        strict = rows != columns
+        self._full_rows = np.concatenate([rows, columns[strict]])
+        self._full_columns = np.concatenate([columns, rows[strict]])
+        self._full_source = np.concatenate([self._kept, self._kept[strict]])
+
+    def factorise(self, values: Array) -> Factor:
+        """Factorise the matrix with (m,) lower-triangle values.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the matrix is singular or not finite.
+        """
+        if not np.isfinite(values).all():
+            raise np.linalg.LinAlgError("the matrix has entries that are not finite")
+        if self.half_bandwidth <= WIDE_BAND * self._size or self._size < 200:
+            band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
+            band[self._band_rows, self._band_columns] = values[self._kept]
+            factor, failed_at = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+            if failed_at == 0:
+                return _BandFactor(factor, self._order)
+            return self._sparse(values, known_indefinite=True)
+        return self._sparse(values)
+
+    def _sparse(self, values: Array, known_indefinite: bool = False) -> Factor:
+        matrix = sp.csc_array(
+            (values[self._full_source], (self._full_rows, self._full_columns)),
+            shape=(self._size, self._size),
+        )
+        try:
+            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True},
+                      diag_pivot_thresh=0.0 if not known_indefinite else 0.1)
+        except RuntimeError as error:
+            raise np.linalg.LinAlgError(str(error)) from error
+        definite = (
+            not known_indefinite
+            and bool((lu.perm_r == lu.perm_c).all())
+            and bool((lu.U.diagonal() > 0).all())
+        )
+        return _SparseFactor(lu, definite)
