@@ -277,7 +277,7 @@ class Body:
             "position_theta": (by_theta, 4 * self.pattern.size),
             "velocity_theta": (by_theta, 4 * self.pattern.size),
             "theta_theta": (square, 16),
-            "theta": (np.broadcast_to(columns, (len(self.cells), 3)), 4),
+            "gradient_theta": (np.broadcast_to(columns, (len(self.cells), 3)), 4),
         }
         used = [places[output] for output in kernel.outputs]
         starts = np.cumsum([0] + [length for _, length in used])

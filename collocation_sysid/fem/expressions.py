@@ -187,7 +187,7 @@ def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
         "position_theta": _to_nodes(point, x_theta),
         "velocity_theta": _to_nodes(point, v_theta),
         "theta_theta": theta_theta,
-        "theta": first,
+        "gradient_theta": first,
     }
     return _function("curvature", point, ("x", "v", "w"), outputs)
 

@@ -269,6 +269,18 @@ class Collocation:
         theta = self.parameters.theta(q)
         return [s.residual_n(x, theta) for s, x in zip(self.segments, positions, strict=True)]
 
+    def largest_force_n(self, z: Array) -> float:
+        """Largest internal or external force on a free dof [N], the yardstick of violations."""
+        q, positions = self.unpack(z)
+        theta = self.parameters.theta(q)
+        largest = 0.0
+        for segment, x in zip(self.segments, positions, strict=True):
+            dynamics = segment.dynamics
+            internal = dynamics.body.force(*dynamics.evaluation_states(x), theta)
+            for force in (internal, dynamics.external_force_n[None]):
+                largest = max(largest, float(np.abs(force[:, segment.free_dofs]).max()))
+        return largest
+
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
         """The worst equations of motion in newtons, largest first."""
         found = []

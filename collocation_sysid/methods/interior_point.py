@@ -1,0 +1,338 @@
+"""Interior point: the whole NLP to IPOPT, with exact sparse derivatives from the assembly."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..nlp.collocation import Collocation
+from ..results.solution import Iteration, Solution, Status, Timing
+from .start import initial_variables
+
+Array = NDArray[np.float64]
+Watch = Callable[[Iteration], None]
+
+IPOPT_STATUS = {
+    "Solve_Succeeded": Status.CONVERGED,
+    "Solved_To_Acceptable_Level": Status.ACCEPTABLE,
+    "Feasible_Point_Found": Status.ACCEPTABLE,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+    "Restoration_Failed": Status.INFEASIBLE,
+    "Search_Direction_Becomes_Too_Small": Status.STALLED,
+    "Diverging_Iterates": Status.DIVERGED,
+    "User_Requested_Stop": Status.INTERRUPTED,
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Maximum_CpuTime_Exceeded": Status.TIME_LIMIT,
+    "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
+    "Error_In_Step_Computation": Status.NUMERICAL_FAILURE,
+    "Invalid_Number_Detected": Status.NUMERICAL_FAILURE,
+    "Not_Enough_Degrees_Of_Freedom": Status.REFUSED,
+    "Invalid_Problem_Definition": Status.REFUSED,
+    "Invalid_Option": Status.REFUSED,
+    "Insufficient_Memory": Status.REFUSED,
+    "Unrecoverable_Exception": Status.NUMERICAL_FAILURE,
+    "NonIpopt_Exception_Thrown": Status.NUMERICAL_FAILURE,
+    "Internal_Error": Status.NUMERICAL_FAILURE,
+}
+
+
+@dataclass(frozen=True)
+class InteriorPointOptions:
+    """Options of the interior-point method.
+
+    Attributes
+    ----------
+    hessian : {"exact", "gauss-newton", "limited-memory"}
+        Second derivatives of the Lagrangian: all of them, the loss's only, or IPOPT's own.
+    linear_solver : str
+        IPOPT's linear solver; the wheel brings "mumps" and "spral".
+    tolerance : float
+        IPOPT's `tol` on the scaled optimality conditions.
+    max_iterations : int
+    max_time_s : float
+    ipopt : mapping
+        Further IPOPT options by name; they win over the ones above.
+    """
+
+    hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
+    linear_solver: str = "mumps"
+    tolerance: float = 1e-8
+    max_iterations: int = 200
+    max_time_s: float = 1e6
+    ipopt: Mapping[str, str | int | float] = field(default_factory=dict)
+
+
+def solve(
+    collocation: Collocation,
+    options: InteriorPointOptions | None = None,
+    watch: Watch | None = None,
+    start: Array | None = None,
+) -> Solution:
+    """Solve the NLP with IPOPT.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    options : InteriorPointOptions, optional
+    watch : callable, optional
+        Called with every `Iteration`.
+    start : (variables,) ndarray, optional
+        Initial variables; a simulation at the guess by default.
+
+    Returns
+    -------
+    Solution
+        Also when it did not converge, or was interrupted (Ctrl-C): then the best iterate.
+    """
+    options = options or InteriorPointOptions()
+    began = time.perf_counter()
+    notes: list[str] = []
+    if start is None:
+        start, notes = initial_variables(collocation)
+    functions = _Functions(collocation, gauss_newton=options.hessian == "gauss-newton")
+    monitor = _Monitor(collocation, watch, began)
+    solver = _build_solver(functions, monitor, options)
+    lower, upper = collocation.bounds()
+    built = time.perf_counter()
+    with _interruptible(monitor):
+        answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
+    stats = solver.stats()
+    total = time.perf_counter() - began
+    status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_FAILURE)
+    z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
+    if not status.converged and monitor.best is not None:
+        z, multipliers = monitor.best
+    spent = functions.seconds + monitor.seconds
+    return Solution(
+        status=status,
+        message=f"{status.sentence} (IPOPT: {stats['return_status']})",
+        method="interior-point",
+        collocation=collocation,
+        z=z,
+        multipliers=multipliers,
+        iterations=int(stats.get("iter_count", len(monitor.history))),
+        history=tuple(monitor.history),
+        timing=Timing(
+            build=built - began,
+            evaluations=functions.seconds,
+            linear_algebra=max(0.0, total - (built - began) - spent),
+            total=total,
+        ),
+        notes=tuple(notes),
+    )
+
+
+def _build_solver(
+    functions: _Functions, monitor: _Monitor, options: InteriorPointOptions
+) -> ca.Function:
+    collocation = functions.collocation
+    z = ca.MX.sym("z", collocation.variables)
+    value, rows = functions.nlp(z, ca.MX(0, 1))
+    settings: dict[str, object] = {
+        "ipopt.linear_solver": options.linear_solver,
+        "ipopt.tol": options.tolerance,
+        "ipopt.max_iter": options.max_iterations,
+        "ipopt.max_wall_time": options.max_time_s,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        # The NLP is scaled already, and only the parameters have bounds: a small barrier suffices.
+        "ipopt.nlp_scaling_method": "none",
+        "ipopt.mu_init": 1e-3,
+        "print_time": False,
+        "error_on_fail": False,
+        "no_nlp_grad": True,
+        "jac_g": functions.jacobian,
+        "grad_f": functions.gradient,
+        "iteration_callback": monitor,
+    }
+    if options.linear_solver == "mumps":
+        settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
+    if options.hessian == "limited-memory":
+        settings["ipopt.hessian_approximation"] = "limited-memory"
+    else:
+        settings["hess_lag"] = functions.hessian
+    settings |= {f"ipopt.{name}": value for name, value in options.ipopt.items()}
+    try:
+        return ca.nlpsol("solver", "ipopt", {"x": z, "f": value, "g": rows}, settings)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise InputError(f"IPOPT cannot be set up: {reason}", None, "solver") from error
+
+
+class _Timed(ca.Callback):
+    """A CasADi function of (z, …) whose outputs are written straight into CasADi's memory."""
+
+    def __init__(
+        self,
+        name: str,
+        inputs: list[ca.Sparsity],
+        outputs: list[ca.Sparsity],
+        evaluate: Callable[[list[Array], list[Array | None]], None],
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
+        self.seconds = 0.0
+        self.construct(name)
+
+    def get_n_in(self) -> int:
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        return len(self._outputs)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return self._inputs[i]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._outputs[i]
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments, results) -> int:
+        began = time.perf_counter()
+        self._evaluate(
+            [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
+            [np.frombuffer(r) if r is not None else None for r in results],
+        )
+        self.seconds += time.perf_counter() - began
+        return 0
+
+
+class _Functions:
+    """The NLP's functions as CasADi callbacks over the shared assembly."""
+
+    def __init__(self, collocation: Collocation, gauss_newton: bool) -> None:
+        self.collocation = collocation
+        variables, rows = collocation.variables, collocation.constraints
+        z, g = ca.Sparsity.dense(variables, 1), ca.Sparsity.dense(rows, 1)
+        p, scalar = ca.Sparsity(0, 1), ca.Sparsity.dense(1, 1)
+        jacobian = ca.Sparsity(rows, variables, *map(_ints, collocation.jacobian_structure))
+        hessian = ca.Sparsity(variables, variables, *map(_ints, collocation.hessian_structure))
+
+        def nlp(inputs: list[Array], outputs: list[Array | None]) -> None:
+            value, values = outputs
+            if value is not None:
+                value[0] = collocation.objective(inputs[0])
+            if values is not None:
+                values[:] = collocation.constraint_values(inputs[0])
+
+        def gradient(inputs: list[Array], outputs: list[Array | None]) -> None:
+            value, slope = outputs
+            if value is not None:
+                value[0] = collocation.objective(inputs[0])
+            if slope is not None:
+                slope[:] = collocation.gradient(inputs[0])
+
+        def jacobian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
+            values, entries = outputs
+            if values is not None:
+                values[:] = collocation.constraint_values(inputs[0])
+            if entries is not None:
+                collocation.jacobian_values(inputs[0], entries)
+
+        def hessian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
+            point, _, weight, multipliers = inputs
+            (entries,) = outputs
+            if gauss_newton:
+                multipliers = np.zeros_like(multipliers)
+            if entries is not None:
+                collocation.hessian_values(point, float(weight[0]), multipliers, entries)
+
+        self.nlp = _Timed("nlp", [z, p], [scalar, g], nlp)
+        self.gradient = _Timed("grad_f", [z, p], [scalar, z], gradient)
+        self.jacobian = _Timed("jac_g", [z, p], [g, jacobian], jacobian_values)
+        self.hessian = _Timed("hess_lag", [z, p, scalar, g], [hessian], hessian_values)
+
+    @property
+    def seconds(self) -> float:
+        """Time spent evaluating."""
+        functions = (self.nlp, self.gradient, self.jacobian, self.hessian)
+        return sum(function.seconds for function in functions)
+
+
+def _ints(values: NDArray[np.int64]) -> list[int]:
+    return values.tolist()
+
+
+class _Monitor(ca.Callback):
+    """Follows the iterates: history, best point, and the wish to stop."""
+
+    def __init__(self, collocation: Collocation, watch: Watch | None, began: float) -> None:
+        ca.Callback.__init__(self)
+        self.collocation = collocation
+        self.watch = watch
+        self.began = began
+        self.stop = False
+        self.history: list[Iteration] = []
+        self.best: tuple[Array, Array] | None = None
+        self.seconds = 0.0
+        self._best_merit = np.inf
+        self.construct("monitor")
+
+    def get_n_in(self) -> int:
+        return ca.nlpsol_n_out()
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        sizes = {
+            "x": self.collocation.variables,
+            "f": 1,
+            "g": self.collocation.constraints,
+            "lam_x": self.collocation.variables,
+            "lam_g": self.collocation.constraints,
+        }
+        return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
+
+    def eval(self, arguments):
+        began = time.perf_counter()
+        z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
+        # Objective and constraints are both of order one.
+        merit = float(value[0] + np.abs(rows).max(initial=0.0))
+        if merit < self._best_merit:
+            self._best_merit, self.best = merit, (z, multipliers)
+        violation = max(np.abs(r).max(initial=0.0) for r in self.collocation.violations_n(z))
+        iteration = Iteration(
+            number=len(self.history),
+            loss=float(value[0]) / self.collocation.loss_scale,
+            rms_m=self.collocation.rms_m(z),
+            violation_n=float(violation),
+            theta=self.collocation.theta(z),
+            time_s=time.perf_counter() - self.began,
+        )
+        self.history.append(iteration)
+        if self.watch is not None:
+            self.watch(iteration)
+        self.seconds += time.perf_counter() - began
+        return [1 if self.stop else 0]
+
+
+@contextmanager
+def _interruptible(monitor: _Monitor) -> Iterator[None]:
+    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def request(_number: int, _frame: object) -> None:
+        monitor.stop = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, request)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
