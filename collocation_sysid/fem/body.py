@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .batched import Batch, Evaluator, available_threads, make_evaluator
+from .batched import Batch, Evaluator, available_threads, choose_evaluator, make_evaluator
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS
 from .materials import Energy, material_named
@@ -24,6 +24,7 @@ from .mesh import TetMesh
 from .pattern import SymmetricPattern, element_destinations
 
 Array = NDArray[np.float64]
+Theta = Sequence[float] | Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +112,11 @@ class Body:
         self.nodes_m: Array = mesh.points_m
         self.cells: NDArray[np.int64] = mesh.tetrahedra
         self.threads = threads or available_threads()
-        self.evaluator = evaluator
+        self.evaluator = choose_evaluator(evaluator)
         density = _density(mesh.volume_m3, density_kg_m3, mass_kg)
         shares = density * mesh.volumes_m3[:, None] * self.element.mass_shares
-        self.node_mass: Array = np.bincount(
-            self.cells.ravel(), shares.ravel(), minlength=len(self.nodes_m)
-        )
+        self.node_mass: Array = np.zeros(len(self.nodes_m))
+        np.add.at(self.node_mass, self.cells, shares)
         self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
         self._evaluators: dict[str, Evaluator] = {}
 
@@ -139,24 +139,24 @@ class Body:
 
     def energy(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> float:
         """Elastic energy Ψ [J] at (n, 3) node positions [m]."""
-        x = self._states(positions)
+        x = self._state(positions)
         return float(self._evaluate("energy", [x], (lambda_pa, mu_pa, 0.0))[0, 0])
 
     def elastic_force(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> Array:
         """Elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m]."""
-        x = self._states(positions)
+        x = self._state(positions)
         force = self._evaluate("force", [x, np.zeros_like(x)], (lambda_pa, mu_pa, 0.0))
         return force.reshape(-1, 3)
 
     def stiffness(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> sp.csc_array:
         """Stiffness K = ∂²Ψ/∂x², (3n, 3n) sparse [N/m]; row 3i + j is coordinate j of node i."""
-        x = self._states(positions)
+        x = self._state(positions)
         theta = (lambda_pa, mu_pa, 0.0, 0.0)
         return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
 
     # Many states ----------------------------------------------------------------------------
 
-    def force(self, positions: ArrayLike, velocities: ArrayLike, theta: Sequence[float]) -> Array:
+    def force(self, positions: ArrayLike, velocities: ArrayLike, theta: Theta) -> Array:
         """Internal force f(x, v; θ), (T, 3n) [N].
 
         Parameters
@@ -164,21 +164,21 @@ class Body:
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
         theta : (λ [Pa], μ [Pa], γ_r [s], γ_m [1/s])
         """
-        x, v = self._states(positions), self._states(velocities)
+        x, v = self._states(positions, velocities)
         return self._evaluate("force", [x, v], theta[:3]) - theta[3] * self.dof_mass * v
 
     def linearise(
         self,
         positions: ArrayLike,
         velocities: ArrayLike,
-        theta: Sequence[float],
+        theta: Theta,
         out: Array | None = None,
     ) -> Linearisation:
         """Internal force and first derivatives at T states, see `Linearisation`.
 
         The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
         """
-        x, v = self._states(positions), self._states(velocities)
+        x, v = self._states(positions, velocities)
         rows = self._evaluate("linearisation", [x, v], theta[:3], out)
         size, entries = self.pattern.size, self.pattern.entries
         force, by_position, by_velocity, by_theta = np.split(
@@ -201,11 +201,11 @@ class Body:
         positions: ArrayLike,
         velocities: ArrayLike,
         weights: ArrayLike,
-        theta: Sequence[float],
+        theta: Theta,
         out: Array | None = None,
     ) -> Curvature:
         """Second derivatives of wᵀ f at T states, see `Curvature`; `weights` like `positions`."""
-        x, v, w = (self._states(field) for field in (positions, velocities, weights))
+        x, v, w = self._states(positions, velocities, weights)
         rows = self._evaluate("curvature", [x, v, w], theta[:3], out)
         size, entries = self.pattern.size, self.pattern.entries
         xx, xv, x_theta, v_theta, theta_theta, by_theta = np.split(
@@ -223,27 +223,44 @@ class Body:
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
-        x = self._states(positions).reshape(-1, len(self.nodes_m), 3)
-        gradients = self.geometry[..., :-1].reshape(
-            len(self.cells), -1, self.element.nodes, 3
-        )
+        x = self._states(positions)[0].reshape(-1, len(self.nodes_m), 3)
+        gradients = self.geometry[..., :-1].reshape(len(self.cells), -1, self.element.nodes, 3)
         return np.linalg.det(np.einsum("teai,eqaj->teqij", x[:, self.cells], gradients))
 
     # Assembly -------------------------------------------------------------------------------
 
-    def _states(self, field: ArrayLike) -> Array:
-        states = np.ascontiguousarray(field, dtype=float).reshape(-1, 3 * len(self.nodes_m))
+    def _states(self, *fields: ArrayLike) -> list[Array]:
+        """Every field as (T, 3n); native code relies on their shapes."""
+        nodes = len(self.nodes_m)
+        arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
+        for array in arrays:
+            if array.size % (3 * nodes) or array.size != arrays[0].size:
+                raise InputError(
+                    f"node fields of shapes {', '.join(str(a.shape) for a in arrays)}; "
+                    f"expected ({nodes}, 3) or (T, {nodes}, 3), with the same T in all"
+                )
+        return [array.reshape(-1, 3 * nodes) for array in arrays]
+
+    def _state(self, positions: ArrayLike) -> Array:
+        states = self._states(positions)[0]
+        if len(states) != 1:
+            raise InputError(
+                f"positions hold {len(states)} states; expected one, ({len(self.nodes_m)}, 3)"
+            )
         return states
 
     def _evaluate(
-        self, name: str, fields: Sequence[Array], theta: Sequence[float], out: Array | None = None
+        self, name: str, fields: Sequence[Array], theta: Theta, out: Array | None = None
     ) -> Array:
         if name not in self._evaluators:
             batch = self._batch(name)
             self._evaluators[name] = make_evaluator(batch, self.evaluator)
         width = self._width(name)
+        shape = (len(fields[0]), width)
         if out is None:
-            out = np.empty((len(fields[0]), width))
+            out = np.empty(shape)
+        elif out.shape != shape or out.dtype != float or not out.flags.c_contiguous:
+            raise InputError(f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}")
         values = np.array(theta, dtype=float)
         self._evaluators[name](fields, values, out, self.threads)
         return out
@@ -262,9 +279,7 @@ class Body:
         vector, lower = element_destinations(self.pattern, self.cells)
         columns = np.arange(3)  # the kernel's λ, μ, γ_r; column 3 is γ_m, which needs no elements
         by_theta = (columns[:, None] + 4 * vector[:, None, :]).reshape(len(self.cells), -1)
-        square = np.broadcast_to(
-            (columns[:, None] + 4 * columns).ravel(), (len(self.cells), 9)
-        )
+        square = np.broadcast_to((columns[:, None] + 4 * columns).ravel(), (len(self.cells), 9))
         whole = np.zeros((len(self.cells), 1), dtype=np.int64)
         places = {
             "energy": (whole, 1),
@@ -287,9 +302,7 @@ class Body:
         return Batch(kernel, self.cells, self.geometry, destinations, self._width(name))
 
 
-def _density(
-    volume_m3: float, density_kg_m3: float | None, mass_kg: float | None
-) -> float:
+def _density(volume_m3: float, density_kg_m3: float | None, mass_kg: float | None) -> float:
     if (density_kg_m3 is None) == (mass_kg is None):
         raise InputError("give exactly one of density_kg_m3 and mass_kg")
     density = density_kg_m3 if density_kg_m3 is not None else (mass_kg or 0.0) / volume_m3

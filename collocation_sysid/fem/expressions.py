@@ -71,7 +71,7 @@ def _material_gradient(point: _Point, field: ca.SX) -> ca.SX:
 
 
 def _to_nodes(point: _Point, stress: ca.SX) -> ca.SX:
-    """Contract columns of a (9, k) quantity conjugate to F with the shape gradients: (3·nodes, k)."""
+    """Contract columns of (9, k), conjugate to F, with the shape gradients: (3·nodes, k)."""
     columns = [
         ca.vec(ca.reshape(stress[:, k], 3, 3) @ point.gradients.T) for k in range(stress.shape[1])
     ]

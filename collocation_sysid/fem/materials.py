@@ -31,7 +31,9 @@ def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     """
     j = ca.det(F)
     return (
-        0.5 * mu_pa * (ca.sumsqr(F) - 3) - mu_pa * (j - 1) + 0.5 * (lambda_pa + mu_pa) * (j - 1) ** 2
+        0.5 * mu_pa * (ca.sumsqr(F) - 3)
+        - mu_pa * (j - 1)
+        + 0.5 * (lambda_pa + mu_pa) * (j - 1) ** 2
     )
 
 
@@ -57,9 +59,7 @@ def mooney_rivlin(
     c10 = 0.5 * mu_pa - c01
     bulk = lambda_pa + 2.0 / 3.0 * mu_pa
     shrink = ca.exp(ca.log(j) * (-2.0 / 3.0))
-    return (
-        c10 * (shrink * first - 3) + c01 * (shrink**2 * second - 3) + 0.5 * bulk * (j - 1) ** 2
-    )
+    return c10 * (shrink * first - 3) + c01 * (shrink**2 * second - 3) + 0.5 * bulk * (j - 1) ** 2
 
 
 def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:

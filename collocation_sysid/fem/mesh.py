@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,28 +96,34 @@ class TetMesh:
 
     points_m: np.ndarray
     tetrahedra: np.ndarray
-    point_arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    file_index: np.ndarray = field(init=False)
-    file_node_count: int = field(init=False)
-    notes: tuple[str, ...] = field(init=False)
+    point_arrays: dict[str, np.ndarray]
+    file_index: np.ndarray
+    file_node_count: int
+    notes: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        points = _checked_points(self.points_m)
-        tetrahedra = _checked_tetrahedra(self.tetrahedra, len(points))
-        arrays = _checked_point_arrays(self.point_arrays or {}, len(points))
-        used, renumbered = np.unique(tetrahedra, return_inverse=True)
+    def __init__(
+        self,
+        points_m: ArrayLike,
+        tetrahedra: ArrayLike,
+        point_arrays: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        points = _checked_points(points_m)
+        elements = _checked_tetrahedra(tetrahedra, len(points))
+        arrays = _checked_point_arrays(point_arrays or {}, len(points))
+        used, renumbered = np.unique(elements, return_inverse=True)
         _refuse_non_finite(points, used)
-        _refuse_duplicates(tetrahedra)
-        _refuse_degenerate(points, tetrahedra)
-        tetrahedra, reversed_elements = orient(points[used], renumbered.reshape(-1, 4))
+        _refuse_duplicates(elements)
+        _refuse_degenerate(points, elements)
+        kept = points[used]
+        oriented, reversed_elements = orient(kept, renumbered.reshape(-1, 4))
         notes = (
             *_note_dropped(len(points), used),
-            *_note_reversed(len(reversed_elements), len(tetrahedra)),
-            *_note_parts(points[used], tetrahedra),
+            *_note_reversed(len(reversed_elements), len(elements)),
+            *_note_parts(kept, oriented),
         )
         self._set(
-            points_m=_read_only(points[used]),
-            tetrahedra=_read_only(tetrahedra),
+            points_m=_read_only(kept),
+            tetrahedra=_read_only(oriented),
             point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
             file_index=_read_only(used),
             file_node_count=len(points),
@@ -177,7 +184,7 @@ class TetMesh:
 
         if isinstance(surface, (str, Path)):
             return meshing.mesh_surface_file(surface, edge_length_m, length_unit, cache)
-        points = np.asarray(surface[0], dtype=float) * length_in_metres(length_unit)
+        points = _checked_points(surface[0]) * length_in_metres(length_unit)
         return meshing.tetrahedralize_surface(points, surface[1], edge_length_m, cache)
 
     def write(self, path: str | Path) -> None:
@@ -185,7 +192,7 @@ class TetMesh:
         import meshio
 
         # Few formats have a boolean type.
-        arrays = {
+        arrays: dict[str, ArrayLike] = {
             name: values.astype(np.uint8) if values.dtype == bool else values
             for name, values in self.point_arrays.items()
         }
@@ -302,10 +309,15 @@ def cell_counts(data: Any) -> dict[str, int]:
 @contextlib.contextmanager
 def _meshio_failures(path: str | Path, done: str):
     """Turn whatever meshio does on a bad file into one InputError."""
-    # Its readers raise whatever their parsing trips over, print their reasons, and may exit.
+    # Its readers raise whatever their parsing trips over, print, warn, and may exit.
     said = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with (
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
             yield
     except (Exception, SystemExit) as error:
         reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
@@ -352,7 +364,9 @@ def _checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
         raise InputError(f"tetrahedra must hold integer node numbers, not {array.dtype}")
     bad = np.flatnonzero(((array < 0) | (array >= node_count)).any(axis=1))
     if len(bad):
-        hint = "; they seem to count from 1" if (array.min(), array.max()) == (1, node_count) else ""
+        hint = (
+            "; they seem to count from 1" if (array.min(), array.max()) == (1, node_count) else ""
+        )
         raise InputError(
             f"element {bad[0]} has nodes {array[bad[0]].tolist()}, but there are {node_count} "
             f"nodes, counted from 0{hint} ({len(bad)} such in all)"
@@ -411,15 +425,18 @@ def _note_dropped(node_count: int, used: np.ndarray) -> tuple[str, ...]:
     dropped = np.setdiff1d(np.arange(node_count), used)
     if not len(dropped):
         return ()
-    return (f"{len(dropped)} of {node_count} nodes were dropped (node {dropped[0]} is the first): "
-            "no element uses them.",)
+    return (
+        f"{len(dropped)} of {node_count} nodes were dropped (node {dropped[0]} is the first): "
+        "no element uses them.",
+    )
 
 
 def _note_reversed(reversed_count: int, element_count: int) -> tuple[str, ...]:
     if not reversed_count:
         return ()
-    return (f"{reversed_count} of {element_count} elements had a negative volume "
-            "and were re-oriented.",)
+    return (
+        f"{reversed_count} of {element_count} elements had a negative volume and were re-oriented.",
+    )
 
 
 def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
@@ -430,7 +447,7 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
         return ()
     sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
     twins = n - len(np.unique(points, axis=0))
-    hint = f"; {twins} nodes lie exactly on others and may have to be merged" if twins else ""
+    hint = f"; {twins} of {n} nodes lie exactly on others: merge them" if twins else ""
     return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,8 +27,8 @@ class Box:
         Lowest and highest coordinates in metres.
     """
 
-    low_m: tuple[float, float, float]
-    high_m: tuple[float, float, float]
+    low_m: Sequence[float]
+    high_m: Sequence[float]
 
     def __post_init__(self) -> None:
         low, high = _triple(self.low_m, "box: low_m"), _triple(self.high_m, "box: high_m")
@@ -44,18 +44,17 @@ class Box:
     def resolve(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
         slack = _round_off_m(mesh)
-        inside = (mesh.points_m >= np.subtract(self.low_m, slack)) & (
-            mesh.points_m <= np.add(self.high_m, slack)
-        )
+        above = mesh.points_m >= np.subtract(self.low_m, slack)
+        below = mesh.points_m <= np.add(self.high_m, slack)
         low, high = (", ".join(f"{x:g}" for x in corner) for corner in (self.low_m, self.high_m))
-        return _chosen(inside.all(axis=1), mesh, f"the box from ({low}) to ({high}) m")
+        return _chosen(np.all(above & below, axis=1), mesh, f"the box from ({low}) to ({high}) m")
 
 
 @dataclass(frozen=True)
 class Ball:
     """The nodes at most `radius_m` away from `center_m`, both in metres."""
 
-    center_m: tuple[float, float, float]
+    center_m: Sequence[float]
     radius_m: float
 
     def __post_init__(self) -> None:
@@ -79,14 +78,13 @@ class Indices:
     These differ from the rows of `mesh.points_m` where unused nodes were dropped.
     """
 
-    indices: tuple[int, ...]
+    indices: Sequence[int]
 
     def __post_init__(self) -> None:
-        given = [self.indices] if np.ndim(self.indices) == 0 else list(self.indices)
-        for index in given:
-            if not isinstance(index, (int, np.integer)) or isinstance(index, bool):
-                raise InputError(f"indices must be whole node numbers, not {index!r}")
-        object.__setattr__(self, "indices", tuple(int(index) for index in given))
+        given = np.atleast_1d(np.asarray(self.indices))
+        if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+            raise InputError(f"indices must be a list of whole node numbers, not {self.indices!r}")
+        object.__setattr__(self, "indices", tuple(given.tolist()))
 
     def resolve(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""

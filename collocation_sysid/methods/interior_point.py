@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import re
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -21,6 +23,8 @@ from .start import initial_variables
 
 Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
+
+Hessian = Literal["exact", "gauss-newton", "limited-memory"]
 
 IPOPT_STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -54,6 +58,10 @@ class InteriorPointOptions:
     ----------
     hessian : {"exact", "gauss-newton", "limited-memory"}
         Second derivatives of the Lagrangian: all of them, the loss's only, or IPOPT's own.
+    warm_up : float
+        An exact Hessian leaves the constraints' curvature out while an iteration still changes a
+        parameter by more than this share: far from the answer, multipliers of a large residual
+        make the full Hessian indefinite and the steps wild. 0 is exact from the start.
     linear_solver : str
         IPOPT's linear solver; the wheel brings "mumps" and "spral".
     tolerance : float
@@ -64,7 +72,8 @@ class InteriorPointOptions:
         Further IPOPT options by name; they win over the ones above.
     """
 
-    hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
+    hessian: Hessian = "exact"
+    warm_up: float = 0.1
     linear_solver: str = "mumps"
     tolerance: float = 1e-8
     max_iterations: int = 200
@@ -93,21 +102,37 @@ def solve(
     -------
     Solution
         Also when it did not converge, or was interrupted (Ctrl-C): then the best iterate.
+
+    Raises
+    ------
+    InputError
+        If IPOPT does not know an option.
     """
     options = options or InteriorPointOptions()
+    if options.hessian not in get_args(Hessian):
+        known = ", ".join(get_args(Hessian))
+        raise InputError(f"no hessian {options.hessian!r}; available: {known}", None, "solver")
     began = time.perf_counter()
     notes: list[str] = []
     if start is None:
         start, notes = initial_variables(collocation)
-    functions = _Functions(collocation, gauss_newton=options.hessian == "gauss-newton")
-    monitor = _Monitor(collocation, watch, began)
+    errors: list[BaseException] = []
+    functions = _Functions(collocation, options, errors)
+    monitor = _Monitor(collocation, watch, began, errors)
     solver = _build_solver(functions, monitor, options)
     lower, upper = collocation.bounds()
     built = time.perf_counter()
     with _interruptible(monitor):
         answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
+    if errors:
+        raise errors[0]
     stats = solver.stats()
     total = time.perf_counter() - began
+    if stats["return_status"] == "Invalid_Option":
+        notes.append(
+            f"linear_solver = '{options.linear_solver}' needs a library that is not installed; "
+            "'mumps' and 'spral' come with CasADi"
+        )
     status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_FAILURE)
     z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
     if not status.converged and monitor.best is not None:
@@ -138,39 +163,42 @@ def _build_solver(
     collocation = functions.collocation
     z = ca.MX.sym("z", collocation.variables)
     value, rows = functions.nlp(z, ca.MX(0, 1))
-    settings: dict[str, object] = {
+    settings: dict[str, Any] = {
         "ipopt.linear_solver": options.linear_solver,
         "ipopt.tol": options.tolerance,
         "ipopt.max_iter": options.max_iterations,
         "ipopt.max_wall_time": options.max_time_s,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
-        # The NLP is scaled already, and only the parameters have bounds: a small barrier suffices.
-        "ipopt.nlp_scaling_method": "none",
-        "ipopt.mu_init": 1e-3,
+        "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
         "print_time": False,
         "error_on_fail": False,
+        "show_eval_warnings": False,  # a trial step that inverts an element is cut back
         "no_nlp_grad": True,
         "jac_g": functions.jacobian,
         "grad_f": functions.gradient,
         "iteration_callback": monitor,
     }
-    if options.linear_solver == "mumps":
-        settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
     if options.hessian == "limited-memory":
         settings["ipopt.hessian_approximation"] = "limited-memory"
     else:
         settings["hess_lag"] = functions.hessian
     settings |= {f"ipopt.{name}": value for name, value in options.ipopt.items()}
+    said = io.StringIO()
     try:
-        return ca.nlpsol("solver", "ipopt", {"x": z, "f": value, "g": rows}, settings)
+        with redirect_stdout(said):  # where IPOPT says which setting it refuses
+            return ca.nlpsol("solver", "ipopt", {"x": z, "f": value, "g": rows}, settings)
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1]
+        reason = (said.getvalue().strip() or str(error).strip().splitlines()[-1]).splitlines()[0]
+        reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
         raise InputError(f"IPOPT cannot be set up: {reason}", None, "solver") from error
 
 
 class _Timed(ca.Callback):
-    """A CasADi function of (z, …) whose outputs are written straight into CasADi's memory."""
+    """A CasADi function of (z, …) whose outputs are written straight into CasADi's memory.
+
+    CasADi would print exceptions and go on: they are put in `errors`, for `solve` to raise.
+    """
 
     def __init__(
         self,
@@ -178,9 +206,11 @@ class _Timed(ca.Callback):
         inputs: list[ca.Sparsity],
         outputs: list[ca.Sparsity],
         evaluate: Callable[[list[Array], list[Array | None]], None],
+        errors: list[BaseException],
     ) -> None:
         ca.Callback.__init__(self)
         self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
+        self._errors = errors
         self.seconds = 0.0
         self.construct(name)
 
@@ -201,10 +231,14 @@ class _Timed(ca.Callback):
 
     def eval_buffer(self, arguments, results) -> int:
         began = time.perf_counter()
-        self._evaluate(
-            [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
-            [np.frombuffer(r) if r is not None else None for r in results],
-        )
+        try:
+            self._evaluate(
+                [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
+                [np.frombuffer(r) if r is not None else None for r in results],
+            )
+        except BaseException as error:
+            self._errors.append(error)
+            return 1
         self.seconds += time.perf_counter() - began
         return 0
 
@@ -212,8 +246,16 @@ class _Timed(ca.Callback):
 class _Functions:
     """The NLP's functions as CasADi callbacks over the shared assembly."""
 
-    def __init__(self, collocation: Collocation, gauss_newton: bool) -> None:
+    def __init__(
+        self,
+        collocation: Collocation,
+        options: InteriorPointOptions,
+        errors: list[BaseException],
+    ) -> None:
         self.collocation = collocation
+        self._exact = options.hessian == "exact"
+        self._warm_up = options.warm_up
+        self._last_q = np.full(collocation.nq, np.inf)
         variables, rows = collocation.variables, collocation.constraints
         z, g = ca.Sparsity.dense(variables, 1), ca.Sparsity.dense(rows, 1)
         p, scalar = ca.Sparsity(0, 1), ca.Sparsity.dense(1, 1)
@@ -244,15 +286,22 @@ class _Functions:
         def hessian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
             point, _, weight, multipliers = inputs
             (entries,) = outputs
-            if gauss_newton:
+            if not self._wants_curvature(point[: collocation.nq]):
                 multipliers = np.zeros_like(multipliers)
             if entries is not None:
                 collocation.hessian_values(point, float(weight[0]), multipliers, entries)
 
-        self.nlp = _Timed("nlp", [z, p], [scalar, g], nlp)
-        self.gradient = _Timed("grad_f", [z, p], [scalar, z], gradient)
-        self.jacobian = _Timed("jac_g", [z, p], [g, jacobian], jacobian_values)
-        self.hessian = _Timed("hess_lag", [z, p, scalar, g], [hessian], hessian_values)
+        self.nlp = _Timed("nlp", [z, p], [scalar, g], nlp, errors)
+        self.gradient = _Timed("grad_f", [z, p], [scalar, z], gradient, errors)
+        self.jacobian = _Timed("jac_g", [z, p], [g, jacobian], jacobian_values, errors)
+        inputs = [z, p, scalar, g]
+        self.hessian = _Timed("hess_lag", inputs, [hessian], hessian_values, errors)
+
+    def _wants_curvature(self, q: Array) -> bool:
+        """Whether the Hessian at q is to have the constraints' curvature, see `warm_up`."""
+        moved = np.abs(q - self._last_q).max(initial=0.0)
+        self._last_q = q.copy()
+        return self._exact and (self._warm_up == 0 or bool(moved < self._warm_up))
 
     @property
     def seconds(self) -> float:
@@ -268,8 +317,15 @@ def _ints(values: NDArray[np.int64]) -> list[int]:
 class _Monitor(ca.Callback):
     """Follows the iterates: history, best point, and the wish to stop."""
 
-    def __init__(self, collocation: Collocation, watch: Watch | None, began: float) -> None:
+    def __init__(
+        self,
+        collocation: Collocation,
+        watch: Watch | None,
+        began: float,
+        errors: list[BaseException],
+    ) -> None:
         ca.Callback.__init__(self)
+        self.errors = errors
         self.collocation = collocation
         self.watch = watch
         self.began = began
@@ -298,6 +354,14 @@ class _Monitor(ca.Callback):
 
     def eval(self, arguments):
         began = time.perf_counter()
+        try:
+            self._follow(arguments)
+        except BaseException as error:
+            self.errors.append(error)
+        self.seconds += time.perf_counter() - began
+        return [1 if self.stop or self.errors else 0]
+
+    def _follow(self, arguments) -> None:
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
@@ -315,8 +379,6 @@ class _Monitor(ca.Callback):
         self.history.append(iteration)
         if self.watch is not None:
             self.watch(iteration)
-        self.seconds += time.perf_counter() - began
-        return [1 if self.stop else 0]
 
 
 @contextmanager

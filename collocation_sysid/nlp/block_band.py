@@ -186,7 +186,7 @@ class _Slab:
         """Place in the slab of given entries of the block at `offset`."""
         k = [b.offset for b in self.blocks].index(offset)
         block = self.blocks[k]
-        width = int(max(block.rows.max(), np.max(rows))) + 1
+        width = int(max(block.rows.max(), np.max(rows, initial=0))) + 1
         codes = block.columns * width + block.rows
         sorter = np.argsort(codes)
         wanted = np.asarray(columns) * width + rows

@@ -148,8 +148,8 @@ class Collocation:
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z; equal for what is given."""
         lower, upper = self.parameters.bounds_q
-        parts = [segment.bounds() for segment in self.segments]
-        return self.pack(lower, [low for low, _ in parts]), self.pack(upper, [up for _, up in parts])
+        lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
+        return self.pack(lower, lows), self.pack(upper, highs)
 
     # Objective --------------------------------------------------------------------------------
 
@@ -157,8 +157,7 @@ class Collocation:
         """L divided by the number of measurements."""
         q, positions = self.unpack(z)
         loss = sum(
-            segment.observation.loss(x)
-            for segment, x in zip(self.segments, positions, strict=True)
+            segment.observation.loss(x) for segment, x in zip(self.segments, positions, strict=True)
         )
         residuals, _ = self.parameters.prior(q)
         return self.loss_scale * (loss + float(residuals @ residuals))
@@ -188,7 +187,7 @@ class Collocation:
 
     @cached_property
     def jacobian_structure(self) -> tuple[Index, Index]:
-        """indptr and indices of ∂g/∂z by compressed columns."""
+        """Column pointers and row indices of ∂g/∂z by compressed columns."""
         dense = np.arange(self.nq + 1) * self.constraints
         indptr, indices = [dense], [np.tile(np.arange(self.constraints), self.nq)]
         used = int(dense[-1])
@@ -222,7 +221,7 @@ class Collocation:
 
     @cached_property
     def hessian_structure(self) -> tuple[Index, Index]:
-        """indptr and indices of the upper triangle of ∇²_z (w L + yᵀ g) by compressed columns."""
+        """The same of the upper triangle of ∇²_z (w L + yᵀ g)."""
         counts = np.arange(self.nq + 1)
         indptr = [counts * (counts + 1) // 2]
         indices = [np.concatenate([np.arange(k) for k in counts])]

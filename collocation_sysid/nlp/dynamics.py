@@ -122,11 +122,11 @@ class Dynamics:
         return result
 
     def residual(self, x: Array, theta: Theta) -> Array:
-        """c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
+        """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
         return self.assemble_residual(x, self.body.force(*self.evaluation_states(x), theta))
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
-        """c (N, 3n) from the internal forces (N − first_row, 3n) at the evaluation states."""
+        """The same from the internal forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
         total[self.first_row :] = force + self.external_force_n
         inertia = self.combine(self.tables.s, x) / self.step_s**2

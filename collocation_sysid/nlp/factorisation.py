@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from ..fem.pattern import SymmetricPattern
 
@@ -25,11 +25,16 @@ Index = NDArray[np.int64]
 # Above this share of the matrix size SuperLU's fill-in is cheaper than the band's.
 WIDE_BAND = 0.4
 
+_pbtrf, _pbtrs = get_lapack_funcs(("pbtrf", "pbtrs"), dtype=np.float64)
+
 
 class Factor(Protocol):
     """A factorised matrix on the free degrees of freedom."""
 
-    positive_definite: bool
+    @property
+    def positive_definite(self) -> bool:
+        """Whether the matrix is positive definite."""
+        ...
 
     def solve(self, right: Array) -> Array:
         """Solve for (k,) or (k, m) right-hand sides in the order of the free dofs."""
@@ -44,7 +49,7 @@ class _BandFactor:
 
     def solve(self, right: Array) -> Array:
         permuted = right[self.order]
-        solved, _ = lapack.dpbtrs(self.band, permuted, lower=1)
+        solved, _ = _pbtrs(self.band, permuted, lower=1)
         result = np.empty_like(right)
         result[self.order] = solved.reshape(right.shape)
         return result
@@ -52,11 +57,11 @@ class _BandFactor:
 
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
-    lu: object
+    lu: SuperLU
     positive_definite: bool
 
     def solve(self, right: Array) -> Array:
-        return self.lu.solve(right)  # type: ignore[attr-defined]
+        return self.lu.solve(right)
 
 
 class Factoriser:
@@ -101,7 +106,7 @@ class Factoriser:
         if self.half_bandwidth <= WIDE_BAND * self._size or self._size < 200:
             band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
             band[self._band_rows, self._band_columns] = values[self._kept]
-            factor, failed_at = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+            factor, failed_at = _pbtrf(band, lower=1, overwrite_ab=1)
             if failed_at == 0:
                 return _BandFactor(factor, self._order)
             return self._sparse(values, known_indefinite=True)
@@ -113,13 +118,17 @@ class Factoriser:
             shape=(self._size, self._size),
         )
         try:
-            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True},
-                      diag_pivot_thresh=0.0 if not known_indefinite else 0.1)
+            lu = splu(
+                matrix,
+                permc_spec="MMD_AT_PLUS_A",
+                options={"SymmetricMode": True},
+                diag_pivot_thresh=0.0 if not known_indefinite else 0.1,
+            )
         except RuntimeError as error:
             raise np.linalg.LinAlgError(str(error)) from error
-        definite = (
-            not known_indefinite
-            and bool((lu.perm_r == lu.perm_c).all())
-            and bool((lu.U.diagonal() > 0).all())
-        )
-        return _SparseFactor(lu, definite)
+        if known_indefinite:
+            return _SparseFactor(lu, positive_definite=False)
+        if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
+            return _SparseFactor(lu, positive_definite=True)
+        # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
+        return self._sparse(values, known_indefinite=True)

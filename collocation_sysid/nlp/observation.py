@@ -63,18 +63,18 @@ class Observation:
 
     def hessian(self, pattern: SymmetricPattern) -> tuple[Index, Array]:
         """∂²L/∂x_t², constant, as lower-triangle positions (k,) and values (T, k)."""
-        operator = sp.csr_array(self.markers.operator)
+        operator = sp.coo_array(self.markers.operator)
+        row_of, dof_of = (np.asarray(index, dtype=np.int64) for index in operator.coords)
+        count = 3 * len(self.markers.names)
         per_row = []
-        for row in range(operator.shape[0]):
-            span = slice(operator.indptr[row], operator.indptr[row + 1])
-            dofs, values = operator.indices[span], operator.data[span]
+        for row in range(count):
+            here = row_of == row
+            dofs, values = dof_of[here], operator.data[here]
             a, b = np.triu_indices(len(dofs))
             per_row.append(
                 (np.full(len(a), row), pattern.position(dofs[a], dofs[b]), values[a] * values[b])
             )
         rows, positions, products = (np.concatenate(part) for part in zip(*per_row, strict=True))
         places, index = np.unique(positions, return_inverse=True)
-        spread = sp.csr_array(
-            (products, (index, rows)), shape=(len(places), operator.shape[0])
-        )
+        spread = sp.csr_array((products, (index, rows)), shape=(len(places), count))
         return places, 2 * (spread @ (self._weights**2).T).T

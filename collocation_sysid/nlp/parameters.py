@@ -11,7 +11,7 @@ and the map q → θ with its derivatives is a CasADi expression.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -84,8 +84,7 @@ class Parameter:
             )
         if not self.lower <= self.guess <= self.upper:
             raise InputError(
-                f"guess = {self.guess:g}, expected a value within "
-                f"[{self.lower:g}, {self.upper:g}]",
+                f"guess = {self.guess:g}, expected a value within [{self.lower:g}, {self.upper:g}]",
                 None,
                 self.name,
             )
@@ -166,7 +165,7 @@ class Parameters:
 
     def theta(self, q: Sequence[float] | Array) -> Theta:
         """Physical parameters at q (nq,)."""
-        return Theta(*np.ravel(self._map(np.asarray(q))[0].full()))
+        return Theta(*self._map(np.asarray(q))[0].full().ravel().tolist())
 
     def theta_derivatives(self, q: Array) -> tuple[Array, Array]:
         """∂θ/∂q (4, nq) and ∂²θ/∂q² (4, nq, nq)."""
@@ -189,9 +188,15 @@ class Parameters:
         return residuals, slopes
 
     def with_guess(self, values: Mapping[str, float]) -> Parameters:
-        """The same parameters with other guesses (fixed ones included)."""
-        from dataclasses import replace
+        """The same parameters with other guesses (fixed ones included).
 
+        Raises
+        ------
+        InputError
+            For a name that is not among them, or a guess out of bounds.
+        """
+        if unknown := sorted(set(values) - set(self.names)):
+            raise InputError(f"no parameter {unknown[0]!r}; there are {', '.join(self.names)}")
         return Parameters(
             tuple(replace(i, guess=values[i.name]) if i.name in values else i for i in self.items)
         )
@@ -203,7 +208,7 @@ def as_theta(parameters: Parameters | Mapping[str, float] | Sequence[float]) -> 
     Raises
     ------
     InputError
-        If names are missing.
+        If names or numbers are missing.
     """
     if isinstance(parameters, Parameters):
         return parameters.theta(parameters.guess_q)
@@ -217,4 +222,7 @@ def as_theta(parameters: Parameters | Mapping[str, float] | Sequence[float]) -> 
                 tuple(Parameter(n, float(parameters[n]), fixed=True) for n in elastic + DAMPING)
             )
         )
+    if len(parameters) != len(Theta._fields):
+        expected = ", ".join(Theta._fields)
+        raise InputError(f"{len(parameters)} parameters given, expected four: {expected}")
     return Theta(*map(float, parameters))

@@ -77,14 +77,10 @@ SCHEMES: dict[str, Scheme] = {
     "bdf2": Scheme(
         "bdf2",
         2,
-        Stencil(
-            p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -24 / 4, 22 / 4, -8 / 4, 1 / 4)
-        ),
+        Stencil(p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -24 / 4, 22 / 4, -8 / 4, 1 / 4)),
         (
             _FIRST_STEP,
-            Stencil(
-                p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -20 / 4, 11 / 4), r=0.5
-            ),
+            Stencil(p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -20 / 4, 11 / 4), r=0.5),
             Stencil(p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -24 / 4, 21 / 4, -6 / 4)),
         ),
     ),

@@ -147,16 +147,11 @@ class Segment:
                 )
                 for j, a, b in self.dynamics.block_terms(lag)
             ]
-            if terms:
-                kept = whole.copy()
-            else:
-                kept = whole & (rows == columns)
+            kept = whole.copy() if terms else whole & (rows == columns)
             if lag == 0 and self.explicit_grasps:
                 kept |= ~free[rows] & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
-            blocks.append(
-                Block(lag, row_place[rows[kept]], columns[kept], source[kept], terms)
-            )
+            blocks.append(Block(lag, row_place[rows[kept]], columns[kept], source[kept], terms))
         return BlockBand(self.dofs, self._row_starts(), blocks)
 
     @cached_property
@@ -179,9 +174,7 @@ class Segment:
             grasps = self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel()
         return np.concatenate(positions), np.concatenate(values), grasps
 
-    def jacobian_values(
-        self, x: Array, theta: Theta, theta_q: Array, values: Array
-    ) -> Array:
+    def jacobian_values(self, x: Array, theta: Theta, theta_q: Array, values: Array) -> Array:
         """Write ∂c/∂x into `values` (jacobian.nnz,) and return ∂c/∂q, (constraints, nq).
 
         Parameters
@@ -277,7 +270,7 @@ class Segment:
         mixed[1, first:] = curvature.velocity_theta @ (theta_q / dynamics.step_s)
         by_theta = dynamics.combine_transposed(dynamics.tables.p, mixed[0])
         by_theta += dynamics.combine_transposed(dynamics.tables.q, mixed[1])
-        values[band.top_positions] = self.length_m * by_theta.reshape(-1, self.nq)
+        values[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
         return curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
 
     @cached_property

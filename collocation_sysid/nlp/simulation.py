@@ -21,6 +21,8 @@ from .parameters import Parameters, Theta, as_theta
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Progress = Callable[[float], None]
+Residual = Callable[[Array], Array]
+Linearise = Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,8 @@ class Solver:
     def newton(
         self,
         x: Array,
-        residual: Callable[[Array], Array],
-        linearise: Callable[[Array], tuple[Array, Array]],
+        residual: Residual,
+        linearise: Linearise,
         keep_definite: bool = False,
     ) -> Array:
         """Solve residual(x) = 0 for the free dofs, starting at x (3n,).
@@ -119,13 +121,17 @@ class Solver:
             if length <= tolerance:
                 x[self.free] += step
                 return x
-            x, factor, value = self._backtrack(
-                x, step, factor, residual, linearise, keep_definite
-            )
+            x, factor, value = self._backtrack(x, step, factor, residual, linearise, keep_definite)
         raise _NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
 
     def _backtrack(
-        self, x, step, factor, residual, linearise, keep_definite
+        self,
+        x: Array,
+        step: Array,
+        factor: Factor,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool,
     ) -> tuple[Array, Factor, Array]:
         length = np.linalg.norm(step)
         share = 1.0
@@ -176,7 +182,10 @@ def _fail(solver: Solver, failure: _NewtonFailure, time_s: float, what: str) -> 
 
 
 def rest_state(
-    experiment: Experiment, theta: Theta, time_s: float | None = None, start: Array | None = None,
+    experiment: Experiment,
+    theta: Theta,
+    time_s: float | None = None,
+    start: Array | None = None,
     solver: Solver | None = None,
 ) -> Array:
     """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
@@ -320,9 +329,7 @@ def march(
 class _Row:
     """Row t of the discrete equations as a function of x_t alone."""
 
-    def __init__(
-        self, dynamics: Dynamics, theta: Theta, x: Array, forces: Array, t: int
-    ) -> None:
+    def __init__(self, dynamics: Dynamics, theta: Theta, x: Array, forces: Array, t: int) -> None:
         self.dynamics, self.theta = dynamics, theta
         table, step, mass = dynamics.tables, dynamics.step_s, dynamics.body.dof_mass
         past = range(1, min(dynamics.reach, t) + 1)

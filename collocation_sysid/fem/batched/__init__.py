@@ -21,18 +21,18 @@ __all__ = [
     "Batch",
     "Evaluator",
     "available_threads",
+    "choose_evaluator",
     "in_slices",
     "make_combiner",
     "make_evaluator",
 ]
 
 
-def make_evaluator(batch: Batch, choice: str = "auto") -> Evaluator:
-    """Build the evaluator of a batch.
+def choose_evaluator(choice: str = "auto") -> str:
+    """Settle on "simd" or "casadi".
 
     Parameters
     ----------
-    batch : Batch
     choice : {"auto", "simd", "casadi"}
         "auto" yields to the environment variable ``COLLOCATION_SYSID_EVALUATOR``.
 
@@ -48,7 +48,12 @@ def make_evaluator(batch: Batch, choice: str = "auto") -> Evaluator:
     has_llvm = find_spec("llvmlite") is not None
     if choice == "simd" and not has_llvm:
         raise InputError("evaluator 'simd' needs llvmlite: pip install llvmlite, or use 'casadi'")
-    if choice == "casadi" or not has_llvm:
+    return "casadi" if choice == "casadi" or not has_llvm else "simd"
+
+
+def make_evaluator(batch: Batch, choice: str = "auto") -> Evaluator:
+    """Build the evaluator of a batch, see `choose_evaluator`."""
+    if choose_evaluator(choice) == "casadi":
         from .casadi_map import CasadiEvaluator
 
         return CasadiEvaluator(batch)

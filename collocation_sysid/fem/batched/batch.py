@@ -41,8 +41,6 @@ class Batch:
 class Evaluator(Protocol):
     """Sums a batch's kernel over elements and quadrature points, for each timestep."""
 
-    def __call__(
-        self, fields: Sequence[Array], theta: Array, out: Array, threads: int
-    ) -> None:
+    def __call__(self, fields: Sequence[Array], theta: Array, out: Array, threads: int) -> None:
         """Overwrite `out` (T, width) from `fields`, each (T, 3n) contiguous, and θ (3,)."""
         ...

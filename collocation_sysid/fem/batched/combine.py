@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,30 @@ Index = NDArray[np.int64]
 class Plan(Protocol):
     """What to combine, see `nlp.block_band.CombinePlan`."""
 
-    first_task: Index
-    tasks: Index
-    coefficients: Array
-    targets: NDArray[np.int32]
-    sources: NDArray[np.int32]
+    @property
+    def first_task(self) -> Index:
+        """(N + 1,) where each column block's tasks begin and end."""
+        ...
+
+    @property
+    def tasks(self) -> Index:
+        """(tasks, 5) out, map start, map length, row, 1 to add or 0 to overwrite."""
+        ...
+
+    @property
+    def coefficients(self) -> Array:
+        """(tasks, 2) a, b."""
+        ...
+
+    @property
+    def targets(self) -> NDArray[np.int32]:
+        """Concatenated maps: where to write, from out on."""
+        ...
+
+    @property
+    def sources(self) -> NDArray[np.int32]:
+        """Concatenated maps: which entry of the row to read."""
+        ...
 
 
 Combiner = Callable[[int, int, Array, Array, Array], None]
@@ -50,7 +69,7 @@ def combine_natively(plan: Plan) -> Combiner:
     from .jit import CompiledFunction
 
     signature = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 7
-    run = CompiledFunction(_emit, "combine", "combine 1", signature)
+    run = CompiledFunction(_emit, "combine", "combine", signature)
     constants = [
         array.ctypes.data for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
     ]
@@ -63,7 +82,7 @@ def combine_natively(plan: Plan) -> Combiner:
     return combine
 
 
-def _emit():  # noqa: ANN202  (llvmlite's types are only known when it is installed)
+def _emit() -> Any:
     from llvmlite import ir
 
     from .simd import DOUBLES, I32S, I64, counting
@@ -77,7 +96,7 @@ def _emit():  # noqa: ANN202  (llvmlite's types are only known when it is instal
     start, stop, stride, tasks, coefficients, targets, sources, a, b, values = function.args
     for pointer in function.args[3:]:
         pointer.add_attribute("noalias")
-    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
     with counting(builder, start, stop, "task") as task:
         first = builder.mul(task, I64(5))
         out, begin, length, row, add = (

@@ -1,7 +1,8 @@
 """Compile LLVM IR to native code for this CPU, with the object code kept on disk.
 
 The cache lives in the user's cache folder (or ``COLLOCATION_SYSID_CACHE``) and is keyed by the
-code's own key together with the LLVM version, the CPU and its features.
+code's own key, the sources that generate it, the LLVM version, the CPU and its features. A file
+is the code after its SHA-256 checksum.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from platformdirs import user_cache_path
 
 # Scalar functions that vector intrinsics fall back to; resolved from the C library by name.
 LIBM = ("log", "exp", "pow", "sin", "cos", "tan", "atan", "tanh", "sinh", "cosh")
+CHECKSUM_BYTES = hashlib.sha256().digest_size
 
 
 def cache_folder() -> Path:
@@ -72,7 +74,7 @@ class CompiledFunction:
     name : str
         The function to look up.
     key : str
-        Identifies the code: equal keys must mean equal IR.
+        Identifies the code: while the files of this folder stay, equal keys must mean equal IR.
     signature : list of ctypes types
     """
 
@@ -89,33 +91,54 @@ class CompiledFunction:
         self._call = ctypes.CFUNCTYPE(None, *signature)(address)
 
     def __call__(self, *arguments: object) -> None:
+        """Run it on integers and addresses, as in the signature."""
         self._call(*arguments)
 
 
-def _cached_object(
-    build: Callable[[], ir.Module], key: str, machine: llvm.TargetMachine
-) -> bytes:
+def _cached_object(build: Callable[[], ir.Module], key: str, machine: llvm.TargetMachine) -> bytes:
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
-    digest = hashlib.sha256(f"{host}\n{key}".encode()).hexdigest()
+    digest = hashlib.sha256(f"{host}\n{_generation()}\n{key}".encode()).hexdigest()
     path = cache_folder() / f"{digest[:32]}.o"
-    with suppress(OSError):
-        return path.read_bytes()
-    code = _compile(build(), machine)
-    with suppress(OSError):  # a read-only cache costs time, not correctness
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as temporary:
-            temporary.write(code)
-        os.replace(temporary.name, path)
+    code = _read_checked(path)
+    if code is None:
+        code = _compile(build(), machine)
+        with suppress(OSError):  # a read-only cache costs time, not correctness
+            _write_checked(path, code)
     return code
+
+
+@cache
+def _generation() -> str:
+    """Identify the code that emits and compiles: once it changes, old kernels must not be used."""
+    digest = hashlib.sha256()
+    for file in ("jit.py", "simd.py", "combine.py"):
+        digest.update(Path(__file__).with_name(file).read_bytes())
+    return digest.hexdigest()
+
+
+def _read_checked(path: Path) -> bytes | None:
+    """Object code as `_write_checked` left it; LLVM would end the process over a damaged one."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    checksum, code = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
+    return code if checksum == hashlib.sha256(code).digest() else None
+
+
+def _write_checked(path: Path, code: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        unfinished = Path(folder) / path.name
+        unfinished.write_bytes(hashlib.sha256(code).digest() + code)
+        unfinished.replace(path)
 
 
 def _compile(module: ir.Module, machine: llvm.TargetMachine) -> bytes:
     module.triple = machine.triple
     parsed = llvm.parse_assembly(str(module))
     parsed.verify()
-    builder = llvm.create_pass_builder(
-        machine, llvm.create_pipeline_tuning_options(speed_level=2)
-    )
+    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
     builder.getModulePassManager().run(parsed, builder)
     return machine.emit_object(parsed)

@@ -11,6 +11,7 @@ import ctypes
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,7 +25,7 @@ from .threads import in_slices
 
 DOUBLE, I32, I64 = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 DOUBLES, I32S = DOUBLE.as_pointer(), I32.as_pointer()
-LAYOUT = "2"  # part of the cache key: raise it when the emitted code changes
+Builder = Value = Any  # llvmlite is not annotated, and what is inferred of it is wrong
 
 
 class SimdEvaluator:
@@ -50,7 +51,7 @@ class SimdEvaluator:
         self._points = batch.geometry.shape[1]
         self._fields = len(kernel.fields)
         source = kernel.function.serialize()
-        key = f"{LAYOUT} {lanes} {self._points} {hashlib.sha256(source.encode()).hexdigest()}"
+        key = f"{lanes} {self._points} {hashlib.sha256(source.encode()).hexdigest()}"
         signature = [ctypes.c_int64] * 5 + [ctypes.c_void_p] * (self._fields + 5)
         self._run = CompiledFunction(
             lambda: _emit(kernel.function, self._fields, self._points, lanes),
@@ -85,9 +86,7 @@ def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray
 
 
 @contextmanager
-def counting(
-    builder: ir.IRBuilder, start: ir.Value, stop: ir.Value, name: str
-) -> Iterator[ir.Value]:
+def counting(builder: Builder, start: Value, stop: Value, name: str) -> Iterator[Value]:
     """A loop over start ≤ i < stop; yields i."""
     before = builder.block
     head = builder.append_basic_block(f"{name}.head")
@@ -120,34 +119,30 @@ class _Emitter:
         )
         self.size = function.nnz_in(0)
         self.module = ir.Module()
-        kind = ir.FunctionType(ir.VoidType(), [I64] * 5 + [DOUBLES] * fields + [
-            DOUBLES, I32S, I32S, DOUBLES, DOUBLES,
-        ])
+        constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
+        kind = ir.FunctionType(ir.VoidType(), [I64] * 5 + [DOUBLES] * fields + constants)
         self.run = ir.Function(self.module, kind, "run")
         for argument in self.run.args:
             if isinstance(argument.type, ir.PointerType):
                 argument.add_attribute("noalias")
-        self.builder = ir.IRBuilder(self.run.append_basic_block("entry"))
+        self.builder: Builder = ir.IRBuilder(self.run.append_basic_block("entry"))
 
     def emit(self) -> ir.Module:
         b, args = self.builder, self.run.args
         t0, t1, blocks, field_stride, out_stride = args[:5]
         field_rows = args[5 : 5 + self.fields]
         geometry, nodes, destinations, theta, out = args[5 + self.fields :]
-        gathered = [
-            self._buffer(self.size, f"field{k}") for k in range(self.fields)
-        ]
+        gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         total = int(self.output_offsets[-1])
         outputs = self._buffer(total, "outputs")
-        parameters = [
-            self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(self.sx.nnz_in(self.fields + 1))
-        ]
-        geometry_size = self.sx.nnz_in(self.fields)
+        geometry_size, theta_size = self.sx.nnz_in(self.fields), self.sx.nnz_in(self.fields + 1)
+        parameters = [self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(theta_size)]
         with counting(b, t0, t1, "t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
             with counting(b, I64(0), blocks, "block") as block:
-                self._gather(rows, b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))]), gathered)
+                here = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
+                self._gather(rows, here, gathered)
                 if self.points > 1:
                     with counting(b, I64(0), I64(total), "zero") as k:
                         self._store(self.vector(None), outputs, k)
@@ -161,29 +156,29 @@ class _Emitter:
         b.ret_void()
         return self.module
 
-    def _buffer(self, count: int, name: str) -> ir.Value:
+    def _buffer(self, count: int, name: str) -> Value:
         buffer = self.builder.alloca(DOUBLE, size=I64(count * self.lanes), name=name)
         buffer.align = 64
         return buffer
 
-    def _pointer(self, base: ir.Value, entry: ir.Value) -> ir.Value:
+    def _pointer(self, base: Value, entry: Value) -> Value:
         b = self.builder
         address = b.gep(base, [b.mul(entry, I64(self.lanes))])
         return b.bitcast(address, self.vector.as_pointer())
 
-    def _load(self, base: ir.Value, entry: ir.Value) -> ir.Value:
+    def _load(self, base: Value, entry: Value) -> Value:
         return self.builder.load(self._pointer(base, entry), align=8)
 
-    def _store(self, value: ir.Value, base: ir.Value, entry: ir.Value) -> None:
+    def _store(self, value: Value, base: Value, entry: Value) -> None:
         self.builder.store(value, self._pointer(base, entry), align=8)
 
-    def _splat(self, scalar: ir.Value) -> ir.Value:
-        value: ir.Value = ir.Constant(self.vector, ir.Undefined)
+    def _splat(self, scalar: Value) -> Value:
+        value: Value = ir.Constant(self.vector, ir.Undefined)
         for lane in range(self.lanes):
             value = self.builder.insert_element(value, scalar, I32(lane))
         return value
 
-    def _gather(self, rows: list, nodes: ir.Value, gathered: list) -> None:
+    def _gather(self, rows: list, nodes: Value, gathered: list) -> None:
         """Load the three coordinates of every node of W elements, field by field."""
         b = self.builder
         with counting(b, I64(0), I64(self.size // 3), "node") as node:
@@ -194,13 +189,13 @@ class _Emitter:
             ]
             for row, buffer in zip(rows, gathered, strict=True):
                 for axis in range(3):
-                    value: ir.Value = ir.Constant(self.vector, ir.Undefined)
+                    value: Value = ir.Constant(self.vector, ir.Undefined)
                     for lane, entry in enumerate(lanes):
                         scalar = b.load(b.gep(row, [b.add(entry, I64(axis))]))
                         value = b.insert_element(value, scalar, I32(lane))
                     self._store(value, buffer, b.add(b.mul(node, I64(3)), I64(axis)))
 
-    def _scatter(self, value: ir.Value, targets: ir.Value, k: ir.Value, row: ir.Value) -> None:
+    def _scatter(self, value: Value, targets: Value, k: Value, row: Value) -> None:
         """Add the W lanes of one output entry where their elements' destinations are."""
         b = self.builder
         first = b.mul(k, I64(self.lanes))
@@ -209,11 +204,9 @@ class _Emitter:
             address = b.gep(row, [target])
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
-    def _kernel(
-        self, gathered: list, geometry: ir.Value, parameters: list, outputs: ir.Value
-    ) -> None:
+    def _kernel(self, gathered: list, geometry: Value, parameters: list, outputs: Value) -> None:
         """Walk the SX instructions of one quadrature point."""
-        work: dict[int, ir.Value] = {}
+        work: dict[int, Value] = {}
         sx = self.sx
         for k in range(sx.n_instructions()):
             operation, source = sx.instruction_id(k), sx.instruction_input(k)
@@ -238,7 +231,7 @@ class _Emitter:
             else:
                 work[target[0]] = self._operate(operation, [work[i] for i in source])
 
-    def _operate(self, operation: int, operands: list) -> ir.Value:
+    def _operate(self, operation: int, operands: list) -> Value:
         b, x = self.builder, operands[0]
         fuse = ["contract"]
         binary = {
@@ -264,9 +257,11 @@ class _Emitter:
             name = f"llvm.{INTRINSICS[operation]}.v{self.lanes}f64"
             intrinsic = self.module.globals.get(name) or ir.Function(self.module, kind, name)
             return b.call(intrinsic, operands)
+        names = (name for name, number in vars(ca).items() if number == operation)
+        name = next((name for name in names if name.startswith("OP_")), operation)
         raise InputError(
-            f"the vector evaluator has no CasADi operation {operation}; "
-            "force evaluator='casadi' for this material"
+            f"the vector evaluator has no CasADi operation {name}; "
+            "choose evaluator='casadi' for this material"
         )
 
 

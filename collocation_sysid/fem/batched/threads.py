@@ -6,10 +6,11 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 
 
 def available_threads() -> int:
-    """Threads to use by default: the cores this process may run on, or ``COLLOCATION_SYSID_THREADS``."""
+    """``COLLOCATION_SYSID_THREADS``, or as many as there are cores that this process may use."""
     override = os.environ.get("COLLOCATION_SYSID_THREADS")
     if override:
         return max(1, int(override))
@@ -32,7 +33,7 @@ def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None
         return
     bounds = [count * k // threads for k in range(threads + 1)]
     pool = _pool(os.getpid(), threads)
-    others = [pool.submit(run, a, b) for a, b in zip(bounds[1:-1], bounds[2:], strict=True)]
+    others = [pool.submit(run, a, b) for a, b in pairwise(bounds[1:])]
     run(bounds[0], bounds[1])
     for other in others:
         other.result()

@@ -1,0 +1,68 @@
+"""One look for all figures: sizes in millimetres, small type, colours for every eye.
+
+Figures are `matplotlib.figure.Figure` objects without pyplot: no display, no global state.
+"""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
+
+# Okabe & Ito's palette, distinguishable with any colour vision.
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
+CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+
+TEXT_PT = 7.5
+SMALL_PT = 6.5
+LINE_PT = 1.1
+PAGE_MM = 180.0
+
+_GREY = "#606060"
+
+
+def new_figure(width_mm: float, height_mm: float) -> Figure:
+    """An empty figure that arranges itself."""
+    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr]
+    return figure
+
+
+def dress(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
+    """Give axes their labels, type sizes, and a quiet frame and grid."""
+    axes.set_title(title, fontsize=TEXT_PT, loc="left")
+    axes.set_xlabel(xlabel, fontsize=TEXT_PT)
+    axes.set_ylabel(ylabel, fontsize=TEXT_PT)
+    axes.tick_params(which="both", labelsize=SMALL_PT, width=0.6, color=_GREY)
+    axes.tick_params(which="major", length=2.5)
+    axes.tick_params(which="minor", length=1.5)
+    axes.yaxis.get_offset_text().set_fontsize(SMALL_PT)
+    axes.grid(True, which="major", color="#E4E4E4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set(linewidth=0.6, color=_GREY)
+
+
+def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
+    """Make the y axis logarithmic, with plain numbers where they are short.
+
+    The axis spans at least `least_ratio`, so that it never has fewer than two numbers.
+    """
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    widen = max(1.0, least_ratio / (high / low)) ** 0.5
+    axes.set_ylim(low / widen, high * widen)
+    few = high / low < 1e3
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
+    axes.yaxis.set_minor_locator(NullLocator())
+    if few and 1e-3 < low and high < 1e5:
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    else:
+        axes.yaxis.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False))

@@ -1,0 +1,127 @@
+"""Small experiments with known parameters: a few nodes, about ten timesteps, noiseless tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.experiment import Experiment, Grasp, Markers, PoseSequence, place_markers
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshing import box_mesh
+from collocation_sysid.nlp.parameters import Parameter, Parameters
+from collocation_sysid.nlp.simulation import simulate, with_markers
+
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+GUESS = Parameters(
+    (
+        Parameter("lambda_pa", 400.0, 10.0, 1e5),
+        Parameter("mu_pa", 150.0, 10.0, 1e5),
+        Parameter("gamma_r_s", 0.02, 1e-5, 1.0),
+        Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0),
+    )
+)
+GRAVITY_M_S2 = (0.0, 0.0, -9.81)
+EDGE_M = 0.1
+
+
+@cache
+def box(size_m: tuple[float, ...] = (EDGE_M,) * 3, divisions: tuple[int, ...] = (2, 2, 2)) -> Body:
+    """A foam box with a corner at the origin; bodies are shared, their kernels compile once."""
+    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0)
+
+
+def nodes_where(body: Body, axis: int, value_m: float) -> np.ndarray:
+    """Nodes on a plane across an axis."""
+    return np.flatnonzero(np.abs(body.nodes_m[:, axis] - value_m) < 1e-9)
+
+
+def smooth_poses(
+    t_s: np.ndarray,
+    sway_m: Sequence[float] = (0.02, 0.01, -0.015),
+    turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
+    angular_frequency_rad_s: float = 20.0,
+) -> PoseSequence:
+    """A motion that starts at rest from the identity, sampled from its formula."""
+    share = 1 - np.cos(angular_frequency_rad_s * t_s)
+    turns = Rotation.from_rotvec(np.outer(share, turn_rad))
+    return PoseSequence(t_s, np.outer(share, sway_m), turns.as_quat())
+
+
+def vertex_markers(body: Body, nodes: ArrayLike, t_s: np.ndarray) -> Markers:
+    """Markers on mesh vertices, not measured yet."""
+    return point_markers(body, body.nodes_m[np.asarray(nodes)], t_s)
+
+
+def point_markers(body: Body, points_m: np.ndarray, t_s: np.ndarray) -> Markers:
+    """Markers at points of the undeformed body, not measured yet."""
+    names = tuple(f"m{k}" for k in range(len(points_m)))
+    nowhere = np.zeros((len(t_s), len(points_m), 3))
+    placement = place_markers(points_m, body.nodes_m, body)
+    return Markers(names, t_s, nowhere, np.full(len(names), 1e-3), placement)
+
+
+def times(steps: int, timestep_s: float = 0.01) -> np.ndarray:
+    """0, Δt, …, `steps` Δt."""
+    return timestep_s * np.arange(steps + 1)
+
+
+def hung_cube(steps: int = 10, divisions: tuple[int, ...] = (2, 2, 2), **changes) -> Experiment:
+    """A cube hung from its top face, swayed and turned from rest."""
+    body, t_s = box(divisions=divisions), times(steps)
+    grasp = Grasp(nodes_where(body, 2, EDGE_M), smooth_poses(t_s))
+    markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
+    return _experiment("hung cube", body, t_s, (grasp,), markers, **changes)
+
+
+def released_cube(steps: int = 10) -> Experiment:
+    """A cube held still at its top face, let go undeformed under gravity."""
+    body, t_s = box(), times(steps)
+    grasp = Grasp(nodes_where(body, 2, EDGE_M), PoseSequence.fixed())
+    markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
+    return _experiment("released cube", body, t_s, (grasp,), markers, start="undeformed")
+
+
+def bar_in_two_hands(steps: int = 10) -> Experiment:
+    """A bar held at both ends, one of which moves."""
+    body, t_s = box((0.15, 0.05, 0.05), (4, 1, 1)), times(steps)
+    still = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
+    moving = Grasp(nodes_where(body, 0, 0.15), smooth_poses(t_s))
+    inside = np.flatnonzero((body.nodes_m[:, 0] > 0.01) & (body.nodes_m[:, 0] < 0.14))
+    markers = vertex_markers(body, inside, t_s)
+    return _experiment("bar in two hands", body, t_s, (still, moving), markers)
+
+
+def cube_with_gaps(steps: int = 12) -> Experiment:
+    """The hung cube seen through markers inside elements, a quarter of their samples missing."""
+    hung = hung_cube(steps)
+    rng = np.random.default_rng(4)
+    points = rng.uniform(0.005, 0.6 * EDGE_M, size=(6, 3))
+    markers = point_markers(hung.body, points, hung.t_s)
+    tracks = np.zeros_like(markers.positions_m)
+    tracks[rng.random(tracks.shape[:2]) < 0.25] = np.nan
+    unmeasured = Markers(markers.names, hung.t_s, tracks, markers.sigma_m, markers.placement)
+    return _experiment("cube with gaps", hung.body, hung.t_s, hung.grasps, unmeasured)
+
+
+SMALL_EXPERIMENTS = {
+    "hung-cube": hung_cube,
+    "released-cube": released_cube,
+    "bar-in-two-hands": bar_in_two_hands,
+    "cube-with-gaps": cube_with_gaps,
+}
+
+
+def measured(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Experiment:
+    """The experiment with the tracks that `TRUTH` gives it; missing samples stay missing."""
+    tracks = simulate(experiment, TRUTH, scheme, substeps=substeps).markers_m
+    present = experiment.markers.present[:, :, None]
+    return with_markers(experiment, np.where(present, tracks, np.nan))
+
+
+def _experiment(name, body, t_s, grasps, markers, **changes) -> Experiment:
+    gravity = changes.pop("gravity_m_s2", np.array(GRAVITY_M_S2))
+    return Experiment(name, body, t_s, grasps, markers, gravity, **changes)

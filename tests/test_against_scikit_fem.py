@@ -1,0 +1,125 @@
+"""Forces and stiffness against an independent library, with stresses written by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import skfem
+from checks import relative_error
+from skfem.models.elasticity import linear_elasticity
+
+from collocation_sysid.fem.materials import MATERIALS
+
+LAMBDA_PA, MU_PA = 200.0, 300.0
+
+
+class Library:
+    """Scikit-fem's assembly on the same mesh, in this package's order of unknowns."""
+
+    def __init__(self, mesh) -> None:
+        self.basis = skfem.Basis(
+            skfem.MeshTet(mesh.points_m.T.copy(), mesh.tetrahedra.T.copy()),
+            skfem.ElementVector(skfem.ElementTetP1()),
+            intorder=1,
+        )
+        nodal_dofs = np.asarray(self.basis.nodal_dofs)
+        self.dofs = nodal_dofs.T.ravel()  # node after node, xyz in each
+        self.points_m = mesh.points_m
+
+    def displacement(self, positions):
+        nodal = np.zeros(self.basis.N)
+        nodal[self.dofs] = (positions - self.points_m).ravel()
+        return self.basis.interpolate(nodal)
+
+    def scalar(self, form, positions) -> float:
+        return skfem.Functional(form).assemble(self.basis, u=self.displacement(positions))
+
+    def vector(self, form, positions) -> np.ndarray:
+        u = self.displacement(positions)
+        return skfem.LinearForm(form).assemble(self.basis, u=u)[self.dofs].reshape(-1, 3)
+
+    def matrix(self, form, positions) -> np.ndarray:
+        u = self.displacement(positions)
+        return (
+            skfem.BilinearForm(form)
+            .assemble(self.basis, u=u)
+            .toarray()[np.ix_(self.dofs, self.dofs)]
+        )
+
+
+# Neo-Hookean: ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3), tensors first, points last.
+
+
+def kinematics(w):
+    """F, F⁻ᵀ and ln J of a displacement."""
+    F = np.eye(3)[:, :, None, None] + w["u"].grad
+    last = np.moveaxis(F, (0, 1), (-2, -1))
+    inverse_transposed = np.moveaxis(np.linalg.inv(last), (-1, -2), (0, 1))
+    return F, inverse_transposed, np.log(np.linalg.det(last))
+
+
+def energy_density(w):
+    F, _, log_j = kinematics(w)
+    return 0.5 * LAMBDA_PA * log_j**2 - MU_PA * log_j + 0.5 * MU_PA * ((F**2).sum((0, 1)) - 3)
+
+
+def virtual_work(v, w):
+    """P : ∇v with P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ."""
+    F, inverse_transposed, log_j = kinematics(w)
+    stress = MU_PA * (F - inverse_transposed) + LAMBDA_PA * log_j * inverse_transposed
+    return (stress * v.grad).sum((0, 1))
+
+
+def tangent_work(u, v, w):
+    """dP : ∇v with dP = μ dF + (μ − λ ln J) F⁻ᵀ dFᵀ F⁻ᵀ + λ (F⁻ᵀ : dF) F⁻ᵀ, dF = ∇u."""
+    _, G, log_j = kinematics(w)
+    turned = np.einsum("ij...,kj...,kl...->il...", G, u.grad, G)
+    volumetric = (G * u.grad).sum((0, 1)) * G
+    rate = MU_PA * u.grad + (MU_PA - LAMBDA_PA * log_j) * turned + LAMBDA_PA * volumetric
+    return (rate * v.grad).sum((0, 1))
+
+
+@pytest.fixture
+def library(small_mesh) -> Library:
+    return Library(small_mesh)
+
+
+@pytest.fixture
+def positions(small_mesh, rng) -> np.ndarray:
+    return small_mesh.points_m + rng.uniform(-0.006, 0.006, small_mesh.points_m.shape)
+
+
+def test_neo_hookean_energy(make_body, library, positions):
+    expected = library.scalar(energy_density, positions)
+    found = make_body("neo-hookean").energy(positions, LAMBDA_PA, MU_PA)
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+def test_neo_hookean_force(make_body, library, positions):
+    expected = -library.vector(virtual_work, positions)
+    found = make_body("neo-hookean").elastic_force(positions, LAMBDA_PA, MU_PA)
+    assert relative_error(found, expected) < 1e-12
+
+
+def test_neo_hookean_stiffness(make_body, library, positions):
+    expected = library.matrix(tangent_work, positions)
+    found = make_body("neo-hookean").stiffness(positions, LAMBDA_PA, MU_PA)
+    assert relative_error(found.toarray(), expected) < 1e-12
+
+
+def test_neo_hookean_damping(make_body, library, positions, rng):
+    velocity = rng.standard_normal(positions.size)
+    expected = -0.009 * library.matrix(tangent_work, positions) @ velocity
+    body = make_body("neo-hookean")
+    damped, free = (
+        body.force(positions, velocity, [LAMBDA_PA, MU_PA, gamma_r, 0.0])[0]
+        for gamma_r in (0.009, 0.0)
+    )
+    assert relative_error(damped - free, expected) < 1e-12
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_stiffness_at_rest_is_linear_elasticity(make_body, library, material):
+    expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
+    found = make_body(material).stiffness(library.points_m, LAMBDA_PA, MU_PA)
+    assert relative_error(found.toarray(), expected) < 1e-12

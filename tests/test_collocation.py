@@ -1,0 +1,416 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from checks import assert_derivative, relative_error
+from problems_small import GUESS, TRUTH, bar_in_two_hands, cube_with_gaps, hung_cube, measured
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment
+from collocation_sysid.fem.batched.combine import combine_with_numpy
+from collocation_sysid.nlp import block_band
+from collocation_sysid.nlp.collocation import Collocation, marker_distances_m
+from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.simulation import march, with_markers
+
+THETA = as_theta(TRUTH)
+DAMPING = GUESS.items[2:]
+WITH_PRIOR = Parameters((replace(GUESS.items[0], prior=(300.0, 0.2)), *GUESS.items[1:]))
+ENGINEERING = Parameters(
+    (
+        Parameter("young_pa", 700.0, 10.0, 1e5, prior=(600.0, 0.3)),
+        Parameter("poisson", 0.2, 0.01, 0.49),
+        *DAMPING,
+    )
+)
+POISSON_FIXED = Parameters(
+    (
+        Parameter("young_pa", 700.0, 10.0, 1e5),
+        Parameter("poisson", 0.2, fixed=True),
+        Parameter("gamma_r_s", 0.0, fixed=True),
+        DAMPING[1],
+    )
+)
+ALL_FIXED = Parameters(tuple(Parameter(i.name, i.guess, fixed=True) for i in GUESS.items))
+
+
+def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
+    """A cube of twelve nodes; its tracks are random, some samples missing."""
+    experiment = hung_cube(steps, (1, 1, 2), start="undeformed")
+    if start == "given":
+        rng = np.random.default_rng(8)
+        shape = experiment.body.nodes_m.shape
+        changes["start_positions_m"] = experiment.body.nodes_m + 1e-3 * rng.normal(size=shape)
+        changes["start_velocities_m_s"] = 0.1 * rng.normal(size=shape)
+    rng = np.random.default_rng(7)
+    tracks = experiment.markers.observe(experiment.rigid_positions(experiment.t_s))
+    tracks += 5e-3 * rng.normal(size=tracks.shape)
+    tracks[rng.random(tracks.shape[:2]) < 0.3] = np.nan
+    return replace(with_markers(experiment, tracks), start=start, **changes)
+
+
+def some_point(collocation: Collocation, seed: int = 1) -> np.ndarray:
+    """Variables that satisfy nothing: carried rigidly, then shaken."""
+    rng = np.random.default_rng(seed)
+    positions = []
+    for segment in collocation.segments:
+        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
+    q = collocation.parameters.guess_q
+    return collocation.pack(q + 0.1 * rng.normal(size=q.shape), positions)
+
+
+def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
+    q = collocation.parameters.guess_q if q is None else q
+    theta = collocation.parameters.theta(q)
+    return collocation.pack(
+        q, [march(s.experiment, s.dynamics, theta) for s in collocation.segments]
+    )
+
+
+def hessian(collocation: Collocation, z: np.ndarray, weight: float, y: np.ndarray) -> sp.csc_array:
+    indptr, indices = collocation.hessian_structure
+    values = collocation.hessian_values(z, weight, y)
+    upper = sp.csc_array((values, indices, indptr), shape=(collocation.variables,) * 2)
+    return sp.csc_array(upper + sp.triu(upper, 1).T)
+
+
+def assert_derivatives(collocation: Collocation, rng: np.random.Generator) -> None:
+    """Jacobian, gradient and Hessian of the Lagrangian against central differences."""
+    z = some_point(collocation)
+    y, weight = rng.normal(size=collocation.constraints), 1.3
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return weight * collocation.gradient(at) + collocation.jacobian(at).T @ y
+
+    jacobian, gradient = collocation.jacobian(z), collocation.gradient(z)
+    second = hessian(collocation, z, weight, y)
+    constraints = collocation.constraint_values
+    assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=0.1)
+    assert_derivative(collocation.objective, lambda d: gradient @ d, z, rng, scale=0.1)
+    assert_derivative(slope, lambda d: second @ d, z, rng, scale=0.1)
+    if collocation.nq:  # their columns would drown among the others
+        only_q = np.concatenate([np.ones(collocation.nq), np.zeros(len(z) - collocation.nq)])
+        assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_q)
+        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_q)
+
+
+# Derivatives
+
+LAYOUTS = list(product(SCHEMES, ["equilibrium", "undeformed", "given"], [False, True], [1, 2]))
+
+
+@pytest.mark.parametrize(("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS)
+def test_derivatives_in_every_layout(
+    scheme: str, start: str, explicit_grasps: bool, substeps: int, rng
+):
+    collocation = Collocation([swung(start)], WITH_PRIOR, scheme, substeps, explicit_grasps)
+    assert_derivatives(collocation, rng)
+
+
+@pytest.mark.parametrize("parameters", [ENGINEERING, POISSON_FIXED, ALL_FIXED])
+def test_derivatives_in_other_parametrisations(parameters: Parameters, rng):
+    assert_derivatives(Collocation([swung()], parameters), rng)
+
+
+def test_derivatives_of_several_experiments(rng):
+    experiments = [swung(), swung("undeformed", steps=7), bar_in_two_hands(3), cube_with_gaps(2)]
+    assert_derivatives(Collocation(experiments, GUESS, "bdf2"), rng)
+
+
+def test_derivatives_of_a_body_nobody_holds(rng):
+    flying = replace(swung("given"), grasps=())
+    assert_derivatives(Collocation([flying], GUESS, explicit_grasps=True), rng)
+
+
+def test_derivatives_with_the_papers_start_rule(rng):
+    experiment = swung("undeformed", start_rule="paper")
+    assert_derivatives(Collocation([experiment], GUESS, "backward-euler"), rng)
+
+
+def test_derivatives_of_an_experiment_shorter_than_the_schemes_reach(rng):
+    assert_derivatives(Collocation([swung(steps=2)], GUESS, "bdf2"), rng)
+
+
+# Feasibility
+
+
+@pytest.mark.parametrize(("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS)
+def test_a_marched_trajectory_satisfies_the_constraints(
+    scheme: str, start: str, explicit_grasps: bool, substeps: int
+):
+    collocation = Collocation([swung(start)], GUESS, scheme, substeps, explicit_grasps)
+    z = marched(collocation)
+    assert np.abs(collocation.constraint_values(z)).max() < 1e-12
+    lower, upper = collocation.bounds()
+    assert ((z >= lower) & (z <= upper)).all()
+    newtons = np.abs(collocation.violations_n(z)[0]).max()
+    assert newtons < 1e-12 * collocation.largest_force_n(z)
+
+
+def test_a_marched_trajectory_with_several_grasps_satisfies_the_constraints():
+    collocation = Collocation([bar_in_two_hands()], GUESS)
+    assert np.abs(collocation.constraint_values(marched(collocation))).max() < 1e-12
+
+
+def test_the_loss_is_zero_where_the_tracks_came_from():
+    collocation = Collocation([measured(hung_cube())], GUESS)
+    z = marched(collocation, np.log(THETA))
+    assert collocation.objective(z) < 1e-20
+    assert collocation.rms_m(z) < 1e-13
+
+
+# Layout
+
+
+def test_pack_and_unpack_are_inverse():
+    collocation = Collocation([swung(), swung(steps=7)], GUESS, substeps=2)
+    z = np.random.default_rng(0).normal(size=collocation.variables)
+    q, positions = collocation.unpack(z)
+    assert q.shape == (4,)
+    assert [x.shape for x in positions] == [(11, 36), (15, 36)]
+    np.testing.assert_allclose(collocation.pack(q, positions), z, rtol=1e-15)
+
+
+def test_variables_and_rows_are_in_the_documented_order():
+    collocation = Collocation([swung("undeformed"), swung(steps=7)], GUESS)
+    z = some_point(collocation)
+    q, positions = collocation.unpack(z)
+    expected_z, expected_g = [q], []
+    for segment, x in zip(collocation.segments, positions, strict=True):
+        residual = segment.dynamics.residual(x, collocation.theta(z))
+        expected_z.append(x.ravel() / segment.length_m)
+        rows = residual[segment.dynamics.first_row :, segment.free_dofs]
+        expected_g.append(rows.ravel() / segment.force_n)
+    np.testing.assert_allclose(z, np.concatenate(expected_z))
+    np.testing.assert_allclose(collocation.constraint_values(z), np.concatenate(expected_g))
+    assert [s.dynamics.first_row for s in collocation.segments] == [1, 0]
+
+
+def test_lengths_are_scaled_by_the_mean_edge():
+    segment = Collocation([swung()], GUESS).segments[0]
+    ends = segment.body.nodes_m[segment.body.mesh.edges]
+    assert segment.length_m == pytest.approx(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
+
+
+@pytest.mark.parametrize(("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS)
+def test_structures_are_compressed_columns_with_ascending_rows(
+    scheme: str, start: str, explicit_grasps: bool, substeps: int
+):
+    experiments = [swung(start), swung(start, steps=3)]
+    collocation = Collocation(experiments, GUESS, scheme, substeps, explicit_grasps)
+    for indptr, indices, rows in (
+        (*collocation.jacobian_structure, collocation.constraints),
+        (*collocation.hessian_structure, collocation.variables),
+    ):
+        assert len(indptr) == collocation.variables + 1
+        assert indptr[0] == 0
+        assert indptr[-1] == len(indices)
+        assert (np.diff(indptr) >= 0).all()
+        assert indices.min() >= 0
+        assert indices.max() < rows
+        column = np.repeat(np.arange(collocation.variables), np.diff(indptr))
+        assert (np.diff(column * rows + indices) > 0).all()
+    indptr, indices = collocation.hessian_structure
+    column = np.repeat(np.arange(collocation.variables), np.diff(indptr))
+    assert (indices <= column).all()
+
+
+def test_values_are_written_where_they_are_wanted():
+    collocation = Collocation([swung(), swung(steps=3)], GUESS)
+    z = some_point(collocation)
+    y = np.ones(collocation.constraints)
+    jacobian = np.full(len(collocation.jacobian_structure[1]), np.nan)
+    second = np.full(len(collocation.hessian_structure[1]), np.nan)
+    assert collocation.jacobian_values(z, jacobian) is jacobian
+    assert collocation.hessian_values(z, 1.0, y, second) is second
+    np.testing.assert_array_equal(jacobian, collocation.jacobian_values(z))
+    np.testing.assert_array_equal(second, collocation.hessian_values(z, 1.0, y))
+
+
+@pytest.mark.parametrize("make", [swung, bar_in_two_hands])
+def test_held_nodes_are_bound_to_the_grasp(make):
+    collocation = Collocation([make()], GUESS, substeps=2)
+    segment = collocation.segments[0]
+    (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
+    held = segment.experiment.held_positions(segment.dynamics.t_s).reshape(len(lower), -1)
+    np.testing.assert_allclose(lower[:, segment.held_dofs], held, rtol=1e-14, atol=1e-17)
+    np.testing.assert_array_equal(lower[:, segment.held_dofs], upper[:, segment.held_dofs])
+    assert (lower[:, segment.free_dofs] == -np.inf).all()
+    assert (upper[:, segment.free_dofs] == np.inf).all()
+
+
+@pytest.mark.parametrize("start", ["undeformed", "given"])
+def test_a_known_start_is_bound_too(start: str):
+    collocation = Collocation([swung(start)], GUESS, explicit_grasps=True)
+    (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
+    expected = collocation.segments[0].experiment.start_positions_m
+    if expected is None:
+        expected = collocation.segments[0].body.nodes_m
+    np.testing.assert_allclose(lower[0], np.ravel(expected), rtol=1e-14, atol=1e-17)
+    np.testing.assert_array_equal(lower[0], upper[0])
+    assert np.isinf(lower[1:]).all()
+
+
+def test_bounds_of_the_parameters_come_first():
+    lower, upper = Collocation([swung()], GUESS).bounds()
+    np.testing.assert_allclose(np.exp(lower[:4]), [10, 10, 1e-5, 1e-3])
+    np.testing.assert_allclose(np.exp(upper[:4]), [1e5, 1e5, 1, 100])
+
+
+# Several experiments
+
+
+def test_experiments_share_nothing_but_the_parameters():
+    experiments = [swung(), swung("undeformed", steps=7)]
+    both = Collocation(experiments, GUESS)
+    z = some_point(both)
+    q, positions = both.unpack(z)
+    jacobian = both.jacobian(z).toarray()
+    by_theta, by_position = [], []
+    for experiment, x in zip(experiments, positions, strict=True):
+        alone = Collocation([experiment], GUESS)
+        block = alone.jacobian(alone.pack(q, [x])).toarray()
+        by_theta.append(block[:, :4])
+        by_position.append(block[:, 4:])
+    expected = np.hstack([np.vstack(by_theta), sp.block_diag(by_position).toarray()])
+    np.testing.assert_allclose(jacobian, expected, atol=1e-13 * np.abs(expected).max())
+
+
+def test_losses_of_experiments_add_up():
+    experiments = [swung(), swung("undeformed", steps=7)]
+    both = Collocation(experiments, GUESS)
+    z = some_point(both)
+    q, positions = both.unpack(z)
+    total = 0.0
+    for experiment, x in zip(experiments, positions, strict=True):
+        alone = Collocation([experiment], GUESS)
+        total += alone.objective(alone.pack(q, [x])) * alone.measurements
+    assert both.objective(z) * both.measurements == pytest.approx(total)
+
+
+def test_validation_experiments_are_left_out():
+    fitted, held_out = swung(), replace(swung(steps=7), name="held out", validation=True)
+    collocation = Collocation([held_out, fitted], GUESS)
+    assert [segment.experiment for segment in collocation.segments] == [fitted]
+    assert collocation.variables == Collocation([fitted], GUESS).variables
+
+
+def test_nothing_to_fit_is_refused():
+    with pytest.raises(InputError, match="nothing to fit"):
+        Collocation([replace(swung(), validation=True)], GUESS)
+    with pytest.raises(InputError, match="substeps = 0, expected at least 1"):
+        Collocation([swung()], GUESS, substeps=0)
+
+
+# Loss
+
+
+def test_the_loss_counts_present_samples_only():
+    collocation = Collocation([swung()], GUESS)
+    z = some_point(collocation)
+    segment, (_, (x,)) = collocation.segments[0], collocation.unpack(z)
+    markers = segment.experiment.markers
+    predicted = markers.observe(x.reshape(len(x), -1, 3))
+    squares = np.sum((predicted - markers.positions_m) ** 2, axis=2)
+    present = np.isfinite(squares)
+    assert 0 < present.sum() < present.size
+    assert collocation.measurements == 3 * present.sum()
+    expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurements
+    assert collocation.objective(z) == pytest.approx(expected)
+    np.testing.assert_allclose(marker_distances_m(segment, x), np.sqrt(squares[present]))
+    assert collocation.rms_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
+
+
+def test_a_frame_without_samples_pulls_on_nothing():
+    experiment = swung()
+    tracks = experiment.markers.positions_m.copy()
+    tracks[3] = np.nan
+    collocation = Collocation([with_markers(experiment, tracks)], GUESS)
+    _, (gradient,) = collocation.unpack(collocation.gradient(some_point(collocation)))
+    assert (gradient[3] == 0).all()
+    assert (np.abs(gradient[[0, 1, 2, 4, 5]]).max(axis=1) > 0).all()
+
+
+def test_with_substeps_only_the_rows_at_samples_are_measured():
+    collocation = Collocation([swung()], GUESS, substeps=3)
+    _, (gradient,) = collocation.unpack(collocation.gradient(some_point(collocation)))
+    moved = np.flatnonzero(np.abs(gradient).max(axis=1))
+    assert len(moved)
+    assert (moved % 3 == 0).all()
+
+
+def test_a_prior_adds_its_squared_residual():
+    with_prior, without = (Collocation([swung()], p) for p in (WITH_PRIOR, GUESS))
+    z = some_point(without)
+    difference = (with_prior.objective(z) - without.objective(z)) * without.measurements
+    assert difference == pytest.approx(((z[0] - np.log(300.0)) / 0.2) ** 2)
+
+
+# Parameters
+
+
+def test_fixing_parameters_drops_their_columns():
+    fixed = Parameters((*GUESS.items[:3], Parameter("gamma_m_1_s", 0.5, fixed=True)))
+    all_free, reduced = Collocation([swung()], GUESS), Collocation([swung()], fixed)
+    z = some_point(all_free)
+    z[3] = np.log(0.5)
+    shorter = np.delete(z, 3)
+    assert reduced.variables == all_free.variables - 1
+    np.testing.assert_allclose(
+        reduced.constraint_values(shorter), all_free.constraint_values(z), atol=1e-14
+    )
+    expected = np.delete(all_free.jacobian(z).toarray(), 3, axis=1)
+    np.testing.assert_allclose(reduced.jacobian(shorter).toarray(), expected, atol=1e-14)
+
+
+def test_both_elastic_pairs_describe_the_same_constraints():
+    lame, engineering = Collocation([swung()], GUESS), Collocation([swung()], ENGINEERING)
+    z = some_point(lame)
+    theta = lame.theta(z)
+    q = np.log([theta.young_pa, theta.poisson, theta.gamma_r_s, theta.gamma_m_1_s])
+    other = engineering.pack(q, lame.unpack(z)[1])
+    newtons = lame.violations_n(z)[0]
+    np.testing.assert_allclose(
+        engineering.violations_n(other)[0], newtons, atol=1e-12 * np.abs(newtons).max()
+    )
+
+
+# Reading a point
+
+
+def test_the_largest_violation_is_named():
+    collocation = Collocation([swung(), replace(swung(steps=7), name="second")], GUESS)
+    z = marched(collocation)
+    q, positions = collocation.unpack(z)
+    node = int(collocation.segments[1].experiment.free_nodes[2])
+    positions[1][-1, 3 * node + 1] += 1e-3
+    worst = collocation.largest_violations(collocation.pack(q, positions), count=3)
+    assert len(worst) == 3
+    assert (worst[0].experiment, worst[0].node, worst[0].axis) == ("second", node, "y")
+    assert worst[0].time_s == pytest.approx(0.07)
+    assert str(worst[0]).startswith(f"second: t = 0.07 s, node {node}, y: -")
+    assert str(worst[0]).endswith(" N")
+    sizes = [abs(violation.newtons) for violation in worst]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+# Filling without a compiler
+
+
+def test_the_numpy_combiner_fills_the_same_values(monkeypatch):
+    def values(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
+        collocation = Collocation([experiment], GUESS, "bdf2")
+        z = some_point(collocation)
+        y = np.random.default_rng(0).normal(size=collocation.constraints)
+        return collocation.jacobian_values(z), collocation.hessian_values(z, 1.0, y)
+
+    natively = values(swung())
+    monkeypatch.setattr(block_band, "make_combiner", combine_with_numpy)
+    for found, expected in zip(values(swung()), natively, strict=True):
+        assert relative_error(found, expected) < 1e-14

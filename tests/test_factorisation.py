@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems_small import TRUTH, box
+
+from collocation_sysid.fem.pattern import SymmetricPattern
+from collocation_sysid.nlp.factorisation import WIDE_BAND, Factoriser
+
+# On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
+BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
+FULL = SymmetricPattern.of_cells(np.arange(70)[None], 70)
+PATTERNS = {"band": BAR.pattern, "SuperLU": FULL}
+
+
+def without_first_nodes(pattern: SymmetricPattern) -> np.ndarray:
+    return np.arange(12, pattern.size)
+
+
+def random_values(pattern: SymmetricPattern, shift: float, seed: int = 0) -> np.ndarray:
+    """Lower-triangle values of a random symmetric matrix with `shift` on its diagonal."""
+    values = np.random.default_rng(seed).normal(size=pattern.entries)
+    values[pattern.diagonal] += shift
+    return values
+
+
+def kept(pattern: SymmetricPattern, values: np.ndarray, free: np.ndarray) -> np.ndarray:
+    return sp.csr_array(pattern.matrix(values)).toarray()[np.ix_(free, free)]
+
+
+def test_the_patterns_take_different_paths():
+    shares = {}
+    for name, pattern in PATTERNS.items():
+        free = without_first_nodes(pattern)
+        shares[name] = Factoriser(pattern, free).half_bandwidth / len(free)
+    assert shares["band"] < WIDE_BAND < shares["SuperLU"]
+    assert FULL.size > 200  # smaller systems always take the band
+
+
+@pytest.mark.parametrize("columns", [None, 1, 5])
+@pytest.mark.parametrize("shift", [100.0, 0.5, -100.0])
+@pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
+def test_factors_solve_for_vectors_and_columns(
+    pattern: SymmetricPattern, shift: float, columns: int | None
+):
+    free = without_first_nodes(pattern)
+    values = random_values(pattern, shift)
+    right = np.random.default_rng(1).normal(size=(len(free), columns or 1))
+    right = right if columns else right[:, 0]
+    before = right.copy()
+    solved = Factoriser(pattern, free).factorise(values).solve(right)
+    assert solved.shape == right.shape
+    np.testing.assert_array_equal(right, before)
+    np.testing.assert_allclose(kept(pattern, values, free) @ solved, right, atol=1e-10)
+
+
+@pytest.mark.parametrize("shift", [100.0, 1.0, 0.0, -100.0])
+@pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
+def test_definiteness_agrees_with_the_eigenvalues(pattern: SymmetricPattern, shift: float):
+    free = without_first_nodes(pattern)
+    values = random_values(pattern, shift)
+    smallest = np.linalg.eigvalsh(kept(pattern, values, free))[0]
+    assert Factoriser(pattern, free).factorise(values).positive_definite == (smallest > 0)
+
+
+def test_a_held_body_at_rest_is_positive_definite_and_its_negative_is_not():
+    hung = np.flatnonzero(BAR.nodes_m[:, 2] < 0.39)
+    free = (3 * hung[:, None] + np.arange(3)).ravel()
+    factoriser = Factoriser(BAR.pattern, free)
+    rest = BAR.nodes_m
+    theta = (TRUTH["lambda_pa"], TRUTH["mu_pa"], 0.0, 0.0)
+    stiffness = -BAR.linearise(rest, np.zeros_like(rest), theta).by_position[0]
+    assert factoriser.factorise(stiffness).positive_definite
+    assert not factoriser.factorise(-stiffness).positive_definite
+
+
+def test_one_analysis_serves_many_matrices():
+    free = without_first_nodes(FULL)
+    factoriser = Factoriser(FULL, free)
+    right = np.ones(len(free))
+    factors = [factoriser.factorise(random_values(FULL, 100.0, seed)) for seed in range(3)]
+    for seed, factor in enumerate(factors):
+        matrix = kept(FULL, random_values(FULL, 100.0, seed), free)
+        np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix, right))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
+def test_a_singular_matrix_is_refused(pattern: SymmetricPattern):
+    values = random_values(pattern, 100.0)
+    values[(pattern.rows == 40) | (pattern.columns == 40)] = 0.0
+    with pytest.raises(np.linalg.LinAlgError, match="singular"):
+        Factoriser(pattern, without_first_nodes(pattern)).factorise(values)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
+def test_numbers_that_are_not_finite_are_refused(pattern: SymmetricPattern, bad: float):
+    values = random_values(pattern, 100.0)
+    values[-1] = bad
+    with pytest.raises(np.linalg.LinAlgError, match="not finite"):
+        Factoriser(pattern, without_first_nodes(pattern)).factorise(values)

@@ -1,0 +1,312 @@
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from problems_small import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, measured, released_cube
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPointOptions, solve
+from collocation_sysid.methods.start import carried_rigidly, initial_variables
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.results.solution import Iteration, Solution, Status
+
+PRECISE = InteriorPointOptions(tolerance=1e-11)
+
+
+def relative_errors(solution: Solution) -> np.ndarray:
+    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
+
+
+@cache
+def cube() -> Collocation:
+    return Collocation([measured(hung_cube())], GUESS)
+
+
+@cache
+def solved_cube() -> Solution:
+    return solve(cube(), PRECISE)
+
+
+# The answer
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
+def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
+    made = measured(SMALL_EXPERIMENTS[experiment](), scheme)
+    solution = solve(Collocation([made], GUESS, scheme), PRECISE)
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+    assert solution.rms_m < 1e-9
+    assert solution.max_violation_relative < 1e-7
+
+
+def test_several_experiments_are_fitted_together():
+    made = [measured(make()) for make in SMALL_EXPERIMENTS.values()]
+    solution = solve(Collocation(made, GUESS), PRECISE)
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+
+
+def test_substeps_are_fitted_too():
+    made = measured(hung_cube(6), substeps=3)
+    solution = solve(Collocation([made], GUESS, substeps=3), PRECISE)
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    "options", [{"hessian": "gauss-newton"}, {"hessian": "limited-memory"}, {"warm_up": 0.0}]
+)
+def test_every_hessian_leads_to_the_same_answer(options: dict):
+    solution = solve(cube(), InteriorPointOptions(**options, tolerance=1e-10))
+    assert solution.status.converged
+    np.testing.assert_allclose(solution.theta, solved_cube().theta, rtol=1e-5)
+
+
+@pytest.mark.parametrize("make", [hung_cube, released_cube])
+def test_explicit_grasps_lead_to_the_same_answer(make):
+    made = measured(make())
+    answers = [
+        solve(Collocation([made], GUESS, explicit_grasps=explicit), PRECISE)
+        for explicit in (False, True)
+    ]
+    np.testing.assert_allclose(answers[0].theta, answers[1].theta, rtol=1e-5)
+    np.testing.assert_allclose(answers[0].positions_m[0], answers[1].positions_m[0], atol=1e-9)
+
+
+def test_fixed_parameters_stay_and_the_others_are_found():
+    fixed = [Parameter(name, TRUTH[name], fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
+    collocation = Collocation([measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed)))
+    solution = solve(collocation, PRECISE)
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+    assert solution.parameters["gamma_r_s"] == TRUTH["gamma_r_s"]
+
+
+def test_young_and_poisson_are_found_as_well():
+    parameters = Parameters(
+        (
+            Parameter("young_pa", 300.0, 10.0, 1e5),
+            Parameter("poisson", 0.4, 0.01, 0.49),
+            *GUESS.items[2:],
+        )
+    )
+    solution = solve(Collocation([measured(hung_cube())], parameters), PRECISE)
+    truth = as_theta(TRUTH)
+    assert solution.parameters["young_pa"] == pytest.approx(truth.young_pa, rel=1e-5)
+    assert solution.parameters["poisson"] == pytest.approx(truth.poisson, rel=1e-5)
+
+
+def test_the_positions_satisfy_grasp_and_motion():
+    solution = solved_cube()
+    segment = cube().segments[0]
+    positions = solution.positions_m[0]
+    np.testing.assert_allclose(
+        positions[:, segment.experiment.held_nodes],
+        segment.held_positions.reshape(len(positions), -1, 3),
+        atol=1e-9,
+    )
+    assert solution.multipliers.shape == (cube().constraints,)
+
+
+# The start
+
+
+def soft_guess() -> Parameters:
+    """So soft that no rest state is found."""
+    soft = [replace(item, guess=item.guess / 100, lower=1e-3) for item in GUESS.items[:2]]
+    return Parameters((*soft, *GUESS.items[2:]))
+
+
+def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
+    collocation = Collocation([measured(hung_cube())], soft_guess())
+    start, notes = initial_variables(collocation)
+    segment = collocation.segments[0]
+    expected = carried_rigidly(segment, as_theta(soft_guess()))
+    np.testing.assert_allclose(collocation.unpack(start)[1][0], expected, atol=1e-15)
+    assert len(notes) == 1
+    assert notes[0].startswith("experiment 'hung cube': the simulation at the guess failed (")
+    assert notes[0].endswith("started from the rest shape carried rigidly by the grasp")
+    solution = solve(collocation, PRECISE)
+    assert solution.notes == tuple(notes)
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+
+
+def test_a_guess_that_can_be_simulated_starts_on_the_constraints():
+    start, notes = initial_variables(cube())
+    assert notes == []
+    assert np.abs(cube().constraint_values(start)).max() < 1e-12
+
+
+def test_the_start_shape_is_carried_with_the_grasp():
+    segment = cube().segments[0]
+    x = carried_rigidly(segment, as_theta(TRUTH)).reshape(segment.grid_rows, -1, 3)
+    np.testing.assert_allclose(
+        x[:, segment.experiment.held_nodes],
+        segment.held_positions.reshape(segment.grid_rows, -1, 3),
+        atol=1e-12,
+    )
+    lengths = np.linalg.norm(x - x[:, :1], axis=2)
+    np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape), atol=1e-12)
+
+
+def test_a_given_start_is_used():
+    again = solve(cube(), start=solved_cube().z)
+    assert again.history[0].theta == solved_cube().theta
+    assert again.history[0].rms_m == pytest.approx(solved_cube().rms_m)
+    np.testing.assert_allclose(again.theta, solved_cube().theta, rtol=1e-5)
+
+
+# Ends other than convergence
+
+
+def test_the_iteration_limit_is_a_status_and_violations_are_listed():
+    solution = solve(cube(), InteriorPointOptions(max_iterations=2))
+    assert solution.status is Status.ITERATION_LIMIT
+    assert not solution.status.converged
+    assert solution.message.endswith("(IPOPT: Maximum_Iterations_Exceeded)")
+    worst = solution.largest_violations[0]
+    assert worst.experiment == "hung cube"
+    assert abs(worst.newtons) == pytest.approx(solution.max_violation_n)
+    assert 1e-8 < solution.max_violation_relative < 1
+
+
+def test_the_time_limit_is_a_status():
+    solution = solve(cube(), InteriorPointOptions(max_time_s=1e-9))
+    assert solution.status is Status.TIME_LIMIT
+
+
+def test_a_linear_solver_that_is_not_installed_is_a_refusal_with_a_remedy():
+    solution = solve(cube(), InteriorPointOptions(linear_solver="ma27"))
+    assert solution.status is Status.REFUSED
+    assert solution.iterations == 0
+    assert "linear_solver = 'ma27' needs a library" in solution.notes[-1]
+    assert "'mumps'" in solution.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"linear_solver": "lapack"}, '"lapack" is not a valid setting for Option: linear_solver'),
+        ({"ipopt": {"toll": 1e-3}}, "solver: IPOPT cannot be set up: No such IPOPT option: toll"),
+        ({"ipopt": {"mu_init": -1.0}}, '"-1" is not a valid setting for Option: mu_init'),
+        ({"hessian": "bfgs"}, "solver: no hessian 'bfgs'; available: exact, gauss-newton"),
+    ],
+)
+def test_unknown_options_are_refused(options: dict, message: str, capfd):
+    with pytest.raises(InputError) as caught:
+        solve(cube(), InteriorPointOptions(**options))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nothing_is_printed(capfd):
+    solve(Collocation([measured(hung_cube())], soft_guess()))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_interruption_keeps_the_best_iterate():
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    handler = signal.getsignal(signal.SIGINT)
+    solution = solve(cube(), watch=interrupt)
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert solution.status is Status.INTERRUPTED
+    assert solution.iterations == 4
+    assert len(solution.history) == 5
+    best = min(solution.history, key=lambda iteration: iteration.loss)
+    assert solution.theta == best.theta
+    assert solution.rms_m == pytest.approx(best.rms_m)
+    assert solution.max_violation_n == pytest.approx(best.violation_n)
+
+
+def test_an_error_in_the_callers_function_reaches_the_caller(capfd):
+    def broken(iteration: Iteration) -> None:
+        raise ZeroDivisionError("in watch")
+
+    with pytest.raises(ZeroDivisionError, match="in watch"):
+        solve(cube(), watch=broken)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "name", ["objective", "gradient", "constraint_values", "jacobian_values", "hessian_values"]
+)
+def test_an_error_in_an_evaluation_reaches_the_caller(name: str, monkeypatch, capfd):
+    def broken(*_: object) -> None:
+        raise KeyboardInterrupt(name)
+
+    monkeypatch.setattr(Collocation, name, broken)
+    with pytest.raises(KeyboardInterrupt, match=name):
+        solve(cube())
+    assert capfd.readouterr() == ("", "")
+
+
+# Status
+
+
+def test_every_ipopt_status_has_a_meaning():
+    converged = {"Solve_Succeeded", "Solved_To_Acceptable_Level", "Feasible_Point_Found"}
+    assert set(IPOPT_STATUS) == converged | {
+        "Infeasible_Problem_Detected",
+        "Search_Direction_Becomes_Too_Small",
+        "Diverging_Iterates",
+        "User_Requested_Stop",
+        "Maximum_Iterations_Exceeded",
+        "Maximum_CpuTime_Exceeded",
+        "Maximum_WallTime_Exceeded",
+        "Restoration_Failed",
+        "Error_In_Step_Computation",
+        "Invalid_Number_Detected",
+        "Not_Enough_Degrees_Of_Freedom",
+        "Invalid_Problem_Definition",
+        "Invalid_Option",
+        "Insufficient_Memory",
+        "Unrecoverable_Exception",
+        "NonIpopt_Exception_Thrown",
+        "Internal_Error",
+    }
+    assert all(isinstance(status, Status) for status in IPOPT_STATUS.values())
+    assert {name for name, status in IPOPT_STATUS.items() if status.converged} == converged
+
+
+@pytest.mark.parametrize("status", Status)
+def test_every_status_has_a_sentence(status: Status):
+    assert status.sentence[0].isupper()
+    assert status.sentence.endswith(".")
+
+
+def test_the_message_holds_the_sentence_and_what_ipopt_said():
+    expected = f"{Status.CONVERGED.sentence} (IPOPT: Solve_Succeeded)"
+    assert solved_cube().message == expected
+
+
+# History and timing
+
+
+def test_the_history_counts_iterations_and_ends_at_the_answer():
+    seen: list[Iteration] = []
+    solution = solve(cube(), watch=seen.append)
+    assert list(solution.history) == seen
+    assert [iteration.number for iteration in seen] == list(range(solution.iterations + 1))
+    assert (np.diff([iteration.time_s for iteration in seen]) >= 0).all()
+    np.testing.assert_allclose(seen[0].theta, as_theta(GUESS))
+    np.testing.assert_allclose(seen[-1].theta, solution.theta)
+    loss = cube().objective(solution.z) * cube().measurements
+    assert seen[-1].loss == pytest.approx(loss)
+
+
+def test_timings_are_parts_of_the_whole():
+    timing = solved_cube().timing
+    parts = (timing.build, timing.evaluations, timing.linear_algebra)
+    assert min(parts) >= 0
+    assert sum(parts) <= timing.total

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checks import observed_order
+from problems_small import TRUTH, box, hung_cube, nodes_where, smooth_poses, vertex_markers
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment, Grasp
+from collocation_sysid.nlp.parameters import as_theta
+from collocation_sysid.nlp.schemes import SCHEMES, STATIC, Stencil, scheme_named
+from collocation_sysid.nlp.simulation import simulate
+
+REGULAR = {name: scheme.regular for name, scheme in SCHEMES.items()}
+STARTS = {
+    f"{name}, row {row}": (stencil, row)
+    for name, scheme in SCHEMES.items()
+    for row, stencil in enumerate(scheme.start, start=1)
+}
+
+
+def moment(coefficients: tuple[float, ...], power: int) -> float:
+    """Σ_i c_i (−i)^power: what the stencil makes of (t / Δt)^power at time zero."""
+    return sum(c * (-float(i)) ** power for i, c in enumerate(coefficients))
+
+
+# Consistency of the tables
+
+
+@pytest.mark.parametrize("stencil", REGULAR.values(), ids=REGULAR)
+def test_stencils_reproduce_position_velocity_and_acceleration_of_a_parabola(stencil: Stencil):
+    assert moment(stencil.p, 0) == pytest.approx(1)  # ξ of a constant
+    assert moment(stencil.q, 0) == pytest.approx(0)  # ν of a constant
+    assert moment(stencil.q, 1) == pytest.approx(1)  # ν of a straight line
+    assert sum(stencil.w) == pytest.approx(1)
+    assert [moment(stencil.s, power) for power in range(3)] == pytest.approx([0, 0, 2])
+    assert stencil.r == 0
+
+
+@pytest.mark.parametrize(("stencil", "row"), STARTS.values(), ids=STARTS)
+def test_start_stencils_know_position_and_velocity(stencil: Stencil, row: int):
+    assert moment(stencil.p, 0) == pytest.approx(1)
+    assert moment(stencil.q, 0) == pytest.approx(0)
+    assert moment(stencil.q, 1) == pytest.approx(1)
+    assert len(stencil.s) <= row + 1  # no point before the start
+    assert max(len(stencil.p), len(stencil.q)) + len(stencil.w) - 1 <= row + 1
+    # No inertia force at constant velocity: the start velocity makes up for missing points.
+    assert moment(stencil.s, 0) == pytest.approx(0)
+    assert moment(stencil.s, 1) + stencil.r == pytest.approx(0)
+
+
+@pytest.mark.parametrize("name", [name for name, scheme in SCHEMES.items() if scheme.order == 2])
+def test_second_order_schemes_centre_velocity_and_force_where_the_inertia_is(name: str):
+    stencil = SCHEMES[name].regular
+    position, velocity = moment(stencil.p, 1), moment(stencil.q, 2) / 2
+    assert velocity == pytest.approx(position)
+    force = position + moment(stencil.w, 1)
+    assert moment(stencil.s, 3) / 6 == pytest.approx(force)
+
+
+def test_row_zero_is_the_static_problem():
+    scheme = scheme_named("midpoint")
+    assert scheme.stencil(0) is STATIC
+    assert scheme.stencil(1) is scheme.start[0]
+    assert scheme.stencil(2) is scheme.stencil(99) is scheme.regular
+
+
+@pytest.mark.parametrize(("name", "reach"), [("backward-euler", 2), ("midpoint", 2), ("bdf2", 4)])
+def test_reach_is_the_oldest_point_in_a_row(name: str, reach: int):
+    assert SCHEMES[name].reach == reach
+
+
+# Looking up
+
+
+def test_unknown_scheme_lists_those_there_are():
+    with pytest.raises(InputError, match=r"no scheme 'rk4'.*backward-euler, midpoint, bdf2"):
+        scheme_named("rk4")
+
+
+def test_unknown_start_rule_lists_those_there_are():
+    with pytest.raises(InputError, match=r"no start rule 'soft'.*standard, paper"):
+        scheme_named("midpoint", "soft")
+
+
+@pytest.mark.parametrize("name", ["midpoint", "bdf2"])
+def test_the_papers_start_rule_belongs_to_backward_euler(name: str):
+    with pytest.raises(InputError, match="'paper' belongs to scheme 'backward-euler'"):
+        scheme_named(name, "paper")
+
+
+def test_the_papers_start_rule_drops_the_first_inertia_only():
+    paper, standard = scheme_named("backward-euler", "paper"), scheme_named("backward-euler")
+    assert paper.regular == standard.regular
+    assert paper.stencil(1) == replace(standard.stencil(1), s=(0.0, 0.0), r=0.0)
+
+
+def test_the_papers_first_step_balances_forces_without_inertia():
+    experiment = hung_cube(steps=6, start="undeformed", start_rule="paper")
+    positions = simulate(experiment, TRUTH, "backward-euler").positions_m
+    velocity = (positions[1] - positions[0]) / experiment.timestep_s
+    force = experiment.body.force(positions[1], velocity, as_theta(TRUTH)).reshape(-1, 3)
+    weight = experiment.body.node_mass[:, None] * experiment.gravity_m_s2
+    largest = np.abs(weight).max()
+    assert np.abs((force + weight)[experiment.free_nodes]).max() < 1e-8 * largest
+
+
+# Measured order
+
+DURATION_S = 0.08
+COARSE_STEPS = (20, 40, 80)
+FINE_STEPS = 1280
+
+
+def swung_bar(steps: int, start: str) -> Experiment:
+    """A bar of 16 nodes; its poses come from their formula at the finest step in use."""
+    body = box((0.04, 0.04, 0.12), (1, 1, 3))
+    t_s, fine_s = (np.linspace(0, DURATION_S, n + 1) for n in (steps, FINE_STEPS))
+    grasp = Grasp(nodes_where(body, 2, 0.0), smooth_poses(fine_s, angular_frequency_rad_s=30.0))
+    markers = vertex_markers(body, nodes_where(body, 2, 0.12), t_s)
+    gravity = np.array([0.0, 0.0, 9.81])
+    return Experiment("bar", body, t_s, (grasp,), markers, gravity, start=start)  # type: ignore[arg-type]
+
+
+def measured_order(start: str, solve: Callable[[Experiment], np.ndarray]) -> float:
+    """Log-log slope of the largest error at the coarsest grid's times, against fine Newmark."""
+    reference = simulate(
+        swung_bar(COARSE_STEPS[0], start), TRUTH, timestep_s=DURATION_S / FINE_STEPS
+    )
+    errors = []
+    for steps in COARSE_STEPS:
+        positions = solve(swung_bar(steps, start))[:: steps // COARSE_STEPS[0]]
+        errors.append(np.abs(positions - reference.positions_m).max())
+    return observed_order(DURATION_S / np.array(COARSE_STEPS), np.array(errors))
+
+
+@pytest.mark.parametrize("start", ["equilibrium", "undeformed"])
+@pytest.mark.parametrize("name", SCHEMES)
+def test_schemes_converge_with_their_order(name: str, start: str):
+    order = measured_order(start, lambda e: simulate(e, TRUTH, name).positions_m)
+    assert order == pytest.approx(SCHEMES[name].order, abs=0.15)
+
+
+@pytest.mark.parametrize("start", ["equilibrium", "undeformed"])
+def test_newmark_converges_with_second_order(start: str):
+    order = measured_order(start, lambda e: simulate(e, TRUTH, timestep_s=e.timestep_s).positions_m)
+    assert order == pytest.approx(2, abs=0.15)
+
+
+def test_substeps_refine_the_grid_between_samples():
+    coarse, fine = swung_bar(20, "equilibrium"), swung_bar(80, "equilibrium")
+    refined = simulate(coarse, TRUTH, "midpoint", substeps=4).positions_m
+    np.testing.assert_allclose(
+        refined, simulate(fine, TRUTH, "midpoint").positions_m[::4], atol=1e-12
+    )
