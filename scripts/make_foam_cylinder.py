@@ -20,7 +20,8 @@ from collocation_sysid.problem import load_problem
 FOLDER = Path(__file__).parents[1] / "problems" / "foam_cylinder"
 TRUTH = Theta(lambda_pa=800.0, mu_pa=600.0, gamma_r_s=0.006, gamma_m_1_s=1.5)
 NOISE_M = 0.0005
-STEPS, STEP_S, FINE_S = 50, 0.01, 0.001
+# Cameras at 100 Hz; the robot logs its poses at 200 Hz.
+STEPS, STEP_S, POSE_STEP_S, FINE_S = 41, 0.01, 0.005, 0.001
 
 
 def main() -> None:
@@ -35,15 +36,20 @@ def main() -> None:
             amplitude_m=(0.05, 0.04, 0.03),
             amplitude_rad=(0.35, 0.4, 0.6),
             frequency_hz=(1.6, 2.0, 2.4),
+            rise_s=0.1,
             start=Rotation.from_rotvec([np.pi, 0, 0]),  # it hangs
         )
 
-    write_poses_csv(FOLDER / "swing_poses.csv", poses(STEP_S))
+    write_poses_csv(FOLDER / "swing_poses.csv", poses(POSE_STEP_S))
     (FOLDER / "swing_markers.csv").unlink(missing_ok=True)
     experiment = load_problem(FOLDER / "problem.toml", simulation=True).experiments[0]
     tracks = measure(experiment, poses(FINE_S), TRUTH, NOISE_M, seed=1)
+    frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     write_markers_csv(
-        FOLDER / "swing_markers.csv", experiment.t_s, experiment.markers.names, tracks
+        FOLDER / "swing_markers.csv",
+        experiment.t_s[frames],
+        experiment.markers.names,
+        tracks[frames],
     )
 
 

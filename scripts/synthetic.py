@@ -11,20 +11,18 @@ from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
 
-# Rise time of the motion: it starts from rest, smoothly.
-RISE_S = 0.1
-
 
 def swing(
     t_s: np.ndarray,
     amplitude_m: tuple[float, float, float],
     amplitude_rad: tuple[float, float, float],
     frequency_hz: tuple[float, float, float],
+    rise_s: float,
     start: Rotation,
 ) -> PoseSequence:
-    """Poses at `t_s`: each axis swings at its own frequency, rotations a little faster."""
+    """Poses at `t_s`: from rest, each axis swings at its own frequency, rotations faster."""
     t = np.asarray(t_s) - t_s[0]
-    rise = t**2 / (t**2 + RISE_S**2)
+    rise = t**2 / (t**2 + rise_s**2)
     angular = 2 * np.pi * np.array(frequency_hz)
     phase = np.outer(t, angular)
     positions = rise[:, None] * amplitude_m * np.sin(phase + [0.0, 0.7, 1.4])

@@ -50,6 +50,10 @@ IPOPT_STATUS = {
 }
 
 
+# Longest step of a parameter's logarithm while warming up.
+STEP_LIMIT = np.log(2.0)
+
+
 @dataclass(frozen=True)
 class InteriorPointOptions:
     """Options of the interior-point method.
@@ -59,9 +63,10 @@ class InteriorPointOptions:
     hessian : {"exact", "gauss-newton", "limited-memory"}
         Second derivatives of the Lagrangian: all of them, the loss's only, or IPOPT's own.
     warm_up : float
-        An exact Hessian leaves the constraints' curvature out while an iteration still changes a
-        parameter by more than this share: far from the answer, multipliers of a large residual
-        make the full Hessian indefinite and the steps wild. 0 is exact from the start.
+        While an iteration still changes a parameter by more than this share, an exact Hessian is
+        replaced by Gauss–Newton's with Levenberg's damping, which keeps every parameter within
+        about a factor of two a step: far from the answer, multipliers of a large residual make
+        the full Hessian indefinite and the steps wild. 0 is exact from the start.
     linear_solver : str
         IPOPT's linear solver; the wheel brings "mumps" and "spral".
     tolerance : float
@@ -262,6 +267,9 @@ class _Functions:
         jacobian = ca.Sparsity(rows, variables, *map(_ints, collocation.jacobian_structure))
         hessian = ca.Sparsity(variables, variables, *map(_ints, collocation.hessian_structure))
 
+        # The first entries are the upper triangle of the block of q, column by column.
+        diagonal = np.cumsum(np.arange(1, collocation.nq + 1)) - 1
+
         def nlp(inputs: list[Array], outputs: list[Array | None]) -> None:
             value, values = outputs
             if value is not None:
@@ -286,10 +294,16 @@ class _Functions:
         def hessian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
             point, _, weight, multipliers = inputs
             (entries,) = outputs
-            if not self._wants_curvature(point[: collocation.nq]):
+            if entries is None:
+                return
+            settled = self._is_settled(point[: collocation.nq])
+            if not (self._exact and settled):
                 multipliers = np.zeros_like(multipliers)
-            if entries is not None:
-                collocation.hessian_values(point, float(weight[0]), multipliers, entries)
+            collocation.hessian_values(point, float(weight[0]), multipliers, entries)
+            if not settled:
+                # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
+                damping = collocation.objective(point) / (2 * STEP_LIMIT**2)
+                entries[diagonal] += float(weight[0]) * damping
 
         self.nlp = _Timed("nlp", [z, p], [scalar, g], nlp, errors)
         self.gradient = _Timed("grad_f", [z, p], [scalar, z], gradient, errors)
@@ -297,11 +311,11 @@ class _Functions:
         inputs = [z, p, scalar, g]
         self.hessian = _Timed("hess_lag", inputs, [hessian], hessian_values, errors)
 
-    def _wants_curvature(self, q: Array) -> bool:
-        """Whether the Hessian at q is to have the constraints' curvature, see `warm_up`."""
+    def _is_settled(self, q: Array) -> bool:
+        """Whether the last step to q was short enough to end the warm-up."""
         moved = np.abs(q - self._last_q).max(initial=0.0)
         self._last_q = q.copy()
-        return self._exact and (self._warm_up == 0 or bool(moved < self._warm_up))
+        return self._warm_up == 0 or bool(moved < self._warm_up)
 
     @property
     def seconds(self) -> float:

@@ -9,50 +9,46 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from ..nlp.collocation import Collocation
 from ..nlp.parameters import DAMPING, LAME
 from .solution import Iteration, Solution
+from .sparsity_plot import jacobian_sparsity
 from .style import (
     BLACK,
     BLUE,
     CYCLE,
     LINE_PT,
     PAGE_MM,
-    SMALL_PT,
+    SYMBOLS,
     TEXT_PT,
     VERMILION,
     dress,
+    legend,
     log_axis,
     new_figure,
 )
 
 Array = NDArray[np.float64]
 
+__all__ = [
+    "convergence",
+    "error_over_time",
+    "jacobian_sparsity",
+    "save_plots",
+    "solution_plots",
+    "tracks",
+]
+
 RESOLUTION_DPI = 150
-SYMBOLS = {
-    "lambda_pa": (r"$\lambda$", "Pa"),
-    "mu_pa": (r"$\mu$", "Pa"),
-    "young_pa": ("$E$", "Pa"),
-    "poisson": (r"$\nu$", ""),
-    "gamma_r_s": (r"$\gamma_r$", "s"),
-    "gamma_m_1_s": (r"$\gamma_m$", "1/s"),
-}
 # Errors whose ratio is larger are drawn on a logarithmic axis.
 FAR_APART = 15.0
-# The sparsity plot: timesteps shown, picture elements across, decades of magnitude told apart.
-SHOWN_STEPS = 6
-RASTER = 400
-DECADES = 6
 
 
 # Convergence ----------------------------------------------------------------------------------
@@ -109,14 +105,14 @@ def _draw_parameters(
         axes.plot(numbers, _positive(values / (reference or 1.0)), "o-", label=label, **style)
     dress(axes, "Parameters", "", f"value / {'final value' if truth is None else 'truth'}")
     log_axis(axes)
-    if history:
-        axes.legend(fontsize=SMALL_PT, frameon=False, title="at the end", title_fontsize=SMALL_PT)
+    if history and names:
+        legend(axes, "at the end")
 
 
 def _positive(values: Sequence[float] | Array) -> Array:
     """Values with gaps where a logarithmic axis has no place for them."""
     array = np.asarray(values, dtype=float)
-    return np.where(array > 0, array, np.nan)
+    return np.where((array > 0) & np.isfinite(array), array, np.nan)
 
 
 # Markers --------------------------------------------------------------------------------------
@@ -130,7 +126,7 @@ def tracks(
     rolled_out_m: Array | None = None,
     max_markers: int = 6,
 ) -> Figure:
-    """Coordinates of markers over time, each with its residuals below.
+    """Coordinates of markers over time, each with model minus measurement below.
 
     Parameters
     ----------
@@ -145,26 +141,26 @@ def tracks(
     models = _models(fitted_m, rolled_out_m)
     shown = _worst_markers(measured_m, models, max_markers)
     figure = new_figure(PAGE_MM, 18 + 34 * len(shown))
-    outer = figure.add_gridspec(len(shown), 3)
+    panels = figure.subplots(
+        2 * len(shown), 3, sharex=True, squeeze=False, height_ratios=(2, 1) * len(shown)
+    )
     for row, marker in enumerate(shown):
         for axis, letter in enumerate("xyz"):
-            cell = outer[row, axis].subgridspec(2, 1, height_ratios=(2, 1))
-            upper, lower = cell.subplots(sharex=True)
+            upper, lower = panels[2 * row : 2 * row + 2, axis]
             measured = 1e3 * measured_m[:, marker, axis]
-            dots = {"ms": 3, "color": BLACK, "mec": "none", "alpha": 0.6, "zorder": 3}
+            dots = {"ms": 2.5, "color": BLACK, "mec": "none", "alpha": 0.6, "zorder": 3}
             upper.plot(t_s, measured, ".", label="measured", **dots)
             lower.axhline(0.0, color=BLACK, lw=0.6)
             for label, model_m, style in models:
                 model = 1e3 * model_m[:, marker, axis]
                 upper.plot(t_s, model, label=label, **style)
                 lower.plot(t_s, model - measured, **style)
-            bottom = row == len(shown) - 1
-            dress(upper, "" if axis else f"{names[marker]}", "", f"{letter} [mm]")
-            dress(lower, "", "time [s]" if bottom else "", "error")
-            lower.tick_params(labelbottom=bottom)
+            dress(upper, "" if axis else names[marker], "", f"{letter} [mm]")
+            dress(lower, "", "", "Δ [mm]")
             upper.yaxis.set_major_locator(MaxNLocator(4))
             lower.yaxis.set_major_locator(MaxNLocator(3))
-            lower.xaxis.set_major_locator(MaxNLocator(5))
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]", fontsize=TEXT_PT)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper left", ncols=3, fontsize=TEXT_PT, frameon=False,
@@ -198,13 +194,13 @@ def error_over_time(
         log_axis(axes)
     else:
         axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize=SMALL_PT, frameon=False)
+    legend(axes)
     return figure
 
 
 def _models(
     fitted_m: Array | None, rolled_out_m: Array | None
-) -> list[tuple[str, Array, dict[str, object]]]:
+) -> list[tuple[str, Array, dict[str, Any]]]:
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
         ("rolled out", rolled_out_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
@@ -230,85 +226,6 @@ def _worst_markers(measured_m: Array, models: Sequence[tuple], count: int) -> li
 
 def _chosen(shown: int, total: int) -> str:
     return "" if shown == total else f"{shown} of {total} markers, those with the largest errors"
-
-
-# Sparsity -------------------------------------------------------------------------------------
-
-
-def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
-    """The constraint Jacobian's first timesteps, and one of its blocks, by magnitude.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Its first experiment is shown.
-    z : (variables,)
-    """
-    segment, nq = collocation.segments[0], collocation.nq
-    first = segment.dynamics.first_row
-    steps = min(SHOWN_STEPS, segment.grid_rows)
-    height, width = segment.rows_per_time, segment.dofs
-    rows = (steps - first) * height
-    matrix = abs(collocation.jacobian(z)[:, : nq + steps * width])[:rows]
-    dense, band = matrix[:, :nq], matrix[:, nq:]
-    last = band[rows - height :, (steps - 1) * width :]
-    figure = new_figure(PAGE_MM, 88)
-    left, middle, right = figure.subplots(1, 3, width_ratios=(0.05 * max(nq, 1), 1, 0.9))
-    largest = float(np.nan_to_num(matrix.data).max(initial=1e-300))
-    norm = LogNorm(largest * 10.0**-DECADES, largest, clip=True)
-    _draw(left, dense, norm, (rows, nq))
-    _draw(middle, band, norm)
-    image = _draw(right, last, norm)
-    symbols = [SYMBOLS[item.name][0] for item in collocation.parameters.free]
-    dress(left, "", "", "equations of motion")
-    left.set_xticks(np.arange(nq) + 0.5, symbols)
-    left.set_yticks(*_block_ticks("c", range(first, steps), height))
-    dress(middle, f"{steps} of {segment.grid_rows} timesteps", "node positions")
-    middle.set_xticks(*_block_ticks("x", range(steps), width))
-    middle.set_yticks([])
-    for axes in (left, middle):
-        _rule(axes, height * np.arange(1, steps - first), horizontal=True)
-    _rule(middle, width * np.arange(1, steps), horizontal=False)
-    block = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
-    dress(right, f"{block}: the mesh graph", "column, 3 node + axis", "row, free ones only")
-    for axes in (left, middle, right):
-        axes.grid(False)
-        axes.spines[:].set_visible(True)
-    bar = figure.colorbar(image, ax=right, shrink=0.6, pad=0.02)
-    bar.set_label("|entry|, scaled", fontsize=SMALL_PT)
-    bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
-    bar.outline.set_linewidth(0.6)  # type: ignore[operator]
-    return figure
-
-
-def _draw(
-    axes: Axes, matrix: sp.sparray, norm: LogNorm, pixels: tuple[int, int] | None = None
-) -> AxesImage:
-    """Draw |entries| on a raster no finer than the eye, the largest of each pixel."""
-    rows, columns = matrix.shape
-    entries = sp.coo_array(matrix)
-    height, width = (min(RASTER, size) for size in pixels or (rows, columns))
-    raster = np.full((height, width), -1.0)
-    places = (entries.row * height // rows, entries.col * width // columns)
-    np.maximum.at(raster, places, np.nan_to_num(entries.data))
-    return axes.imshow(
-        np.ma.masked_less(raster, 0.0),
-        norm=norm,
-        cmap="cividis_r",
-        aspect="auto",
-        interpolation="nearest",
-        extent=(0, columns, rows, 0),
-    )
-
-
-def _block_ticks(letter: str, times: Sequence[int], size: int) -> tuple[Array, list[str]]:
-    return (np.arange(len(times)) + 0.5) * size, [f"${letter}_{{{t}}}$" for t in times]
-
-
-def _rule(axes: Axes, places: NDArray, horizontal: bool) -> None:
-    draw = axes.axhline if horizontal else axes.axvline
-    for place in places:
-        draw(place, color="#B0B0B0", lw=0.4)
 
 
 # Files ----------------------------------------------------------------------------------------

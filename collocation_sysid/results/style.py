@@ -5,6 +5,8 @@ Figures are `matplotlib.figure.Figure` objects without pyplot: no display, no gl
 
 from __future__ import annotations
 
+from math import inf
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
@@ -23,6 +25,16 @@ TEXT_PT = 7.5
 SMALL_PT = 6.5
 LINE_PT = 1.1
 PAGE_MM = 180.0
+
+# Symbol and unit of every parameter.
+SYMBOLS = {
+    "lambda_pa": (r"$\lambda$", "Pa"),
+    "mu_pa": (r"$\mu$", "Pa"),
+    "young_pa": ("$E$", "Pa"),
+    "poisson": (r"$\nu$", ""),
+    "gamma_r_s": (r"$\gamma_r$", "s"),
+    "gamma_m_1_s": (r"$\gamma_m$", "1/s"),
+}
 
 _GREY = "#606060"
 
@@ -50,6 +62,12 @@ def dress(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> No
         spine.set(linewidth=0.6, color=_GREY)
 
 
+def legend(axes: Axes, title: str = "") -> None:
+    """A small legend that keeps readable over lines."""
+    box = axes.legend(title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85)
+    box.get_frame().set(edgecolor="none", facecolor="white")
+
+
 def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     """Make the y axis logarithmic, with plain numbers where they are short.
 
@@ -62,7 +80,7 @@ def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     few = high / low < 1e3
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
-    if few and 1e-3 < low and high < 1e5:
+    if few and low > 1e-3 and high < 1e5:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     else:
-        axes.yaxis.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False))
+        axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(inf, inf)))

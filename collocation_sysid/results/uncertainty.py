@@ -148,7 +148,7 @@ def covariance(
     for segment, by_q in zip(segments, marker_z, strict=True):
         markers = segment.experiment.markers
         weights = np.repeat(markers.present / markers.sigma_m, 3, axis=1)
-        rows = (by_q * weights[..., None]).reshape(-1, len(q))
+        rows = (by_q * weights[..., None]).reshape(weights.size, len(q))
         information += rows.T @ rows
     _, slopes = parameters.prior(q)
     # σ² multiplies through, so that noise estimated as zero still has an inverse.
@@ -235,8 +235,11 @@ def _derived(
         elif name == "poisson":
             # ln ν/(½ − ν) = ln λ/μ is taken as normal: the interval stays within (0, ½).
             ratio = _estimate(value / (0.5 - value), 0.0, std / (value * (1 - 2 * value)), False)
-            interval = ratio.ci95 and tuple(0.5 * r / (1 + r) for r in ratio.ci95)
-            found[name] = Estimate(value, std if interval else None, interval)
+            if ratio.ci95 is None:
+                found[name] = Estimate(value)
+            else:
+                low, high = (0.5 * r / (1 + r) for r in ratio.ci95)
+                found[name] = Estimate(value, std, (low, high))
         else:
             found[name] = _estimate(value, std, std / value, False)
     return found
