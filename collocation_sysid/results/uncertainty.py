@@ -38,8 +38,12 @@ Noise = Literal["given", "estimated"]
 CI95 = 1.959963984540054
 # A parameter this near a bound, in its logarithm, is at it: interior-point methods stay inside.
 AT_BOUND = 1e-4
-# Directions with less than this share of the information are not determined by the data.
-UNDETERMINED = 1e-12
+# Deviation of a logarithm beyond which the data do not determine the parameter.
+UNDETERMINED = 100.0
+# Eigenvalue of the information, in units of its diagonal, that is zero up to rounding; and the
+# share in such a direction that does not matter.
+SINGULAR = 1e-12
+NEGLIGIBLE = 1e-3
 # Residuals this many times the given sigma, squared, are worth a warning.
 SUSPICIOUS_CHI_SQUARED = 2.0
 
@@ -137,24 +141,20 @@ def covariance(
         marker_z = marker_sensitivities(collocation, z)
     segments = collocation.segments
     chi_squared = sum(s.observation.loss(x) for s, x in zip(segments, positions, strict=True))
-    freedom = collocation.measurements - int((~bounded).sum())
+    estimated = int((~bounded).sum())
+    freedom = collocation.measurements - estimated
     if noise == "estimated" and freedom < 1:
         raise InputError(
             f"the noise cannot be estimated from {collocation.measurements} measurements of "
-            f"{int((~bounded).sum())} parameters; give sigma_m and use noise = 'given'"
+            f"{estimated} parameters; give sigma_m and use noise = 'given'"
         )
     scale = chi_squared / freedom if noise == "estimated" else 1.0
-    information = np.zeros((len(q), len(q)))
-    for segment, by_q in zip(segments, marker_z, strict=True):
-        markers = segment.experiment.markers
-        weights = np.repeat(markers.present / markers.sigma_m, 3, axis=1)
-        rows = (by_q * weights[..., None]).reshape(weights.size, len(q))
-        information += rows.T @ rows
     _, slopes = parameters.prior(q)
-    # σ² multiplies through, so that noise estimated as zero still has an inverse.
+    # (I / s² + P)⁻¹ = s² (I + s² P)⁻¹ also holds for noise estimated as zero.
+    information = _information(collocation, marker_z) + scale * np.diag(slopes**2)
     of_q = np.full_like(information, np.nan)
     free = np.ix_(~bounded, ~bounded)
-    of_q[free] = scale * _inverse((information + scale * np.diag(slopes**2))[free])
+    of_q[free] = _inverse(information[free], scale)
     return Uncertainty(
         names=tuple(item.name for item in parameters.free),
         covariance=of_q,
@@ -173,17 +173,30 @@ def _at_bound(parameters: Parameters, q: Array) -> NDArray[np.bool_]:
     return (q - lower < AT_BOUND) | (upper - q < AT_BOUND)
 
 
-def _inverse(information: Array) -> Array:
-    """Inverse of a positive semidefinite matrix; infinite where it has no information."""
+def _information(collocation: Collocation, marker_z: Sequence[Array]) -> Array:
+    """Σ Sᵀ W S over the present samples of all experiments."""
+    nq = collocation.nq
+    total = np.zeros((nq, nq))
+    for segment, by_q in zip(collocation.segments, marker_z, strict=True):
+        markers = segment.experiment.markers
+        weights = np.repeat(markers.present / markers.sigma_m, 3, axis=1)
+        rows = (by_q * weights[..., None]).reshape(weights.size, nq)
+        total += rows.T @ rows
+    return total
+
+
+def _inverse(information: Array, scale: float) -> Array:
+    """`scale` times the inverse; infinite variance for what is not determined."""
     if not len(information):
         return information
-    scale = np.sqrt(np.diag(information))
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    known = values > UNDETERMINED * len(values)
-    vectors = vectors / scale[:, None]
-    inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-    lost = (np.abs(vectors[:, ~known] * scale[:, None]) > 1e-3).any(axis=1)
+    units = np.sqrt(np.diag(information))
+    units[units == 0] = 1.0
+    values, vectors = np.linalg.eigh(information / np.outer(units, units))
+    known = values > SINGULAR
+    scaled = vectors[:, known] / units[:, None]
+    inverse = scale * (scaled / values[known]) @ scaled.T
+    lost = (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
+    lost |= np.diag(inverse) > UNDETERMINED**2
     inverse[lost] = inverse[:, lost] = np.nan
     inverse[lost, lost] = np.inf
     return inverse
@@ -207,10 +220,9 @@ def _estimates(
 
 def _estimate(value: float, std: float, relative: float, at_bound: bool) -> Estimate:
     """An estimate whose logarithm is normal with deviation `relative`."""
-    with np.errstate(over="ignore"):
-        spread = float(np.exp(CI95 * relative))
-    if not np.isfinite(spread):
+    if not relative <= UNDETERMINED:  # or NaN
         return Estimate(value, at_bound=at_bound)
+    spread = float(np.exp(CI95 * relative))
     return Estimate(value, std, (value / spread, value * spread), at_bound)
 
 

@@ -191,7 +191,7 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
         If there is anything else at `path`; at once, so that no work is lost.
     """
     target = Path(path).resolve()
-    _require_replaceable(target, overwrite)
+    require_replaceable(target, overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     mark = secrets.token_hex(4)
     temporary = target.with_name(f".{target.name}.{mark}.partial")
@@ -202,7 +202,7 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        _require_replaceable(target, overwrite)
+        require_replaceable(target, overwrite)
         _put_in_place(temporary, target, target.with_name(f".{target.name}.{mark}.old"))
     except (InputError, OSError) as error:
         raise InputError(
@@ -210,7 +210,7 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
         ) from error
 
 
-def _require_replaceable(target: Path, overwrite: bool) -> None:
+def require_replaceable(target: Path, overwrite: bool = True) -> None:
     if not target.exists():
         return
     if not target.is_dir():
