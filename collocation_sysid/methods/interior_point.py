@@ -285,11 +285,13 @@ class _Functions:
                 slope[:] = collocation.gradient(inputs[0])
 
         def jacobian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
-            values, entries = outputs
-            if values is not None:
-                values[:] = collocation.constraint_values(inputs[0])
+            rows, entries = outputs
             if entries is not None:
-                collocation.jacobian_values(inputs[0], entries)
+                values, _ = collocation.constraints_and_jacobian(inputs[0], entries)
+                if rows is not None:
+                    rows[:] = values
+            elif rows is not None:
+                rows[:] = collocation.constraint_values(inputs[0])
 
         def hessian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
             point, _, weight, multipliers = inputs

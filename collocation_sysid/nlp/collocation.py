@@ -199,17 +199,25 @@ class Collocation:
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_structure`."""
+        return self.constraints_and_jacobian(z, out)[1]
+
+    def constraints_and_jacobian(
+        self, z: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
+        """g and the values of ∂g/∂z, from one evaluation of the elements."""
         q, positions = self.unpack(z)
         theta = self.parameters.theta(q)
         theta_q, _ = self.parameters.theta_derivatives(q)
         values = np.empty(len(self.jacobian_structure[1])) if out is None else out
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
+        rows = np.empty(self.constraints)
         used = columns.size
         for segment, x, (a, b) in zip(self.segments, positions, self._row_spans(), strict=True):
             here = values[used : used + segment.jacobian.nnz]
-            columns[:, a:b] = segment.jacobian_values(x, theta, theta_q, here).T
+            rows[a:b], by_q = segment.constraints_and_jacobian(x, theta, theta_q, here)
+            columns[:, a:b] = by_q.T
             used += segment.jacobian.nnz
-        return values
+        return rows, values
 
     def jacobian(self, z: Array) -> sp.csc_array:
         """∂g/∂z as a sparse matrix."""

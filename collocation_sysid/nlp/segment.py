@@ -117,7 +117,10 @@ class Segment:
 
     def constraint_values(self, x: Array, theta: Theta) -> Array:
         """(constraints,) scaled rows at x (N, 3n) in metres."""
-        rows = self.dynamics.residual(x, theta) / self.force_n
+        return self._rows(x, self.dynamics.residual(x, theta))
+
+    def _rows(self, x: Array, residual_n: Array) -> Array:
+        rows = residual_n / self.force_n
         if self.explicit_grasps:
             rows[:, self.held_dofs] = (x[:, self.held_dofs] - self.held_positions) / self.length_m
         return rows[self.dynamics.first_row :, self.row_dofs].ravel()
@@ -174,16 +177,23 @@ class Segment:
             grasps = self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel()
         return np.concatenate(positions), np.concatenate(values), grasps
 
-    def jacobian_values(self, x: Array, theta: Theta, theta_q: Array, values: Array) -> Array:
-        """Write ∂c/∂x into `values` (jacobian.nnz,) and return ∂c/∂q, (constraints, nq).
+    def constraints_and_jacobian(
+        self, x: Array, theta: Theta, theta_q: Array, values: Array
+    ) -> tuple[Array, Array]:
+        """Write ∂c/∂x into `values` (jacobian.nnz,).
 
         Parameters
         ----------
         x : (N, 3n) metres
         theta_q : (4, nq) ∂θ/∂q
+
+        Returns
+        -------
+        rows : (constraints,) c
+        by_q : (constraints, nq) ∂c/∂q
         """
         dynamics = self.dynamics
-        forces = dynamics.linearise(x, theta, self._linearisation_rows)
+        forces = dynamics.linearise(x, theta, self.linearisation_rows)
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
         positions, inertia, grasps = self._jacobian_constants
         values[positions] += inertia
@@ -192,10 +202,12 @@ class Segment:
         by_theta[dynamics.first_row :] = forces.by_theta @ (theta_q / self.force_n)
         by_theta = dynamics.combine(dynamics.tables.w, by_theta)
         by_theta[:, self.held_dofs] = 0
-        return by_theta[dynamics.first_row :, self.row_dofs].reshape(self.constraints, -1)
+        by_q = by_theta[dynamics.first_row :, self.row_dofs]
+        rows = self._rows(x, dynamics.assemble_residual(x, forces.force))
+        return rows, by_q.reshape(self.constraints, theta_q.shape[1])
 
     @cached_property
-    def _linearisation_rows(self) -> Array:
+    def linearisation_rows(self) -> Array:
         # Kept between calls: fresh pages would cost as much as the numbers in them.
         return np.zeros((self.constraint_times, self.body.linearisation_width))
 

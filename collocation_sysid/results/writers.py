@@ -211,6 +211,13 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
 
 
 def require_replaceable(target: Path, overwrite: bool = True) -> None:
+    """Refuse a place for a run folder that holds anything but an earlier run.
+
+    Raises
+    ------
+    InputError
+        Naming the place and what is there.
+    """
     if not target.exists():
         return
     if not target.is_dir():

@@ -73,7 +73,6 @@ class SimdEvaluator:
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
-            out[start:stop] = 0.0
             self._run(start, stop, self._blocks, stride, self._width, *addresses, *constants)
 
         in_slices(run, len(out), threads)
@@ -140,6 +139,7 @@ class _Emitter:
         with counting(b, t0, t1, "t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
+            self._clear(out_row, out_stride)
             with counting(b, I64(0), blocks, "block") as block:
                 here = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
                 self._gather(rows, here, gathered)
@@ -160,6 +160,13 @@ class _Emitter:
         buffer = self.builder.alloca(DOUBLE, size=I64(count * self.lanes), name=name)
         buffer.align = 64
         return buffer
+
+    def _clear(self, row: ir.Value, length: ir.Value) -> None:
+        """Zero one timestep's outputs, which then stay in the cache while they are added up."""
+        b, bytes_ = self.builder, ir.IntType(8).as_pointer()
+        memset = self.module.declare_intrinsic("llvm.memset", (bytes_, I64))
+        size = b.mul(length, I64(8))
+        b.call(memset, [b.bitcast(row, bytes_), ir.IntType(8)(0), size, ir.IntType(1)(0)])
 
     def _pointer(self, base: Value, entry: Value) -> Value:
         b = self.builder
