@@ -6,12 +6,13 @@ Exit codes: 0 converged, 1 not converged, 2 bad input, 130 interrupted.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.text import Text
 
 from .errors import InputError, SimulationError
@@ -54,22 +55,24 @@ def solve(
 ) -> None:
     """Identify the parameters and write a run folder."""
     from .problem import load_problem
-    from .terminal import Progress, summary
     from .results.solution import Status
     from .results.writers import require_replaceable
+    from .run import as_json as json_text
     from .run import result, run, write_run
+    from .terminal import Progress, summary
 
     folder = out or Path("runs") / _run_name(problem)
     loaded = load_problem(problem, set_ or ())
+    _require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
         finished = run(loaded, method, watch=progress.iteration, log=progress.say)
         progress.say("writing the run folder")
         write_run(finished, folder)
     if as_json:
-        typer.echo(json.dumps(result(finished), indent=1))
+        typer.echo(json_text(result(finished)))
     else:
-        Console(highlight=False).print(summary(finished, folder))
+        _show(summary(finished, folder))
     status = finished.solution.status
     if status is Status.INTERRUPTED:
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -86,7 +89,7 @@ def simulate(
     ] = "newmark",
     timestep_s: Annotated[float | None, typer.Option(help="Newmark's step.")] = None,
     noise_m: Annotated[float, typer.Option(min=0, help="Standard deviation of the noise.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     frames: Annotated[bool, typer.Option(help="Also write frames for ParaView.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -97,10 +100,11 @@ def simulate(
     guesses or fixed values: set others with --set.
     """
     from .problem import load_problem
-    from .terminal import Progress
     from .synthesis import write_data
+    from .terminal import Progress
 
     loaded = load_problem(problem, set_ or (), simulation=True)
+    _require_possible(out)
     with Progress(errors, loaded, quiet=quiet) as progress:
         written = write_data(
             loaded, out, integrator, timestep_s, noise_m, seed, frames, progress.share
@@ -123,7 +127,7 @@ def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False)
     if as_json:
         typer.echo(json.dumps(findings.as_dict(), indent=1))
     else:
-        Console(highlight=False).print(check_table(findings))
+        _show(check_table(findings))
     raise typer.Exit(0 if findings.derivatives_agree else EXIT_NOT_CONVERGED)
 
 
@@ -135,6 +139,7 @@ def plot(
     """Draw the plots of a run again, from its files."""
     from .results.redraw import redraw
 
+    _require_possible(out or run_folder)
     for file in redraw(run_folder, out or run_folder):
         typer.echo(file)
 
@@ -154,10 +159,12 @@ def new(name: Annotated[str, typer.Argument(help="Name of the new folder.")]) ->
 
     folder = Path(name)
     file = folder / "problem.toml"
+    _require_possible(folder)
     if file.exists():
         raise InputError("it is there already; choose another name", file)
     folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(TEMPLATE.format(title=folder.name), encoding="utf-8")
+    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
+    file.write_text(TEMPLATE.format(title=title), encoding="utf-8")
     typer.echo(file)
 
 
@@ -182,12 +189,31 @@ def _run_name(problem: Path) -> str:
     return problem.resolve().parent.name if problem.stem == "problem" else problem.stem
 
 
+def _require_possible(folder: Path) -> None:
+    """Refuse a folder that cannot be made, before any work is done for it."""
+    for place in (folder, *folder.parents):
+        if place.is_dir():
+            if not os.access(place, os.W_OK):
+                raise InputError("this folder cannot be written in; choose another", place)
+            return
+        if place.exists():
+            raise InputError("this is a file; expected a folder to write in", place)
+
+
+def _show(content: RenderableType) -> None:
+    """Print on stdout; a terminal wraps long lines itself, and files keep them whole."""
+    Console(highlight=False).print(content, soft_wrap=True)
+
+
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
     try:
         app()
     except InputError as error:
         _refuse("error", error, EXIT_BAD_INPUT)
+    except OSError as error:
+        reason = InputError(error.strerror or str(error), error.filename)
+        _refuse("error", reason, EXIT_BAD_INPUT)
     except SimulationError as error:
         _refuse("simulation failed", error, EXIT_NOT_CONVERGED)
 

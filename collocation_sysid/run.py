@@ -22,7 +22,7 @@ from .nlp.collocation import Collocation
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem
 from .results.plots import save_plots, solution_plots
-from .results.solution import Iteration, Solution
+from .results.solution import Iteration, Solution, Status
 from .results.uncertainty import Estimate, Uncertainty, covariance
 from .results.writers import run_folder, write_frames
 
@@ -98,18 +98,26 @@ def solve(
     Raises
     ------
     InputError
-        For an unknown method or option.
+        For an unknown method or option, and when the solver refuses the problem.
     """
     name = method or problem.file.solver.method
     if name not in METHODS:
-        raise InputError(f"no method {name!r}; available: {', '.join(METHODS)}", None, "method")
+        raise InputError(f"found {name!r}; expected one of {', '.join(METHODS)}", None, "--method")
     chosen = METHODS[name]
     known = {field.name for field in fields(chosen.options)}
     given = {key: value for key, value in problem.file.solver.model_dump().items() if key in known}
     unknown = sorted(set(options) - known)
     if unknown:
         raise InputError(f"no option {unknown[0]!r}; {name} has {', '.join(sorted(known))}")
-    return chosen.solve(build_collocation(problem), chosen.options(**(given | options)), watch)
+    try:
+        collocation = build_collocation(problem)
+        solution = chosen.solve(collocation, chosen.options(**(given | options)), watch)
+    except InputError as error:
+        raise error.located(problem.path) from error
+    if solution.status is Status.REFUSED:
+        reasons = "; ".join(solution.notes)
+        raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
+    return solution
 
 
 def run(
@@ -142,6 +150,8 @@ def _roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> R
         )
     except SimulationError as error:
         return str(error)
+    except KeyboardInterrupt:  # the answer itself is there, and worth writing
+        return "interrupted"
     distances = np.linalg.norm(trajectory.markers_m - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]
     return Rollout(float(np.sqrt(np.mean(present**2))), float(present.max()), trajectory)
@@ -160,7 +170,7 @@ def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
     solution = finished.solution
     with run_folder(folder) as place:
         (place / "problem.toml").write_text(finished.problem.text, encoding="utf-8")
-        (place / "result.json").write_text(json.dumps(result(finished), indent=1) + "\n")
+        (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(finished))
         rolled_out = {
             name: rollout.trajectory.markers_m
@@ -179,9 +189,7 @@ def _write_all_frames(solution: Solution, place: Path) -> None:
         here = place if len(segments) == 1 else place / segment.experiment.name
         here.mkdir(exist_ok=True)
         body = segment.body
-        write_frames(
-            here, segment.dynamics.t_s, positions, body.cells, body.element, body.nodes_m
-        )
+        write_frames(here, segment.dynamics.t_s, positions, body.cells, body.element, body.nodes_m)
 
 
 def _arrays(finished: Run) -> dict[str, Array]:
@@ -276,6 +284,19 @@ def result(finished: Run) -> dict[str, Any]:
     }
 
 
+def as_json(content: Any) -> str:
+    """Text of a result; JSON has no NaN and no infinity, null takes their place."""
+    return json.dumps(_finite(content), indent=1, allow_nan=False)
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not np.isfinite(content) else content
+
+
 def _uncertainty_notes(finished: Run) -> tuple[str, ...]:
     return finished.uncertainty.notes if finished.uncertainty is not None else ()
 
@@ -283,12 +304,11 @@ def _uncertainty_notes(finished: Run) -> tuple[str, ...]:
 def _parameters(finished: Run) -> dict[str, Any]:
     parameters = finished.solution.collocation.parameters
     values = finished.solution.parameters
-    guesses = parameters.values(parameters.guess_q)
     estimates = finished.uncertainty.estimates if finished.uncertainty is not None else {}
     return {
         item.name: {
             "value": values[item.name],
-            "guess": guesses[item.name],
+            "guess": item.guess,
             "fixed": item.fixed,
             **_error_bar(estimates.get(item.name, Estimate(values[item.name]))),
         }
@@ -335,5 +355,3 @@ def _pooled_rms(finished: Run, rolled: Mapping[str, Rollout]) -> float | None:
     counts = {e.name: e.markers.samples for e in finished.problem.experiments}
     squares = sum(counts[name] * r.rms_m**2 for name, r in rolled.items())
     return float(np.sqrt(squares / sum(counts[name] for name in rolled)))
-
-

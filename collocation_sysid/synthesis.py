@@ -47,13 +47,21 @@ def write_data(
     Raises
     ------
     InputError
-        For an unknown integrator.
+        For an unknown integrator, or a timestep or noise that is no length of time or noise.
     SimulationError
         Before anything is written.
     """
     known = ("newmark", *SCHEMES)
     if integrator not in known:
-        raise InputError(f"no integrator {integrator!r}; available: {', '.join(known)}")
+        raise InputError(
+            f"found {integrator!r}; expected one of {', '.join(known)}", None, "--integrator"
+        )
+    if timestep_s is not None and not 0 < timestep_s < np.inf:
+        raise InputError(
+            f"found {timestep_s:g}; expected a number of seconds above 0", None, "--timestep-s"
+        )
+    if not 0 <= noise_m < np.inf:
+        raise InputError(f"found {noise_m:g}; expected metres, 0 or more", None, "--noise-m")
     rng = np.random.default_rng(seed)
     substeps = problem.file.transcription.substeps
     simulated = [

@@ -127,14 +127,13 @@ def summary(finished: Run, folder: Path) -> RenderableType:
 def _parameter_table(finished: Run) -> Table:
     solution = finished.solution
     parameters = solution.collocation.parameters
-    guesses = parameters.values(parameters.guess_q)
     table = Table("", "value", "±", "95 % interval", "guess", box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"
     estimates = dict(finished.uncertainty.estimates) if finished.uncertainty is not None else {}
     for item in parameters.items:
         estimate = estimates.get(item.name, Estimate(solution.parameters[item.name]))
-        last = "fixed" if item.fixed else f"{guesses[item.name]:.5g}"
+        last = "fixed" if item.fixed else f"{item.guess:.5g}"
         table.add_row(*_estimate_cells(item.name, estimate), last)
     if finished.uncertainty is not None:
         for name, estimate in finished.uncertainty.derived.items():

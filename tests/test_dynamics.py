@@ -21,7 +21,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
 from collocation_sysid.nlp.parameters import Theta, as_theta
-from collocation_sysid.nlp.simulation import march
+from collocation_sysid.nlp.marching import march
 
 THETA = as_theta(TRUTH)
 

@@ -239,7 +239,8 @@ def test_an_error_in_the_callers_function_reaches_the_caller(capfd):
 
 
 @pytest.mark.parametrize(
-    "name", ["objective", "gradient", "constraint_values", "constraints_and_jacobian", "hessian_values"]
+    "name",
+    ["objective", "gradient", "constraint_values", "constraints_and_jacobian", "hessian_values"],
 )
 def test_an_error_in_an_evaluation_reaches_the_caller(name: str, monkeypatch, capfd):
     def broken(*_: object) -> None:

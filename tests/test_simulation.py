@@ -21,16 +21,12 @@ from problems_small import (
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.nlp.dynamics import Dynamics, external_force
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.newton import NewtonOptions, Solver
 from collocation_sysid.nlp.parameters import Theta, as_theta
+from collocation_sysid.nlp.rest import rest_state
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import (
-    NewtonOptions,
-    Solver,
-    march,
-    rest_state,
-    simulate,
-    with_markers,
-)
+from collocation_sysid.nlp.simulation import simulate, with_markers
 
 THETA = as_theta(TRUTH)
 ABSURDLY_SOFT = Theta(0.02, 0.03, 0.009, 1.0)

@@ -20,7 +20,8 @@ from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, Parameter, Parameters, Theta
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import march, with_markers
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.results.uncertainty import (
     covariance,
     marker_sensitivities,

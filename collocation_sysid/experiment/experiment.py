@@ -137,7 +137,10 @@ class Experiment:
 
     def _check_time(self) -> None:
         if len(self.t_s) < 3:
-            raise InputError(f"{len(self.t_s)} samples in time; at least 3 are needed")
+            raise InputError(
+                f"{len(self.t_s)} samples in time; at least 3 are needed: check window_s and the "
+                "marker file"
+            )
         step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
         measured = self.markers.t_s
         if len(measured) != len(self.t_s) or (
@@ -155,6 +158,11 @@ class Experiment:
         n = len(self.body.nodes_m)
         if self.held_nodes.size and self.held_nodes[-1] >= n:
             raise InputError(f"a grasp holds node {self.held_nodes[-1]}, but the body has {n}")
+        if len(self.held_nodes) == n:
+            raise InputError(
+                f"the grasps hold all {n} nodes, so nothing can move; select fewer, and check the "
+                "length unit of the mesh"
+            )
         if self.markers.placement.node_count != n:
             raise InputError(
                 f"the markers were placed on a body of {self.markers.placement.node_count} nodes, "

@@ -124,7 +124,7 @@ def place_markers(
             nodes[k], weights[k], distance[k] = shape.embed(point)
         if distance[k] > limit_m:
             raise InputError(
-                f"marker '{labels[k]}' at {np.array2string(point, precision=4)} m is "
+                f"marker '{labels[k]}' at ({', '.join(f'{x:.4g}' for x in point)}) m is "
                 f"{distance[k]:.4g} m away from the body, more than the {limit_m:.4g} m allowed; "
                 "check length_unit, the frame of the poses and the marker's reference_m, "
                 "or raise max_distance_m"

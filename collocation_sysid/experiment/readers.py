@@ -143,12 +143,22 @@ def _read_csv(path: str | Path) -> tuple[list[str], list[int], list[list[str]]]:
             cells = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path) from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError:
+        raise InputError(
+            "is not a text file (UTF-8); expected comma-separated values", path
+        ) from None
+    except csv.Error as error:
         raise InputError(f"is not a CSV text file: {error}", path) from error
     cells = [(line, row) for line, row in cells if any(row)]
     if not cells:
         raise InputError("is empty; expected a line of column names, then rows of numbers", path)
     header = cells[0][1]
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        raise InputError(
+            "the cells are separated by semicolons or tabs; expected commas, and points in numbers",
+            path,
+            "line 1",
+        )
     if len(cells) == 1:
         raise InputError("has column names but no rows of numbers", path)
     for line, row in cells[1:]:

@@ -9,7 +9,9 @@ from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Theta
 from ..nlp.segment import Segment
-from ..nlp.simulation import Solver, march, start_state
+from ..nlp.marching import march
+from ..nlp.newton import Solver
+from ..nlp.rest import start_state
 
 Array = NDArray[np.float64]
 

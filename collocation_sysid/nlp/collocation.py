@@ -201,10 +201,8 @@ class Collocation:
         """Values of ∂g/∂z in the order of `jacobian_structure`."""
         return self.constraints_and_jacobian(z, out)[1]
 
-    def constraints_and_jacobian(
-        self, z: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
-        """g and the values of ∂g/∂z, from one evaluation of the elements."""
+    def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
+        """G and the values of ∂g/∂z, from one evaluation of the elements."""
         q, positions = self.unpack(z)
         theta = self.parameters.theta(q)
         theta_q, _ = self.parameters.theta_derivatives(q)

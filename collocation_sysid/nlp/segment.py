@@ -208,6 +208,7 @@ class Segment:
 
     @cached_property
     def linearisation_rows(self) -> Array:
+        """Work space of `constraints_and_jacobian`."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
         return np.zeros((self.constraint_times, self.body.linearisation_width))
 

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-import difflib
+import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import tomli_w
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from ..errors import InputError
+from .explaining import explain
 from .schema import ProblemFile
 
+# What the TOML parser says where people see something simpler.
+_PLAINER = {
+    "Cannot overwrite a value": "this key is given twice",
+    "Illegal character '\\n'": "a text lacks its closing quote",
+}
 
-def read_problem_file(
-    path: str | Path, overrides: Sequence[str] = ()
-) -> tuple[ProblemFile, str]:
+
+def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[ProblemFile, str]:
     """Read and validate a problem file.
 
     Parameters
     ----------
     path : str or Path
     overrides : sequence of "dotted.key=value"
-        Values in TOML syntax; bare words are strings; list items by number.
+        Values in TOML syntax; bare words are strings; list items by number, tables in a list also
+        by name.
 
     Returns
     -------
@@ -40,7 +46,7 @@ def read_problem_file(
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not valid TOML: {error}", path) from error
+        raise _bad_syntax(str(error), text, path) from error
     for override in overrides:
         _apply(content, override)
     if overrides:
@@ -48,36 +54,53 @@ def read_problem_file(
     try:
         return ProblemFile.model_validate(content), text
     except ValidationError as error:
-        raise _explain(error, path) from error
+        raise explain(error, content, path) from error
 
 
 def _read_text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError("there is no such file; expected a problem file (TOML)", path) from None
     except IsADirectoryError:
         raise InputError("this is a folder; expected a problem file (TOML)", path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", path) from error
+    except UnicodeDecodeError:
+        raise InputError("this is not a text file; expected a problem file (TOML)", path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path) from error
+
+
+def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
+    reason, _, place = complaint.rpartition(" (at ")
+    reason = _PLAINER.get(reason, reason)
+    found = re.match(r"line (\d+)", place)
+    if found is None:
+        return InputError(f"not valid TOML: {reason or complaint}, at its end", path)
+    number = int(found[1])
+    line = text.splitlines()[number - 1].strip()
+    return InputError(f"not valid TOML: {reason} in: {line}", path, f"line {number}")
+
+
+# Overrides ----------------------------------------------------------------------------------------
 
 
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, value = override.partition("=")
-    if not equals or not key.strip():
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
         raise InputError(
             f"found {override!r}, expected key=value such as parameters.mu_pa.guess=200", "--set"
         )
-    *parents, last = key.strip().split(".")
     place: Any = content
-    for part in parents:
+    for part in parts[:-1]:
         place = _descend(place, part, key)
+    last = parts[-1]
     if isinstance(place, list):
-        place[_index(place, last, key)] = _value(value)
+        place[_index(place, last, key)] = _value(value, key)
     elif isinstance(place, dict):
-        place[last] = _value(value)
+        place[last] = _value(value, key)
     else:
-        raise InputError(f"{key!r} leads into a plain value, not a table", "--set")
+        raise _no_table(place, key)
 
 
 def _descend(place: Any, part: str, key: str) -> Any:
@@ -85,81 +108,36 @@ def _descend(place: Any, part: str, key: str) -> Any:
         return place.setdefault(part, {})
     if isinstance(place, list):
         return place[_index(place, part, key)]
-    raise InputError(f"{key!r} leads into a plain value, not a table", "--set")
+    raise _no_table(place, key)
+
+
+def _no_table(place: Any, key: str) -> InputError:
+    return InputError(
+        f"{key.strip()} leads into the plain value {place!r}; expected a key of a table", "--set"
+    )
 
 
 def _index(items: list[Any], part: str, key: str) -> int:
-    if not part.isdecimal() or int(part) >= len(items):
-        raise InputError(
-            f"{part!r} in {key!r} is not an item; expected a number from 0 to {len(items) - 1}",
-            "--set",
-        )
-    return int(part)
+    names = [item.get("name") if isinstance(item, dict) else None for item in items]
+    if part in names:
+        return names.index(part)
+    if part.isdecimal() and int(part) < len(items):
+        return int(part)
+    known = "".join(f" or {name}" for name in names if name)
+    raise InputError(
+        f"found {part!r} in {key.strip()}; expected a number from 0 to {len(items) - 1}{known}",
+        "--set",
+    )
 
 
-def _value(text: str) -> Any:
+def _value(text: str, key: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
+        if text.strip().startswith(("[", "{", '"', "'")):
+            raise InputError(
+                f"found {text.strip()} for {key.strip()}; expected a value as in a TOML file, such "
+                'as 0.5, [0, 0, -9.81], {guess = 0.5} or "text"',
+                "--set",
+            ) from None
         return text
-
-
-def _explain(error: ValidationError, path: Path) -> InputError:
-    """The first of pydantic's complaints in this project's words."""
-    faults = error.errors(include_url=False)
-    # An unknown key explains the others around it.
-    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    parts = [part for part in fault["loc"] if not _is_union_tag(part)]
-    where = ".".join(str(part) for part in parts)
-    found = fault.get("input")
-    if fault["type"] == "extra_forbidden":
-        message = _unknown_key(parts)
-    elif fault["type"] == "missing":
-        message = "missing; this key is required"
-    elif fault["type"] == "value_error":
-        message = str(fault["ctx"]["error"])
-    else:
-        expectation = fault["msg"].replace("Input should be", "expected")
-        message = f"found {_short(found)}; {expectation[0].lower()}{expectation[1:]}"
-    if len(faults) > 1:
-        message += f" (and {len(faults) - 1} more to mend)"
-    return InputError(message, path, where or None)
-
-
-def _is_union_tag(part: str | int) -> bool:
-    return isinstance(part, str) and (part in ("float", "int", "str") or "[" in part)
-
-
-def _unknown_key(parts: Sequence[str | int]) -> str:
-    known = _keys_at(parts[:-1])
-    close = difflib.get_close_matches(str(parts[-1]), known, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
-    return f"unknown key; {hint}"
-
-
-def _keys_at(parts: Sequence[str | int]) -> list[str]:
-    """The keys a table of the schema knows."""
-    model: type[BaseModel] = ProblemFile
-    for part in parts:
-        if isinstance(part, int):
-            continue
-        inner = _model_in(model.model_fields[part].annotation)
-        if inner is None:
-            return []
-        model = inner
-    return list(model.model_fields)
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        found = _model_in(argument)
-        if found is not None:
-            return found
-    return None
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

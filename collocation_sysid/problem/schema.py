@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    model_validator,
+)
 
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
+from ..methods import METHODS
 from ..nlp.schemes import SCHEMES
 
-Vector = tuple[float, float, float]
+# TOML tells text, numbers and truth values apart, so a "30" or true for a number is a slip.
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
+Boundless = Annotated[float, Field(strict=True)]
+Whole = Annotated[int, Field(strict=True)]
+Flag = Annotated[bool, Field(strict=True)]
+Text = Annotated[str, Field(min_length=1)]
+Vector = tuple[Finite, Finite, Finite]
+Corner = tuple[Boundless, Boundless, Boundless]
 Unit = Literal["m", "cm", "mm", "in"]
-Material = Literal[tuple(MATERIALS)]  # type: ignore[valid-type]
-ElementName = Literal[tuple(ELEMENTS)]  # type: ignore[valid-type]
-SchemeName = Literal[tuple(SCHEMES)]  # type: ignore[valid-type]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+if TYPE_CHECKING:
+    MaterialName = ElementName = SchemeName = MethodName = str
+else:
+    MaterialName = Literal[tuple(MATERIALS)]
+    ElementName = Literal[tuple(ELEMENTS)]
+    SchemeName = Literal[tuple(SCHEMES)]
+    MethodName = Literal[tuple(METHODS)]
 
 
 class Section(BaseModel):
-    """A table of the problem file."""
+    """A table of the problem file; messages quote the fields' descriptions as what is expected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -27,13 +49,13 @@ class Section(BaseModel):
 class ObjectSection(Section):
     """The soft object: its mesh or surface, mass and material."""
 
-    mesh: str | None = Field(None, description="Tetrahedral mesh in any meshio format.")
-    surface: str | None = Field(None, description="Closed surface to fill with tetrahedra.")
+    mesh: Text | None = Field(None, description="Tetrahedral mesh in any meshio format.")
+    surface: Text | None = Field(None, description="Closed surface to fill with tetrahedra.")
     edge_length_m: Positive | None = Field(None, description="Wanted edge length of a surface.")
     length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
     mass_kg: Positive | None = Field(None, description="Weighed mass of the whole object.")
     density_kg_m3: Positive | None = Field(None, description="Uniform density instead of a mass.")
-    material: Material = "neo-hookean"
+    material: MaterialName = "neo-hookean"
     element: ElementName = "tet4"
     evaluator: Literal["auto", "simd", "casadi"] = Field(
         "auto", description="How element kernels are evaluated."
@@ -41,12 +63,10 @@ class ObjectSection(Section):
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ObjectSection:
-        if (self.mesh is None) == (self.surface is None):
-            raise ValueError("expected exactly one of mesh and surface")
+        _exactly_one(self, "mesh", "surface")
         if (self.surface is None) != (self.edge_length_m is None):
-            raise ValueError("edge_length_m belongs to surface: expected both or neither")
-        if (self.mass_kg is None) == (self.density_kg_m3 is None):
-            raise ValueError("expected exactly one of mass_kg and density_kg_m3")
+            raise ValueError("edge_length_m belongs to surface; expected both or neither")
+        _exactly_one(self, "mass_kg", "density_kg_m3")
         return self
 
 
@@ -63,15 +83,18 @@ class ParameterSection(Section):
     guess: Positive | None = None
     lower: Positive | None = None
     upper: Positive | None = None
-    fixed: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = Field(
-        None, description="Value that is not estimated."
-    )
+    fixed: NotNegative | None = Field(None, description="Value that is not estimated.")
     prior: PriorSection | None = None
 
     @model_validator(mode="after")
     def _guess_or_fixed(self) -> ParameterSection:
-        if (self.guess is None) == (self.fixed is None):
-            raise ValueError("expected exactly one of guess and fixed")
+        _exactly_one(self, "guess", "fixed")
+        useless = _given(self, "lower", "upper", "prior")
+        if self.fixed is not None and useless:
+            raise ValueError(
+                f"found fixed beside {', '.join(useless)}; expected fixed alone, or guess in its "
+                "place to estimate the parameter"
+            )
         return self
 
 
@@ -87,62 +110,85 @@ class ParametersSection(Section):
 
     @model_validator(mode="after")
     def _one_pair(self) -> ParametersSection:
-        given = [name for name in ("lambda_pa", "mu_pa", "young_pa", "poisson")
-                 if getattr(self, name) is not None]  # fmt: skip
+        given = _given(self, "lambda_pa", "mu_pa", "young_pa", "poisson")
         if given not in (["lambda_pa", "mu_pa"], ["young_pa", "poisson"]):
             raise ValueError(
                 f"the elastic parameters are {', '.join(given) or 'missing'}; "
                 "expected lambda_pa and mu_pa, or young_pa and poisson"
             )
+        for name in ("mu_pa", "young_pa"):
+            if name in given and getattr(self, name).fixed == 0:
+                raise ValueError(f"found {name} = {{ fixed = 0 }}; expected a stiffness above 0")
         return self
 
 
 class NodesSection(Section):
     """A selection of mesh nodes, by exactly one of these."""
 
-    box_m: tuple[Vector, Vector] | None = Field(None, description="Lowest and highest corner.")
-    ball_m: tuple[Vector, Positive] | None = Field(None, description="Centre and radius.")
-    indices: list[int] | None = Field(None, description="Node numbers as in the mesh file.")
-    name: str | None = Field(None, description="A point array of the mesh, nonzero where selected.")
+    box_m: tuple[Corner, Corner] | None = Field(
+        None, description="Lowest and highest corner [[x, y, z], [x, y, z]]."
+    )
+    ball_m: tuple[Vector, Positive] | None = Field(
+        None, description="Centre and radius [[x, y, z], radius]."
+    )
+    indices: list[Whole] | None = Field(
+        None, description="List of node numbers as in the mesh file, counted from 0."
+    )
+    name: Text | None = Field(None, description="A point array of the mesh, 1 where selected.")
 
     @model_validator(mode="after")
     def _one(self) -> NodesSection:
-        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"found {', '.join(given) or 'nothing'}; expected exactly one of "
-                "box_m, ball_m, indices, name"
-            )
+        _exactly_one(self, *type(self).model_fields)
         return self
 
 
-def _named_nodes(value: Any) -> Any:
-    return {"name": value} if isinstance(value, str) else value
+# Where a key takes one of two forms, a tag in <> tells them apart; messages leave the tag out.
 
 
-def _as_list(value: Any) -> Any:
-    return [value] if isinstance(value, dict) else value
+def _nodes_form(value: Any) -> str:
+    return "<name>" if isinstance(value, str) else "<table>"
+
+
+Nodes = Annotated[
+    Annotated[NodesSection, Tag("<table>")] | Annotated[Text, Tag("<name>")],
+    Discriminator(_nodes_form),
+]
 
 
 class GraspSection(Section):
     """Nodes held by a gripper, and how it moves."""
 
-    nodes: Annotated[NodesSection, BeforeValidator(_named_nodes)]
-    poses: str | None = Field(None, description="Poses CSV; held where they are without it.")
+    nodes: Nodes = Field(
+        description="Selection: a table of box_m, ball_m or indices, or the name of a point array."
+    )
+    poses: Text | None = Field(None, description="Poses CSV; held where they are without it.")
     interpolation: Literal["linear", "hold"] = "linear"
+
+
+def _sigma_form(value: Any) -> str:
+    return "<by marker>" if isinstance(value, dict) else "<for all>"
+
+
+Sigma = Annotated[
+    Annotated[Positive, Tag("<for all>")] | Annotated[dict[str, Positive], Tag("<by marker>")],
+    Discriminator(_sigma_form),
+]
 
 
 class MarkersSection(Section):
     """Tracked points."""
 
-    file: str | None = Field(None, description="Markers CSV; only `simulate` can do without.")
-    sigma_m: Positive | dict[str, Positive] = Field(
+    file: Text | None = Field(None, description="Markers CSV; only `simulate` can do without.")
+    sigma_m: Sigma = Field(
         1e-3, description="Standard deviation of a coordinate, for all or by marker name."
     )
-    names: list[str] | None = Field(None, description="Which markers to use; all by default.")
-    length_unit: Unit = "m"
+    names: list[str] | None = Field(
+        None, description="List of the names of markers to use; all by default."
+    )
+    length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
     reference_m: dict[str, Vector] = Field(
-        default_factory=dict, description="Places on the undeformed body, by marker name."
+        default_factory=dict,
+        description="Place [x, y, z] on the undeformed body for each marker, by name.",
     )
     attach: Literal["auto", "vertex", "embedded"] = "auto"
     max_distance_m: Positive | None = Field(
@@ -150,23 +196,55 @@ class MarkersSection(Section):
     )
 
 
+def _file_name(name: str) -> str:
+    if not name or name.startswith(".") or any(mark in name for mark in '/\\:*?"<>|\n'):
+        raise ValueError(
+            f"found {name!r}; expected a name that files can have: not empty, no dot in front, "
+            'none of / \\ : * ? " < > |'
+        )
+    return name
+
+
+def _grasp_form(value: Any) -> str:
+    return "<several>" if isinstance(value, list) else "<one>"
+
+
+Grasps = Annotated[
+    Annotated[GraspSection, Tag("<one>")] | Annotated[list[GraspSection], Tag("<several>")],
+    Discriminator(_grasp_form),
+]
+
+
 class ExperimentSection(Section):
     """One recording."""
 
-    name: str = Field(min_length=1, pattern=r"^[^/\\]+$")
-    grasp: Annotated[list[GraspSection], BeforeValidator(_as_list)] = Field(default_factory=list)
+    name: Annotated[str, AfterValidator(_file_name)]
+    grasp: Grasps = Field(
+        default_factory=list, description="A table of nodes and poses, or a list of them."
+    )
     markers: MarkersSection
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     start_rule: Literal["standard", "paper"] = "standard"
-    gravity_m_s2: Vector = (0.0, 0.0, -9.81)
-    window_s: tuple[float, float] | None = Field(None, description="Use only this span of time.")
+    gravity_m_s2: Vector = Field(
+        (0.0, 0.0, -9.81), description="Acceleration of gravity [x, y, z]."
+    )
+    window_s: tuple[Boundless, Boundless] | None = Field(
+        None, description="First and last time to use [start, end]."
+    )
     resample_hz: Positive | None = Field(None, description="Put poses and markers on this rate.")
-    validation: bool = Field(False, description="Not fitted, only predicted.")
+    validation: Flag = Field(False, description="Not fitted, only predicted.")
+
+    @property
+    def grasps(self) -> list[GraspSection]:
+        """The grasps, however they are written."""
+        return self.grasp if isinstance(self.grasp, list) else [self.grasp]
 
     @model_validator(mode="after")
     def _window(self) -> ExperimentSection:
         if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
-            raise ValueError(f"window_s = {list(self.window_s)}; expected [start, end], start < end")
+            raise ValueError(
+                f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
+            )
         return self
 
 
@@ -174,22 +252,32 @@ class TranscriptionSection(Section):
     """How the equations of motion become constraints."""
 
     scheme: SchemeName = "midpoint"
-    substeps: int = Field(1, ge=1, description="Grid steps between samples.")
-    explicit_grasps: bool = Field(
-        False, description="Grasped nodes as constraint rows (the paper's c^g) instead of bounds."
+    substeps: Whole = Field(default=1, ge=1, description="Grid steps between samples.")
+    explicit_grasps: Flag = Field(
+        default=False,
+        description="Grasped nodes as constraint rows (the paper's c^g) instead of bounds.",
     )
+
+
+def _ipopt_value(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise ValueError(
+            f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
+            'switches are "yes" and "no"'
+        )
+    return value
 
 
 class SolverSection(Section):
     """The method and its options."""
 
-    method: Literal["interior-point"] = "interior-point"
+    method: MethodName = "interior-point"
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
-    linear_solver: str = Field("mumps", description="IPOPT's linear solver.")
+    linear_solver: Text = Field(default="mumps", description="IPOPT's linear solver.")
     tolerance: Positive = 1e-8
-    max_iterations: int = Field(200, ge=0)
+    max_iterations: Whole = Field(default=200, ge=0)
     max_time_s: Positive = 1e6
-    ipopt: dict[str, str | int | float] = Field(
+    ipopt: dict[str, Annotated[str | int | float, BeforeValidator(_ipopt_value)]] = Field(
         default_factory=dict, description="Further IPOPT options by name."
     )
 
@@ -199,7 +287,7 @@ class RolloutSection(Section):
 
     integrator: Literal["newmark", "scheme"] = "newmark"
     timestep_s: Positive | None = Field(
-        None, description="Newmark's step; a quarter of the sample interval by default."
+        default=None, description="Newmark's step; a quarter of the sample interval by default."
     )
 
 
@@ -209,7 +297,9 @@ class ProblemFile(Section):
     title: str = ""
     object: ObjectSection
     parameters: ParametersSection
-    experiment: list[ExperimentSection] = Field(min_length=1)
+    experiment: list[ExperimentSection] = Field(
+        min_length=1, description="At least one [[experiment]] table, one for each recording."
+    )
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = SolverSection()
     rollout: RolloutSection = RolloutSection()
@@ -221,3 +311,25 @@ class ProblemFile(Section):
         if repeated:
             raise ValueError(f"two experiments are named {repeated[0]!r}; names must differ")
         return self
+
+    @model_validator(mode="after")
+    def _paper_rule_has_its_scheme(self) -> ProblemFile:
+        scheme = self.transcription.scheme
+        for experiment in self.experiment:
+            if experiment.start_rule == "paper" and scheme != "backward-euler":
+                raise ValueError(
+                    f"experiment {experiment.name!r} has start_rule = 'paper' and the scheme is "
+                    f"{scheme!r}; that rule expects transcription.scheme = 'backward-euler'"
+                )
+        return self
+
+
+def _given(section: Section, *names: str) -> list[str]:
+    return [name for name in names if getattr(section, name) is not None]
+
+
+def _exactly_one(section: Section, *names: str) -> None:
+    given = _given(section, *names)
+    if len(given) != 1:
+        found = " and ".join(given) or f"no {' or '.join(names)}"
+        raise ValueError(f"found {found}; expected exactly one of {', '.join(names)}")

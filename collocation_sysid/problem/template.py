@@ -1,7 +1,7 @@
 """The commented problem file that `collocation-sysid new` writes."""
 
 TEMPLATE = """\
-title = "{title}"
+title = {title}
 
 [object]
 mesh = "body.vtu"              # tetrahedra, any format meshio reads

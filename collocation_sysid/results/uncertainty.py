@@ -37,7 +37,7 @@ Noise = Literal["given", "estimated"]
 
 CI95 = 1.959963984540054
 # A parameter this near a bound, in its logarithm, is at it: interior-point methods stay inside.
-AT_BOUND = 1e-4
+AT_BOUND = 1e-3
 # Deviation of a logarithm beyond which the data do not determine the parameter.
 UNDETERMINED = 100.0
 # Eigenvalue of the information, in units of its diagonal, that is zero up to rounding; and the

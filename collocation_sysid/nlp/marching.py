@@ -1,0 +1,114 @@
+"""March a collocation scheme forward: trajectories that satisfy its constraints exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..experiment.experiment import Experiment
+from .dynamics import Dynamics
+from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
+from .parameters import Theta
+from .rest import start_state
+
+Array = NDArray[np.float64]
+Progress = Callable[[float], None]
+
+
+def march(
+    experiment: Experiment,
+    dynamics: Dynamics,
+    theta: Theta,
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+) -> Array:
+    """Positions (N, 3n) that satisfy the scheme's equations, one row after another.
+
+    Raises
+    ------
+    SimulationError
+        Naming time and element of the step that failed.
+    """
+    solver = Solver(experiment, options)
+    held = experiment.held_positions(dynamics.t_s).reshape(dynamics.rows, -1)
+    x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
+    x[0], v0 = start_state(experiment, theta, solver)
+    forces = np.zeros_like(x)  # total force at every evaluation so far
+    if dynamics.first_row == 0:
+        still = np.zeros_like(x[:1])
+        forces[0] = dynamics.body.force(x[:1], still, theta)[0] + dynamics.external_force_n
+    for t in range(1, dynamics.rows):
+        row = _Row(dynamics, theta, x, forces, t)
+        guess = x[t - 1] + (x[t - 1] - x[t - 2] if t > 1 else dynamics.step_s * v0)
+        try:
+            x[t] = _solve_row(solver, row, guess, x[t - 1], held[t])
+        except NewtonFailure as failure:
+            time_s = float(dynamics.t_s[t])
+            raise simulation_error(solver, failure, time_s, f"the step at row {t}") from failure
+        forces[t] = row.force(x[t])
+        if progress:
+            progress(t / (dynamics.rows - 1))
+    return x
+
+
+class _Row:
+    """Row t of the discrete equations as a function of x_t alone."""
+
+    def __init__(self, dynamics: Dynamics, theta: Theta, x: Array, forces: Array, t: int) -> None:
+        self.dynamics, self.theta = dynamics, theta
+        table, step, mass = dynamics.tables, dynamics.step_s, dynamics.body.dof_mass
+        past = range(1, min(dynamics.reach, t) + 1)
+        zero = np.zeros(x.shape[1])
+        self.p, self.q = table.p[t, 0], table.q[t, 0] / step
+        self.w, self.s = table.w[t, 0], table.s[t, 0] / step**2
+        self.xi = sum((table.p[t, i] * x[t - i] for i in past), zero)
+        self.nu = sum((table.q[t, i] * x[t - i] for i in past), zero) / step
+        self.known = sum((table.w[t, j] * forces[t - j] for j in past), zero)
+        self.known -= mass * sum((table.s[t, i] * x[t - i] for i in past), zero) / step**2
+        self.known -= mass * table.r[t] * dynamics.start_velocity_m_s / step
+
+    def force(self, x: Array) -> Array:
+        """F_t."""
+        force = self.dynamics.body.force(*self._states(x), self.theta)[0]
+        return force + self.dynamics.external_force_n
+
+    def _states(self, x: Array) -> tuple[Array, Array]:
+        return (self.xi + self.p * x)[None], (self.nu + self.q * x)[None]
+
+    def residual(self, x: Array) -> Array:
+        """c_t."""
+        return self.w * self.force(x) + self.known - self.s * self.dynamics.body.dof_mass * x
+
+    def linearise(self, x: Array) -> tuple[Array, Array]:
+        """c_t and the lower triangle of −∂c_t/∂x_t."""
+        body = self.dynamics.body
+        at = body.linearise(*self._states(x), self.theta)
+        matrix = -self.w * (self.p * at.by_position[0] + self.q * at.by_velocity[0])
+        matrix[body.pattern.diagonal] += self.s * body.dof_mass
+        force = at.force[0] + self.dynamics.external_force_n
+        return self.w * force + self.known - self.s * body.dof_mass * x, matrix
+
+
+def _solve_row(solver: Solver, row: _Row, guess: Array, previous: Array, held: Array) -> Array:
+    """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way."""
+    try:
+        start = guess.copy()
+        start[solver.held] = held
+        return solver.newton(start, row.residual, row.linearise)
+    except NewtonFailure:
+        pass
+    x, reached, increment = previous.copy(), 0.0, 1.0
+    origin = previous[solver.held]
+    while reached < 1.0:
+        goal = min(1.0, reached + increment)
+        start = x.copy()
+        start[solver.held] = origin + goal * (held - origin)
+        try:
+            x, reached = solver.newton(start, row.residual, row.linearise), goal
+        except NewtonFailure:
+            increment /= 2
+            if increment < 0.5**solver.options.halvings:
+                raise
+    return x

@@ -1,0 +1,159 @@
+"""Newton's method for the static problem and for one implicit timestep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SimulationError
+from ..experiment.experiment import Experiment
+from .factorisation import Factor, Factoriser
+
+Array = NDArray[np.float64]
+Residual = Callable[[Array], Array]
+Linearise = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Newton's method for one implicit step or the rest state.
+
+    Attributes
+    ----------
+    tolerance : float
+        Length of the last Newton step over the body's size.
+    iterations : int
+        Iterations before a step is given up.
+    backtracks : int
+        Halvings of a Newton step before it is given up.
+    halvings : int
+        How often a time step (Newmark) or the grasp's motion in it (schemes) is halved.
+    """
+
+    tolerance: float = 1e-10
+    iterations: int = 30
+    backtracks: int = 25
+    halvings: int = 8
+
+
+class NewtonFailure(Exception):
+    """Newton did not converge; carries the worst state for the message."""
+
+    def __init__(self, x: Array, reason: str) -> None:
+        self.x = x
+        self.reason = reason
+        super().__init__(reason)
+
+
+class Solver:
+    """Newton with backtracking on the free dofs of a body with given held dofs.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Its body and which nodes are held.
+    options : NewtonOptions
+    """
+
+    def __init__(self, experiment: Experiment, options: NewtonOptions | None = None) -> None:
+        self.body = experiment.body
+        self.options = options or NewtonOptions()
+        self.free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
+        self.held = (3 * experiment.held_nodes[:, None] + np.arange(3)).ravel()
+        self.factoriser = Factoriser(self.body.pattern, self.free)
+        self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+
+    def newton(
+        self,
+        x: Array,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool = False,
+    ) -> Array:
+        """Solve residual(x) = 0 for the free dofs, starting at x (3n,).
+
+        A step is accepted when the next one, computed with the same factor, is shorter
+        (Deuflhard's natural monotonicity test), no element is inverted, and with
+        `keep_definite` only while −∂r/∂x stays positive definite.
+
+        Parameters
+        ----------
+        residual : x -> (3n,)
+        linearise : x -> residual (3n,) and lower triangle (m,) of −∂r/∂x
+        """
+        x = x.copy()
+        self._require_upright(x)
+        tolerance = self.options.tolerance * self._size_m
+        value, matrix = linearise(x)
+        factor = self._factorise(matrix, x, keep_definite)
+        for _ in range(self.options.iterations):
+            step = factor.solve(value[self.free])
+            length = float(np.linalg.norm(step, np.inf))
+            if length <= tolerance:
+                x[self.free] += step
+                return x
+            x, factor, value = self._backtrack(x, step, factor, residual, linearise, keep_definite)
+        raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
+
+    def _backtrack(
+        self,
+        x: Array,
+        step: Array,
+        factor: Factor,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool,
+    ) -> tuple[Array, Factor, Array]:
+        length = np.linalg.norm(step)
+        share = 1.0
+        for _ in range(self.options.backtracks):
+            trial = x.copy()
+            trial[self.free] += share * step
+            if self.is_upright(trial):
+                next_step = factor.solve(residual(trial)[self.free])
+                if np.linalg.norm(next_step) <= (1 - share / 4) * length:
+                    value, matrix = linearise(trial)
+                    try:
+                        return trial, self._factorise(matrix, trial, keep_definite), value
+                    except NewtonFailure:
+                        pass
+            share /= 2
+        raise NewtonFailure(x, "no step along Newton's direction makes progress")
+
+    def _factorise(self, matrix: Array, x: Array, keep_definite: bool) -> Factor:
+        try:
+            factor = self.factoriser.factorise(matrix)
+        except np.linalg.LinAlgError as error:
+            raise NewtonFailure(x, f"the equations are singular: {error}") from error
+        if keep_definite and not factor.positive_definite:
+            raise NewtonFailure(x, "the stiffness is not positive definite")
+        return factor
+
+    def is_upright(self, x: Array) -> bool:
+        """Whether no element is inverted at x (3n,)."""
+        return bool(self.body.volume_ratios(x).min() > 0)
+
+    def _require_upright(self, x: Array) -> None:
+        if not self.is_upright(x):
+            raise NewtonFailure(x, "an element is inverted before the first iteration")
+
+    def worst_element(self, x: Array) -> int:
+        """The element with the smallest det F."""
+        return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
+
+
+def simulation_error(
+    solver: Solver, failure: NewtonFailure, time_s: float, what: str
+) -> SimulationError:
+    """The error for the user: what failed, when, at which element, and what to change."""
+    element = solver.worst_element(failure.x)
+    ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
+    return SimulationError(
+        f"{what} failed: {failure.reason}; the worst element has det F = {ratio:.3g}. "
+        "Stiffer parameters, a smaller timestep or a finer mesh may help",
+        time_s,
+        element,
+    )

@@ -1,0 +1,168 @@
+"""Pydantic's complaints about a problem file in this project's words."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from ..errors import InputError
+from .schema import ProblemFile
+
+Part = str | int
+Fault = Mapping[str, Any]
+
+_EXPECTED = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false, without quotes",
+    "string_type": "text in quotes",
+    "string_too_short": "a text that is not empty",
+    "finite_number": "a finite number",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "dict_type": "a table",
+}
+
+
+def explain(error: ValidationError, content: dict[str, Any], path: Path) -> InputError:
+    """Turn the first complaint into an `InputError`, and count the others.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Of `ProblemFile`.
+    content : dict
+        The file's content that was validated.
+    path : Path
+    """
+    faults = error.errors(include_url=False)
+    # An unknown key explains the others around it.
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    message = _message(fault, content)
+    where = _where(_key(fault), content)
+    others = {_where(_key(other), content) for other in faults} - {where}
+    if others:
+        message += f" (and {len(others)} more to mend)"
+    return InputError(message, path, where or None)
+
+
+def _key(fault: Fault) -> list[Part]:
+    """The key at fault: without the union's tags, and without places in an array of numbers."""
+    parts = [p for p in fault["loc"] if not (isinstance(p, str) and p.startswith("<"))]
+    field, depth = _field(parts)
+    if field is not None and _model_in(field.annotation) is None:
+        while len(parts) > depth and isinstance(parts[-1], int):
+            parts.pop()
+    return parts
+
+
+def _message(fault: Fault, content: dict[str, Any]) -> str:
+    key = _key(fault)
+    field, _ = _field(key)
+    description = (field.description if field else None) or ""
+    expected = description[:1].lower() + description[1:].rstrip(".").split(";")[0]
+    kind, model = fault["type"], _model_in(field.annotation) if field else None
+    if kind == "extra_forbidden":
+        return _unknown_key(key)
+    if kind == "value_error":
+        return str(fault["ctx"]["error"])
+    in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
+    if kind == "missing" and not in_array:
+        return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
+    found = f"found {_short(_value_at(key, content))}"
+    if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
+        return f"{found}; expected {expected}"
+    if kind in ("model_type", "model_attributes_type") and model is not None:
+        return f"{found}; expected a table with some of the keys {', '.join(model.model_fields)}"
+    if kind == "literal_error":
+        return f"{found}; {_meant(fault['input'], fault['ctx']['expected'])}"
+    phrase = _EXPECTED[kind] if kind in _EXPECTED else fault["msg"].removeprefix("Input should be ")
+    return f"{found}; expected {phrase.format(**fault.get('ctx') or {})}"
+
+
+def _unknown_key(key: Sequence[Part]) -> str:
+    known = list(_model_at(key[:-1]).model_fields)
+    close = difflib.get_close_matches(str(key[-1]), known, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+    return f"unknown key; {hint}"
+
+
+def _meant(found: Any, expected: str) -> str:
+    names = expected.replace(" or ", ", ").replace("'", "").split(", ")
+    close = difflib.get_close_matches(str(found), [n for n in names if len(n) > 2], n=1)
+    return f"did you mean {close[0]!r}? Expected {expected}" if close else f"expected {expected}"
+
+
+def _where(key: Sequence[Part], content: dict[str, Any]) -> str:
+    """The key as it is written in the file, experiments by their names."""
+    place: Any = content
+    written: list[str] = []
+    experiment = ""
+    for part in key:
+        place = _inside(place, part)
+        written.append(str(part))
+        name = _inside(place, "name")
+        if len(written) == 2 and written[0] == "experiment" and name and isinstance(name, str):
+            experiment, written = f"experiment {name!r}", []
+    return ": ".join(text for text in (experiment, ".".join(written)) if text)
+
+
+def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
+    place: Any = content
+    for part in key:
+        place = _inside(place, part)
+    return place
+
+
+def _inside(place: Any, part: Part) -> Any:
+    try:
+        return place[part]
+    except (KeyError, IndexError, TypeError):
+        return None
+
+
+# The schema -----------------------------------------------------------------------------------
+
+
+def _field(key: Sequence[Part]) -> tuple[FieldInfo | None, int]:
+    """The deepest field of the schema on the way to a key, and how many parts lead to it."""
+    model: type[BaseModel] | None = ProblemFile
+    field, depth = None, 0
+    for count, part in enumerate(key, start=1):
+        if isinstance(part, int):
+            continue
+        if model is None or part not in model.model_fields:
+            break
+        field, depth = model.model_fields[part], count
+        model = _model_in(field.annotation)
+    return field, depth
+
+
+def _model_at(key: Sequence[Part]) -> type[BaseModel]:
+    field, _ = _field(key)
+    model = _model_in(field.annotation) if field is not None else None
+    return model or ProblemFile
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The table that a field is, or is a list of."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in getattr(annotation, "__args__", ()):
+        found = _model_in(argument)
+        if found is not None:
+            return found
+    return None
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
