@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from problem_files import write_problem
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
@@ -35,3 +38,20 @@ def make_body(small_mesh: TetMesh) -> BodyFactory:
         return Body(small_mesh, material, density_kg_m3=30.0, evaluator=evaluator)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def tiny_problem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a tiny problem with one experiment, not to be changed."""
+    folder = tmp_path_factory.mktemp("tiny")
+    write_problem(folder, {"swing": 8})
+    return folder
+
+
+@pytest.fixture
+def tiny(tiny_problem: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the tiny problem's folder, which is the working directory."""
+    folder = tmp_path / "tiny"
+    shutil.copytree(tiny_problem, folder)
+    monkeypatch.chdir(folder)
+    return folder
