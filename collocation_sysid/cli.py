@@ -88,8 +88,8 @@ def simulate(
         str, typer.Option(help="newmark, or a scheme: midpoint, backward-euler, bdf2.")
     ] = "newmark",
     timestep_s: Annotated[float | None, typer.Option(help="Newmark's step.")] = None,
-    noise_m: Annotated[float, typer.Option(min=0, help="Standard deviation of the noise.")] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    noise_m: Annotated[float, typer.Option(help="Standard deviation of the noise.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     frames: Annotated[bool, typer.Option(help="Also write frames for ParaView.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -208,7 +208,7 @@ def _show(content: RenderableType) -> None:
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
     try:
-        app()
+        app(prog_name="collocation-sysid")
     except InputError as error:
         _refuse("error", error, EXIT_BAD_INPUT)
     except OSError as error:

@@ -47,10 +47,36 @@ def write_data(
     Raises
     ------
     InputError
-        For an unknown integrator, or a timestep or noise that is no length of time or noise.
+        For an unknown integrator, a timestep, noise or seed that cannot be, and before a file
+        that the problem reads is overwritten.
     SimulationError
         Before anything is written.
     """
+    place = Path(folder)
+    _refuse_options(integrator, timestep_s, noise_m, seed)
+    _refuse_inputs(problem, place)
+    rng = np.random.default_rng(seed)
+    substeps = problem.file.transcription.substeps
+    simulated = [
+        simulate(experiment, problem.parameters, integrator, timestep_s, substeps, None, progress)
+        for experiment in problem.experiments
+    ]
+    place.mkdir(parents=True, exist_ok=True)
+    written = []
+    for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
+        noise = noise_m * rng.normal(size=trajectory.markers_m.shape)
+        markers, *poses = files = _tables(experiment, place)
+        names, tracks = experiment.markers.names, trajectory.markers_m + noise
+        write_markers_csv(markers, experiment.t_s, names, tracks)
+        for file, grasp in zip(poses, experiment.grasps, strict=True):
+            write_poses_csv(file, grasp.poses)
+        written += files
+        if frames:
+            written.append(_write_frames(experiment, trajectory, place / experiment.name))
+    return written
+
+
+def _refuse_options(integrator: str, timestep_s: float | None, noise_m: float, seed: int) -> None:
     known = ("newmark", *SCHEMES)
     if integrator not in known:
         raise InputError(
@@ -62,33 +88,33 @@ def write_data(
         )
     if not 0 <= noise_m < np.inf:
         raise InputError(f"found {noise_m:g}; expected metres, 0 or more", None, "--noise-m")
-    rng = np.random.default_rng(seed)
-    substeps = problem.file.transcription.substeps
-    simulated = [
-        simulate(experiment, problem.parameters, integrator, timestep_s, substeps, None, progress)
-        for experiment in problem.experiments
-    ]
-    place = Path(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    written = []
-    for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
-        noise = noise_m * rng.normal(size=trajectory.markers_m.shape)
-        written += _write_tables(experiment, trajectory.markers_m + noise, place)
-        if frames:
-            written.append(_write_frames(experiment, trajectory, place / experiment.name))
-    return written
+    if seed < 0:
+        raise InputError(f"found {seed}; expected a whole number, 0 or more", None, "--seed")
 
 
-def _write_tables(experiment: Experiment, tracks_m: np.ndarray, place: Path) -> list[Path]:
-    markers = place / f"{experiment.name}_markers.csv"
-    write_markers_csv(markers, experiment.t_s, experiment.markers.names, tracks_m)
-    written = [markers]
-    for number, grasp in enumerate(experiment.grasps, start=1):
-        suffix = "" if number == 1 else f"_{number}"
-        file = place / f"{experiment.name}_poses{suffix}.csv"
-        write_poses_csv(file, grasp.poses)
-        written.append(file)
-    return written
+def _refuse_inputs(problem: Problem, place: Path) -> None:
+    """Refuse to overwrite a file that the problem reads: it may be a recording."""
+    read = set()
+    for section in problem.file.experiment:
+        for name in (section.markers.file, *(grasp.poses for grasp in section.grasps)):
+            if name is not None:
+                read.add((problem.path.parent / name).resolve())
+    for experiment in problem.experiments:
+        for file in _tables(experiment, place):
+            if file.exists() and file.resolve() in read:
+                raise InputError(
+                    f"{problem.path} reads this file, so it is not overwritten; choose another "
+                    "folder, or move it away",
+                    file,
+                )
+
+
+def _tables(experiment: Experiment, place: Path) -> list[Path]:
+    """The marker file, and one of poses for each grasp."""
+    suffixes = ["", *(f"_{number}" for number in range(2, len(experiment.grasps) + 1))]
+    poses = [f"{experiment.name}_poses{suffix}.csv" for suffix in suffixes]
+    names = [f"{experiment.name}_markers.csv", *poses[: len(experiment.grasps)]]
+    return [place / name for name in names]
 
 
 def _write_frames(experiment: Experiment, trajectory: Trajectory, folder: Path) -> Path:

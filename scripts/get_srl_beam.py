@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.experiment import write_markers_csv
-from collocation_sysid.fem.meshing import box_mesh
+from collocation_sysid.fem.structured import box_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "srl_beam"
 COMMIT = "5010a6983e4e4baf82e810ed16ddc4013e0106cb"

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import measure, swing
 
 from collocation_sysid.experiment import write_markers_csv, write_poses_csv
-from collocation_sysid.fem.meshing import cylinder_mesh
+from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.problem import load_problem
 

@@ -11,7 +11,7 @@ from problem_files import write_problem
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.meshing import box_mesh
+from collocation_sysid.fem.structured import box_mesh
 
 BodyFactory = Callable[..., Body]
 

@@ -16,7 +16,7 @@ from problems_small import smooth_poses, times
 from collocation_sysid import cli
 from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.meshing import box_mesh
+from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import load_problem
 from collocation_sysid.synthesis import write_data
 
@@ -40,7 +40,7 @@ gamma_m_1_s = { guess = 0.5, lower = 1e-3, upper = 100.0 }
 [rollout]
 integrator = "scheme"
 """
-GRASP = '{ nodes = { box_m = [[-1, -1, 0.089], [1, 1, 1]] }, poses = "swing_poses.csv" }'
+GRASP = '{ nodes = { box_m = [[-1, -1, 0.089], [1, 1, 1]] }, poses = "swing_motion.csv" }'
 REFERENCES = "{ low = [0.0, 0.0, 0.0], mid = [0.03, 0.02, 0.03], side = [0.06, 0.06, 0.03] }"
 EXPERIMENT = f"""
 [[experiment]]
@@ -66,7 +66,7 @@ def write_problem(folder: Path, steps: dict[str, int], validation: str = "") -> 
     text = PROBLEM
     for k, (name, count) in enumerate(steps.items()):
         poses = smooth_poses(times(count), turn_rad=np.roll((0.2, -0.15, 0.3), k))
-        write_poses_csv(folder / f"{name}_poses.csv", poses)
+        write_poses_csv(folder / f"{name}_motion.csv", poses)
         added = EXPERIMENT.replace("swing", name)
         text += added.replace("grasp", "validation = true\ngrasp") if name == validation else added
     file = folder / "problem.toml"

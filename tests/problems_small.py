@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.experiment import Experiment, Grasp, Markers, PoseSequence, place_markers
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.meshing import box_mesh
+from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import simulate, with_markers
 

@@ -158,11 +158,6 @@ class Experiment:
         n = len(self.body.nodes_m)
         if self.held_nodes.size and self.held_nodes[-1] >= n:
             raise InputError(f"a grasp holds node {self.held_nodes[-1]}, but the body has {n}")
-        if len(self.held_nodes) == n:
-            raise InputError(
-                f"the grasps hold all {n} nodes, so nothing can move; select fewer, and check the "
-                "length unit of the mesh"
-            )
         if self.markers.placement.node_count != n:
             raise InputError(
                 f"the markers were placed on a body of {self.markers.placement.node_count} nodes, "

@@ -145,7 +145,7 @@ def _read_csv(path: str | Path) -> tuple[list[str], list[int], list[list[str]]]:
         raise InputError(f"cannot be read: {error.strerror}", path) from error
     except UnicodeDecodeError:
         raise InputError(
-            "is not a text file (UTF-8); expected comma-separated values", path
+            "is not a CSV text file (UTF-8); expected comma-separated values", path
         ) from None
     except csv.Error as error:
         raise InputError(f"is not a CSV text file: {error}", path) from error

@@ -1,65 +1,33 @@
-"""The tetrahedral mesh: read, cleaned, checked and measured once, then never changed."""
+"""The tetrahedral mesh: made or read, cleaned and checked once, then never changed."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
+from .mesh_checks import (
+    MeshQuality,
+    checked_point_arrays,
+    checked_points,
+    checked_tetrahedra,
+    cleaned,
+    measured_quality,
+    signed_volumes,
+    unique_edges,
+)
+from .mesh_files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
+from .selection import Selection
+from .surface import tetrahedralize_surface
 
-if TYPE_CHECKING:
-    from .selection import Selection
-
-LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
-
-# Volume over mean edge length cubed; 0.118 for the regular tetrahedron. Below this a
-# single-precision file cannot tell the element from a flat one.
-DEGENERATE_RATIO = 1e-6
-
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 _OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-_SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
-
-
-@dataclass(frozen=True)
-class MeshQuality:
-    """Size and shape of a mesh's elements.
-
-    The quality of an element is its mean ratio 12 (3V)^(2/3) / Σ l² over its six edges: 1 for
-    the regular tetrahedron, towards 0 the flatter it gets.
-    """
-
-    nodes: int
-    elements: int
-    volume_m3: float
-    edge_min_m: float
-    edge_mean_m: float
-    edge_max_m: float
-    quality_min: float
-    quality_median: float
-    worst_element: int
-
-    def describe(self) -> str:
-        """Return the numbers as a sentence."""
-        low, mean, high = (1e3 * x for x in (self.edge_min_m, self.edge_mean_m, self.edge_max_m))
-        return (
-            f"{self.nodes} nodes, {self.elements} tetrahedra, {self.volume_m3:.4g} m³; "
-            f"edges {low:.3g} to {high:.3g} mm (mean {mean:.3g} mm); "
-            f"mean-ratio quality {self.quality_min:.2f} at worst (element {self.worst_element}), "
-            f"{self.quality_median:.2f} in the median."
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,26 +75,16 @@ class TetMesh:
         tetrahedra: ArrayLike,
         point_arrays: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        points = _checked_points(points_m)
-        elements = _checked_tetrahedra(tetrahedra, len(points))
-        arrays = _checked_point_arrays(point_arrays or {}, len(points))
-        used, renumbered = np.unique(elements, return_inverse=True)
-        _refuse_non_finite(points, used)
-        _refuse_duplicates(elements)
-        _refuse_degenerate(points, elements)
-        kept = points[used]
-        oriented, reversed_elements = orient(kept, renumbered.reshape(-1, 4))
-        notes = (
-            *_note_dropped(len(points), used),
-            *_note_reversed(len(reversed_elements), len(elements)),
-            *_note_parts(kept, oriented),
-        )
+        given = checked_points(points_m)
+        elements = checked_tetrahedra(tetrahedra, len(given))
+        arrays = checked_point_arrays(point_arrays or {}, len(given))
+        points, elements, used, notes = cleaned(given, elements)
         self._set(
-            points_m=_read_only(kept),
-            tetrahedra=_read_only(oriented),
+            points_m=_read_only(points),
+            tetrahedra=_read_only(elements),
             point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
             file_index=_read_only(used),
-            file_node_count=len(points),
+            file_node_count=len(given),
             notes=notes,
         )
 
@@ -154,18 +112,12 @@ class TetMesh:
         InputError
             If the file cannot be read, holds no linear tetrahedra, or its mesh is refused.
         """
-        metres = length_in_metres(length_unit)
-        data = read_meshio(path)
-        counts = cell_counts(data)
-        blocks = [block.data for block in data.cells if block.type == "tetra" and len(block.data)]
-        if not blocks:
-            raise InputError(_explain_no_tetrahedra(counts), path)
-        arrays = {**_point_sets(data), **data.point_data}
+        points_m, tetrahedra, arrays, notes = read_tetrahedra(path, length_unit)
         try:
-            mesh = cls(_checked_points(data.points) * metres, np.concatenate(blocks), arrays)
+            mesh = cls(points_m, tetrahedra, arrays)
         except InputError as error:
             raise error.located(path) from None
-        mesh._set(notes=(*_note_left_out(counts), *mesh.notes))
+        mesh._set(notes=(*notes, *mesh.notes))
         return mesh
 
     @classmethod
@@ -176,29 +128,39 @@ class TetMesh:
         length_unit: str = "m",
         cache: str | Path | None = None,
     ) -> TetMesh:
-        """Tetrahedralise a closed surface: a file, or (points, triangles) in `length_unit`.
+        """Fill a closed surface with tetrahedra by `surface.tetrahedralize_surface`.
 
-        See `meshing.mesh_surface_file` and `meshing.tetrahedralize_surface`; `cache` is a folder.
+        Parameters
+        ----------
+        surface : str, Path or pair of arrays
+            An STL, OBJ or PLY file, or vertices (p, 3) and triangles (F, 3).
+        edge_length_m : float
+            Wanted edge length in metres, whatever the surface's unit.
+        length_unit : {"m", "cm", "mm", "um", "in"}
+            The unit of the surface's coordinates.
+        cache : str or Path, optional
+            Folder that keeps the mesh, since meshing it again would give another one.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, its surface is refused, or pytetwild is missing.
         """
-        from . import meshing  # it builds on this module
-
         if isinstance(surface, (str, Path)):
-            return meshing.mesh_surface_file(surface, edge_length_m, length_unit, cache)
-        points = _checked_points(surface[0]) * length_in_metres(length_unit)
-        return meshing.tetrahedralize_surface(points, surface[1], edge_length_m, cache)
+            path = surface
+            points, triangles = read_triangles(surface, length_unit)
+        else:
+            path = None
+            points = checked_points(surface[0]) * length_in_metres(length_unit)
+            triangles = surface[1]
+        try:
+            return cls(*tetrahedralize_surface(points, triangles, edge_length_m, cache))
+        except InputError as error:
+            raise error.located(path) from error.__cause__
 
     def write(self, path: str | Path) -> None:
         """Write the mesh, in metres, to any format meshio knows by the file's ending."""
-        import meshio
-
-        # Few formats have a boolean type.
-        arrays: dict[str, ArrayLike] = {
-            name: values.astype(np.uint8) if values.dtype == bool else values
-            for name, values in self.point_arrays.items()
-        }
-        mesh = meshio.Mesh(self.points_m, [("tetra", self.tetrahedra)], point_data=arrays)
-        with _meshio_failures(path, "written"):
-            meshio.write(path, mesh)
+        write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays)
 
     def select(self, selection: Selection) -> np.ndarray:
         """Return the nodes of a `selection.Selection`, as sorted int64 indices."""
@@ -231,7 +193,7 @@ class TetMesh:
     @cached_property
     def edges(self) -> np.ndarray:
         """Pairs of nodes that share an element, (m, 2) int64, each once, sorted."""
-        return _read_only(_unique_edges(self.tetrahedra))
+        return _read_only(unique_edges(self.tetrahedra))
 
     @cached_property
     def sha256(self) -> str:
@@ -243,241 +205,10 @@ class TetMesh:
 
     def quality(self) -> MeshQuality:
         """Measure the elements."""
-        squared = (_edge_lengths(self.points_m, self.tetrahedra) ** 2).sum(axis=1)
-        quality = 12 * (3 * self.volumes_m3) ** (2 / 3) / squared
-        lengths = np.linalg.norm(np.diff(self.points_m[self.edges], axis=1), axis=2)
-        return MeshQuality(
-            nodes=len(self.points_m),
-            elements=len(self.tetrahedra),
-            volume_m3=self.volume_m3,
-            edge_min_m=float(lengths.min()),
-            edge_mean_m=float(lengths.mean()),
-            edge_max_m=float(lengths.max()),
-            quality_min=float(quality.min()),
-            quality_median=float(np.median(quality)),
-            worst_element=int(quality.argmin()),
-        )
-
-
-def length_in_metres(length_unit: str) -> float:
-    """Return the length of one "m", "cm", "mm", "um" or "in" in metres."""
-    if length_unit not in LENGTH_UNITS_M:
-        known = ", ".join(f'"{unit}"' for unit in LENGTH_UNITS_M)
-        raise InputError(f"length unit {length_unit!r} is unknown; use one of {known}")
-    return LENGTH_UNITS_M[length_unit]
-
-
-def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Volume of each tetrahedron, (E,) m³; positive if (x₁−x₀, x₂−x₀, x₃−x₀) is right-handed."""
-    corner = points_m[tetrahedra]
-    a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
-    return np.einsum("ei,ei->e", np.cross(a, b), c) / 6
-
-
-def orient(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tetrahedra with positive volumes, and the indices of those that were reversed."""
-    reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
-    oriented = tetrahedra.copy()
-    oriented[reversed_elements, 2:] = tetrahedra[reversed_elements, :1:-1]
-    return oriented, reversed_elements
-
-
-def read_meshio(path: str | Path) -> Any:
-    """Read a file into a `meshio.Mesh`.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or meshio cannot read it.
-    """
-    import meshio
-
-    if not Path(path).is_file():
-        raise InputError("there is no such file", path)
-    with _meshio_failures(path, "read"):
-        return meshio.read(path)
-
-
-def cell_counts(data: Any) -> dict[str, int]:
-    """Count the cells of a `meshio.Mesh` by type."""
-    counts: dict[str, int] = {}
-    for block in data.cells:
-        counts[block.type] = counts.get(block.type, 0) + len(block.data)
-    return counts
-
-
-@contextlib.contextmanager
-def _meshio_failures(path: str | Path, done: str):
-    """Turn whatever meshio does on a bad file into one InputError."""
-    # Its readers raise whatever their parsing trips over, print, warn, and may exit.
-    said = io.StringIO()
-    try:
-        with (
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")
-            yield
-    except (Exception, SystemExit) as error:
-        reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise InputError(
-            f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
-            ".mesh and .inp are known, told by the file's ending",
-            path,
-        ) from error
+        return measured_quality(self.points_m, self.tetrahedra, self.edges)
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array
-
-
-def _edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    ends = points[tetrahedra[:, _EDGES]]
-    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
-
-
-def _unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
-    return np.unique(np.sort(tetrahedra[:, _EDGES].reshape(-1, 2), axis=1), axis=0)
-
-
-def _checked_points(points_m: ArrayLike) -> np.ndarray:
-    try:
-        points = np.array(points_m, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError("points_m must be an (n, 3) array of numbers") from None
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
-    return points
-
-
-def _checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
-    try:
-        array = np.array(tetrahedra)
-    except ValueError:
-        raise InputError("tetrahedra must be an (E, 4) array of node numbers") from None
-    if array.ndim != 2 or array.shape[1] != 4 or not len(array):
-        raise InputError(f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}")
-    if array.dtype.kind not in "iu":
-        raise InputError(f"tetrahedra must hold integer node numbers, not {array.dtype}")
-    bad = np.flatnonzero(((array < 0) | (array >= node_count)).any(axis=1))
-    if len(bad):
-        hint = (
-            "; they seem to count from 1" if (array.min(), array.max()) == (1, node_count) else ""
-        )
-        raise InputError(
-            f"element {bad[0]} has nodes {array[bad[0]].tolist()}, but there are {node_count} "
-            f"nodes, counted from 0{hint} ({len(bad)} such in all)"
-        )
-    return array.astype(np.int64)
-
-
-def _checked_point_arrays(
-    arrays: Mapping[str, ArrayLike], node_count: int
-) -> dict[str, np.ndarray]:
-    checked = {name: np.asarray(values) for name, values in arrays.items()}
-    for name, values in checked.items():
-        if values.ndim == 0 or len(values) != node_count:
-            raise InputError(
-                f'point array "{name}" has shape {values.shape}; '
-                f"its first length must be the number of nodes, {node_count}"
-            )
-    return checked
-
-
-def _refuse_non_finite(points: np.ndarray, used: np.ndarray) -> None:
-    bad = used[~np.isfinite(points[used]).all(axis=1)]
-    if len(bad):
-        raise InputError(
-            f"node {bad[0]} lies at {points[bad[0]].tolist()}: "
-            f"coordinates must be finite ({len(bad)} such in all)"
-        )
-
-
-def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
-    _, first, inverse = np.unique(
-        np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
-    )
-    twin = first[inverse.ravel()]
-    again = np.flatnonzero(twin != np.arange(len(tetrahedra)))
-    if len(again):
-        raise InputError(
-            f"element {again[0]} has the same nodes {tetrahedra[again[0]].tolist()} as element "
-            f"{twin[again[0]]}; remove the duplicates ({len(again)} in all)"
-        )
-
-
-def _refuse_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
-    volumes = np.abs(signed_volumes(points, tetrahedra))
-    cubes = _edge_lengths(points, tetrahedra).mean(axis=1) ** 3
-    bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
-    if len(bad):
-        raise InputError(
-            f"element {bad[0]} with nodes {tetrahedra[bad[0]].tolist()} is degenerate: its volume "
-            f"is {volumes[bad[0]]:.3g} m³, which must exceed {DEGENERATE_RATIO:g} of its mean edge "
-            f"length cubed, {cubes[bad[0]]:.3g} m³ ({len(bad)} such in all); remove it or remesh"
-        )
-
-
-def _note_dropped(node_count: int, used: np.ndarray) -> tuple[str, ...]:
-    dropped = np.setdiff1d(np.arange(node_count), used)
-    if not len(dropped):
-        return ()
-    return (
-        f"{len(dropped)} of {node_count} nodes were dropped (node {dropped[0]} is the first): "
-        "no element uses them.",
-    )
-
-
-def _note_reversed(reversed_count: int, element_count: int) -> tuple[str, ...]:
-    if not reversed_count:
-        return ()
-    return (
-        f"{reversed_count} of {element_count} elements had a negative volume and were re-oriented.",
-    )
-
-
-def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
-    edges, n = _unique_edges(tetrahedra), len(points)
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    parts, label = connected_components(graph, directed=False)
-    if parts == 1:
-        return ()
-    sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
-    twins = n - len(np.unique(points, axis=0))
-    hint = f"; {twins} of {n} nodes lie exactly on others: merge them" if twins else ""
-    return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)
-
-
-def _note_left_out(counts: dict[str, int]) -> tuple[str, ...]:
-    others = {name: count for name, count in counts.items() if name != "tetra" and count}
-    if not others:
-        return ()
-    solid = any(name.startswith(_SOLID_CELLS) for name in others)
-    warning = ": that part of the body is missing" if solid else ""
-    return (f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",)
-
-
-def _explain_no_tetrahedra(counts: dict[str, int]) -> str:
-    if "tetra10" in counts:
-        return (
-            f"found only quadratic tetrahedra ({_listed(counts)}), which are for the quadratic "
-            "element and not supported yet; save the mesh with linear tetrahedra"
-        )
-    found = f"found {_listed(counts)}" if counts else "it has no cells at all"
-    surface = "; a closed surface can be filled by TetMesh.from_surface" * ("triangle" in counts)
-    return f"no tetrahedra in this file, {found}{surface}"
-
-
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in counts.items())
-
-
-def _point_sets(data: Any) -> dict[str, np.ndarray]:
-    sets = {}
-    for name, nodes in (data.point_sets or {}).items():
-        sets[name] = np.zeros(len(data.points), dtype=bool)
-        sets[name][np.asarray(nodes, dtype=np.int64)] = True
-    return sets

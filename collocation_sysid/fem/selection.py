@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from ..errors import InputError
 
-if TYPE_CHECKING:
-    from .mesh import TetMesh
-
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
 ROUND_OFF = 1e-9
+
+
+class _Mesh(Protocol):
+    """What a selection looks at of a `TetMesh`, which describes it."""
+
+    @property
+    def points_m(self) -> np.ndarray: ...
+    @property
+    def bounds_m(self) -> np.ndarray: ...
+    @property
+    def point_arrays(self) -> Mapping[str, np.ndarray]: ...
+    @property
+    def file_index(self) -> np.ndarray: ...
+    @property
+    def file_node_count(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +53,7 @@ class Box:
         object.__setattr__(self, "low_m", low)
         object.__setattr__(self, "high_m", high)
 
-    def resolve(self, mesh: TetMesh) -> np.ndarray:
+    def resolve(self, mesh: _Mesh) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
         slack = _round_off_m(mesh)
         above = mesh.points_m >= np.subtract(self.low_m, slack)
@@ -62,7 +74,7 @@ class Ball:
         if not _is_number(self.radius_m) or not self.radius_m > 0:
             raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
-    def resolve(self, mesh: TetMesh) -> np.ndarray:
+    def resolve(self, mesh: _Mesh) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
         distance = np.linalg.norm(mesh.points_m - np.array(self.center_m), axis=1)
         center = ", ".join(f"{x:g}" for x in self.center_m)
@@ -86,7 +98,7 @@ class Indices:
             raise InputError(f"indices must be a list of whole node numbers, not {self.indices!r}")
         object.__setattr__(self, "indices", tuple(given.tolist()))
 
-    def resolve(self, mesh: TetMesh) -> np.ndarray:
+    def resolve(self, mesh: _Mesh) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
         wanted = np.unique(np.array(self.indices, dtype=np.int64))
         outside = wanted[(wanted < 0) | (wanted >= mesh.file_node_count)]
@@ -110,13 +122,13 @@ class Named:
 
     name: str
 
-    def resolve(self, mesh: TetMesh) -> np.ndarray:
+    def resolve(self, mesh: _Mesh) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
         if self.name not in mesh.point_arrays:
             names = ", ".join(f'"{name}"' for name in mesh.point_arrays)
             available = f"it has {names}" if names else "it has none"
             raise InputError(f'the mesh has no point array "{self.name}"; {available}')
-        values = np.asarray(mesh.point_arrays[self.name])
+        values = mesh.point_arrays[self.name]
         if values.size != len(mesh.points_m):
             raise InputError(
                 f'point array "{self.name}" has {values.size // len(mesh.points_m)} values per '
@@ -134,7 +146,7 @@ class Named:
 Selection = Box | Ball | Indices | Named
 
 
-def _chosen(mask: np.ndarray, mesh: TetMesh, what: str, nearest: str = "") -> np.ndarray:
+def _chosen(mask: np.ndarray, mesh: _Mesh, what: str, nearest: str = "") -> np.ndarray:
     if not mask.any():
         body = ", ".join(
             f"{axis} from {low:.4g} to {high:.4g} m"
@@ -146,7 +158,7 @@ def _chosen(mask: np.ndarray, mesh: TetMesh, what: str, nearest: str = "") -> np
     return np.flatnonzero(mask).astype(np.int64)
 
 
-def _round_off_m(mesh: TetMesh) -> float:
+def _round_off_m(mesh: _Mesh) -> float:
     return ROUND_OFF * float(np.linalg.norm(np.ptp(mesh.points_m, axis=0)))
 
 

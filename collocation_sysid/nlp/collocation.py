@@ -266,6 +266,27 @@ class Collocation:
         values[: len(rows)] = by_q[rows[order], columns[order]]
         return values
 
+    def kkt_residual(self, z: Array, multipliers: Array) -> float:
+        """Largest violation of the first-order conditions of the whole NLP, in its scaling.
+
+        Stationarity of objective + multipliers · g in every variable that is not given; a
+        parameter at a bound may only push against it. And feasibility.
+        """
+        rows, values = self.constraints_and_jacobian(z)
+        indptr, indices = self.jacobian_structure
+        jacobian = sp.csc_array((values, indices, indptr), shape=(len(rows), len(z)))
+        slope = self.gradient(z) + jacobian.T @ multipliers
+        lower, upper = self.bounds()
+        slope[lower == upper] = 0
+        near = 1e-6
+        slope[: self.nq][(z - lower)[: self.nq] < near] = np.minimum(
+            slope[: self.nq][(z - lower)[: self.nq] < near], 0
+        )
+        slope[: self.nq][(upper - z)[: self.nq] < near] = np.maximum(
+            slope[: self.nq][(upper - z)[: self.nq] < near], 0
+        )
+        return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
+
     # Reading a point --------------------------------------------------------------------------
 
     def violations_n(self, z: Array) -> list[Array]:

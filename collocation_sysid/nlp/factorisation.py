@@ -17,7 +17,9 @@ from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
+from ..fem.batched import in_slices
 from ..fem.pattern import SymmetricPattern
+from .lapack import cholesky_in_place
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -25,7 +27,7 @@ Index = NDArray[np.int64]
 # Above this share of the matrix size SuperLU's fill-in is cheaper than the band's.
 WIDE_BAND = 0.4
 
-_pbtrf, _pbtrs = get_lapack_funcs(("pbtrf", "pbtrs"), dtype=np.float64)
+(_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 
 
 class Factor(Protocol):
@@ -87,11 +89,16 @@ class Factoriser:
         rank[self._order] = np.arange(self._size)
         low, high = np.minimum(rank[rows], rank[columns]), np.maximum(rank[rows], rank[columns])
         self.half_bandwidth = int((high - low).max(initial=0))
-        self._band_rows, self._band_columns = high - low, low
+        self._band_places = low * (self.half_bandwidth + 1) + high - low
         strict = rows != columns
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
         self._full_source = np.concatenate([self._kept, self._kept[strict]])
+
+    @property
+    def banded(self) -> bool:
+        """Whether the band is narrow enough for banded Cholesky."""
+        return self.half_bandwidth <= WIDE_BAND * self._size or self._size < 200
 
     def factorise(self, values: Array) -> Factor:
         """Factorise the matrix with (m,) lower-triangle values.
@@ -101,16 +108,35 @@ class Factoriser:
         numpy.linalg.LinAlgError
             If the matrix is singular or not finite.
         """
+        return self.factorise_all(values[None], threads=1)[0]
+
+    def factorise_all(self, values: Array, threads: int) -> list[Factor]:
+        """Factorise K matrices with lower-triangle values (K, m), side by side on threads.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If one is singular or not finite.
+        """
+        factors: list[Factor | None] = [None] * len(values)
+
+        def run(start: int, stop: int) -> None:
+            for k in range(start, stop):
+                factors[k] = self._factorise(values[k])
+
+        in_slices(run, len(values), threads)
+        return [factor for factor in factors if factor is not None]
+
+    def _factorise(self, values: Array) -> Factor:
         if not np.isfinite(values).all():
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
-        if self.half_bandwidth <= WIDE_BAND * self._size or self._size < 200:
-            band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
-            band[self._band_rows, self._band_columns] = values[self._kept]
-            factor, failed_at = _pbtrf(band, lower=1, overwrite_ab=1)
-            if failed_at == 0:
-                return _BandFactor(factor, self._order)
-            return self._sparse(values, known_indefinite=True)
-        return self._sparse(values)
+        if not self.banded:
+            return self._sparse(values)
+        band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
+        band.T.reshape(-1)[self._band_places] = values[self._kept]
+        if cholesky_in_place(band):
+            return _BandFactor(band, self._order)
+        return self._sparse(values, known_indefinite=True)
 
     def _sparse(self, values: Array, known_indefinite: bool = False) -> Factor:
         matrix = sp.csc_array(

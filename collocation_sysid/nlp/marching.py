@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from .dynamics import Dynamics
 from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
@@ -31,26 +32,64 @@ def march(
     SimulationError
         Naming time and element of the step that failed.
     """
+    x, failure = march_on(experiment, dynamics, theta, None, options, progress)
+    if failure is not None:
+        raise failure
+    return x
+
+
+def march_on(
+    experiment: Experiment,
+    dynamics: Dynamics,
+    theta: Theta,
+    known: Array | None = None,
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+) -> tuple[Array, SimulationError | None]:
+    """Continue a trajectory as far as it goes.
+
+    Parameters
+    ----------
+    known : (k, 3n) ndarray, optional
+        The first rows; the experiment's start by default.
+
+    Returns
+    -------
+    x : (r, 3n) ndarray
+        The rows reached, `known` included; all N where nothing failed.
+    failure : SimulationError or None
+        Why it stopped.
+    """
     solver = Solver(experiment, options)
     held = experiment.held_positions(dynamics.t_s).reshape(dynamics.rows, -1)
     x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
-    x[0], v0 = start_state(experiment, theta, solver)
+    v0 = np.zeros(x.shape[1])
+    if known is None:
+        try:
+            x[0], v0 = start_state(experiment, theta, solver)
+        except SimulationError as failure:
+            return x[:0], failure
+        known = x[:1]
+    done = len(known)
+    x[:done] = known
     forces = np.zeros_like(x)  # total force at every evaluation so far
-    if dynamics.first_row == 0:
-        still = np.zeros_like(x[:1])
-        forces[0] = dynamics.body.force(x[:1], still, theta)[0] + dynamics.external_force_n
-    for t in range(1, dynamics.rows):
+    xi, nu = dynamics.evaluation_states(x)
+    first, seen = dynamics.first_row, done - dynamics.first_row
+    if seen > 0:
+        internal = dynamics.body.force(xi[:seen], nu[:seen], theta)
+        forces[first:done] = internal + dynamics.external_force_n
+    for t in range(done, dynamics.rows):
         row = _Row(dynamics, theta, x, forces, t)
         guess = x[t - 1] + (x[t - 1] - x[t - 2] if t > 1 else dynamics.step_s * v0)
         try:
             x[t] = _solve_row(solver, row, guess, x[t - 1], held[t])
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
-            raise simulation_error(solver, failure, time_s, f"the step at row {t}") from failure
+            return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
         forces[t] = row.force(x[t])
         if progress:
             progress(t / (dynamics.rows - 1))
-    return x
+    return x, None
 
 
 class _Row:

@@ -82,21 +82,29 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
         return f"{found}; expected a table with some of the keys {', '.join(model.model_fields)}"
     if kind == "literal_error":
         return f"{found}; {_meant(fault['input'], fault['ctx']['expected'])}"
-    phrase = _EXPECTED[kind] if kind in _EXPECTED else fault["msg"].removeprefix("Input should be ")
-    return f"{found}; expected {phrase.format(**fault.get('ctx') or {})}"
+    if kind in _EXPECTED:
+        return f"{found}; expected {_EXPECTED[kind].format(**fault.get('ctx') or {})}"
+    return f"{found}; expected {fault['msg'].removeprefix('Input should be ')}"
 
 
 def _unknown_key(key: Sequence[Part]) -> str:
     known = list(_model_at(key[:-1]).model_fields)
-    close = difflib.get_close_matches(str(key[-1]), known, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+    close = _nearest(key[-1], known)
+    hint = f"did you mean {close}?" if close else f"expected one of {', '.join(known)}"
     return f"unknown key; {hint}"
 
 
 def _meant(found: Any, expected: str) -> str:
-    names = expected.replace(" or ", ", ").replace("'", "").split(", ")
-    close = difflib.get_close_matches(str(found), [n for n in names if len(n) > 2], n=1)
-    return f"did you mean {close[0]!r}? Expected {expected}" if close else f"expected {expected}"
+    close = _nearest(found, expected.replace(" or ", ", ").replace("'", "").split(", "))
+    return f"did you mean {close!r}? Expected {expected}" if close else f"expected {expected}"
+
+
+def _nearest(found: Any, names: Sequence[str]) -> str | None:
+    """The name that was meant, where it was cut short or misspelt."""
+    text = str(found)
+    longer = [name for name in names if len(text) > 2 and name.startswith(text)]
+    close = longer or difflib.get_close_matches(text, [n for n in names if len(n) > 2], n=1)
+    return close[0] if close else None
 
 
 def _where(key: Sequence[Part], content: dict[str, Any]) -> str:

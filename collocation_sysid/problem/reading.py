@@ -140,4 +140,4 @@ def _value(text: str, key: str) -> Any:
                 'as 0.5, [0, 0, -9.81], {guess = 0.5} or "text"',
                 "--set",
             ) from None
-        return text
+        return text.strip()

@@ -19,14 +19,15 @@ from ..experiment import (
     Placement,
     PoseSequence,
     align,
+    held_nodes,
     place_markers,
     read_markers_csv,
     read_poses_csv,
 )
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
-from ..nlp.parameters import Parameters
 from ..nlp.newton import Solver
+from ..nlp.parameters import Parameters
 from ..nlp.rest import start_state
 from .schema import ExperimentSection, GraspSection, MarkersSection, NodesSection
 
@@ -118,6 +119,14 @@ class RecordingReader:
                 validation=section.validation,
             )
 
+        n = len(self.body.nodes_m)
+        if len(held_nodes(grasps)) == n:
+            raise InputError(
+                f"the selected nodes are all {n} there are, so nothing can move; select fewer, and "
+                "check length_unit of the object",
+                None,
+                "grasp",
+            )
         return self._place(t_s, table, build)
 
     def _grasp_key(self, k: int, key: str) -> str:

@@ -29,6 +29,7 @@ class Status(Enum):
     NUMERICAL_FAILURE = "numerical-failure"
     INTERRUPTED = "interrupted"
     REFUSED = "refused"
+    NOT_SIMULABLE = "not-simulable"
 
     @property
     def converged(self) -> bool:
@@ -55,6 +56,8 @@ _SENTENCES = {
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",
     Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
+    Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
+    "damped parameters, or use interior-point, which needs no simulation.",
     Status.REFUSED: "The solver refused the problem or one of its options.",
 }
 
@@ -149,6 +152,11 @@ class Solution:
     def max_violation_relative(self) -> float:
         """The same over the largest force in the balance."""
         return self.max_violation_n / max(self.collocation.largest_force_n(self.z), 1e-300)
+
+    @cached_property
+    def kkt_residual(self) -> float:
+        """Largest violation of the NLP's first-order conditions, see `Collocation`."""
+        return self.collocation.kkt_residual(self.z, self.multipliers)
 
     @property
     def largest_violations(self) -> list[Violation]:

@@ -1,0 +1,224 @@
+"""What a tetrahedral mesh must satisfy, as arrays: checked, cleaned, refused, graded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..errors import InputError
+
+# Volume over mean edge length cubed; 0.118 for the regular tetrahedron. Below this a
+# single-precision file cannot tell the element from a flat one.
+DEGENERATE_RATIO = 1e-6
+
+_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+
+def checked_points(points_m: ArrayLike) -> np.ndarray:
+    """Return a float64 copy of (n, 3) coordinates."""
+    try:
+        points = np.array(points_m, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError("points_m must be an (n, 3) array of numbers") from None
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
+    return points
+
+
+def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
+    """Return an int64 copy of (E, 4) node numbers, E > 0, all of them below `node_count`."""
+    try:
+        array = np.array(tetrahedra)
+    except ValueError:
+        raise InputError("tetrahedra must be an (E, 4) array of node numbers") from None
+    if array.ndim != 2 or array.shape[1] != 4 or not len(array):
+        raise InputError(f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}")
+    if array.dtype.kind not in "iu":
+        raise InputError(f"tetrahedra must hold integer node numbers, not {array.dtype}")
+    bad = np.flatnonzero(((array < 0) | (array >= node_count)).any(axis=1))
+    if len(bad):
+        hint = (
+            "; they seem to count from 1" if (array.min(), array.max()) == (1, node_count) else ""
+        )
+        raise InputError(
+            f"element {bad[0]} has nodes {array[bad[0]].tolist()}, but there are {node_count} "
+            f"nodes, counted from 0{hint} ({len(bad)} such in all)"
+        )
+    return array.astype(np.int64)
+
+
+def checked_point_arrays(arrays: Mapping[str, ArrayLike], node_count: int) -> dict[str, np.ndarray]:
+    """Return the arrays, each of which must have a value per node."""
+    checked = {name: np.asarray(values) for name, values in arrays.items()}
+    for name, values in checked.items():
+        if values.ndim == 0 or len(values) != node_count:
+            raise InputError(
+                f'point array "{name}" has shape {values.shape}; '
+                f"its first length must be the number of nodes, {node_count}"
+            )
+    return checked
+
+
+def cleaned(
+    points_m: np.ndarray, tetrahedra: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Drop nodes that no element uses and reverse negatively oriented elements, keeping orders.
+
+    Returns
+    -------
+    points_m : (n', 3) array
+    tetrahedra : (E, 4) array
+    used : (n',) int64
+        The number that each node had, increasing.
+    notes : tuple of str
+        What was cleaned and what looks suspicious, in sentences.
+
+    Raises
+    ------
+    InputError
+        For coordinates that are not finite, and elements that are degenerate or given twice.
+    """
+    used, renumbered = np.unique(tetrahedra, return_inverse=True)
+    _refuse_non_finite(points_m, used)
+    _refuse_duplicates(tetrahedra)
+    _refuse_degenerate(points_m, tetrahedra)
+    kept = points_m[used]
+    oriented, reversed_elements = orient(kept, renumbered.reshape(-1, 4))
+    notes = []
+    dropped = np.setdiff1d(np.arange(len(points_m)), used)
+    if len(dropped):
+        notes.append(
+            f"{len(dropped)} of {len(points_m)} nodes were dropped (node {dropped[0]} is the "
+            "first): no element uses them."
+        )
+    if len(reversed_elements):
+        notes.append(
+            f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
+            "re-oriented."
+        )
+    return kept, oriented, used, (*notes, *_note_parts(kept, oriented))
+
+
+def orient(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tetrahedra with positive volumes, and the indices of those that were reversed."""
+    reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
+    oriented = tetrahedra.copy()
+    oriented[reversed_elements, 2:] = tetrahedra[reversed_elements, :1:-1]
+    return oriented, reversed_elements
+
+
+def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Volume of each tetrahedron, (E,) m³; positive if (x₁−x₀, x₂−x₀, x₃−x₀) is right-handed."""
+    corner = points_m[tetrahedra]
+    a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
+    return np.einsum("ei,ei->e", np.cross(a, b), c) / 6
+
+
+def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
+    """Pairs of nodes that share an element, (m, 2), each once, sorted."""
+    return np.unique(np.sort(tetrahedra[:, _EDGES].reshape(-1, 2), axis=1), axis=0)
+
+
+@dataclass(frozen=True)
+class MeshQuality:
+    """Size and shape of a mesh's elements.
+
+    The quality of an element is its mean ratio 12 (3V)^(2/3) / Σ l² over its six edges: 1 for
+    the regular tetrahedron, towards 0 the flatter it gets.
+    """
+
+    nodes: int
+    elements: int
+    volume_m3: float
+    edge_min_m: float
+    edge_mean_m: float
+    edge_max_m: float
+    quality_min: float
+    quality_median: float
+    worst_element: int
+
+    def describe(self) -> str:
+        """Return the numbers as a sentence."""
+        low, mean, high = (1e3 * x for x in (self.edge_min_m, self.edge_mean_m, self.edge_max_m))
+        return (
+            f"{self.nodes} nodes, {self.elements} tetrahedra, {self.volume_m3:.4g} m³; "
+            f"edges {low:.3g} to {high:.3g} mm (mean {mean:.3g} mm); "
+            f"mean-ratio quality {self.quality_min:.2f} at worst (element {self.worst_element}), "
+            f"{self.quality_median:.2f} in the median."
+        )
+
+
+def measured_quality(
+    points_m: np.ndarray, tetrahedra: np.ndarray, edges: np.ndarray
+) -> MeshQuality:
+    """Measure positively oriented tetrahedra and their `unique_edges`."""
+    volumes = signed_volumes(points_m, tetrahedra)
+    quality = 12 * (3 * volumes) ** (2 / 3) / (_edge_lengths(points_m, tetrahedra) ** 2).sum(axis=1)
+    lengths = np.linalg.norm(np.diff(points_m[edges], axis=1), axis=2)
+    return MeshQuality(
+        nodes=len(points_m),
+        elements=len(tetrahedra),
+        volume_m3=float(volumes.sum()),
+        edge_min_m=float(lengths.min()),
+        edge_mean_m=float(lengths.mean()),
+        edge_max_m=float(lengths.max()),
+        quality_min=float(quality.min()),
+        quality_median=float(np.median(quality)),
+        worst_element=int(quality.argmin()),
+    )
+
+
+def _edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    ends = points[tetrahedra[:, _EDGES]]
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
+
+
+def _refuse_non_finite(points: np.ndarray, used: np.ndarray) -> None:
+    bad = used[~np.isfinite(points[used]).all(axis=1)]
+    if len(bad):
+        raise InputError(
+            f"node {bad[0]} lies at {points[bad[0]].tolist()}: "
+            f"coordinates must be finite ({len(bad)} such in all)"
+        )
+
+
+def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
+    _, first, inverse = np.unique(
+        np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    twin = first[inverse.ravel()]
+    again = np.flatnonzero(twin != np.arange(len(tetrahedra)))
+    if len(again):
+        raise InputError(
+            f"element {again[0]} has the same nodes {tetrahedra[again[0]].tolist()} as element "
+            f"{twin[again[0]]}; remove the duplicates ({len(again)} in all)"
+        )
+
+
+def _refuse_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
+    volumes = np.abs(signed_volumes(points, tetrahedra))
+    cubes = _edge_lengths(points, tetrahedra).mean(axis=1) ** 3
+    bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
+    if len(bad):
+        raise InputError(
+            f"element {bad[0]} with nodes {tetrahedra[bad[0]].tolist()} is degenerate: its volume "
+            f"is {volumes[bad[0]]:.3g} m³, which must exceed {DEGENERATE_RATIO:g} of its mean edge "
+            f"length cubed, {cubes[bad[0]]:.3g} m³ ({len(bad)} such in all); remove it or remesh"
+        )
+
+
+def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
+    edges, n = unique_edges(tetrahedra), len(points)
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
+    parts, label = connected_components(graph, directed=False)
+    if parts == 1:
+        return ()
+    sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
+    twins = n - len(np.unique(points, axis=0))
+    hint = f"; {twins} of {n} nodes lie exactly on others: merge them" if twins else ""
+    return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)

@@ -1,0 +1,177 @@
+"""Mesh files, read and written through meshio: plain arrays in, plain arrays out."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+
+METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
+
+_SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
+
+
+def length_in_metres(length_unit: str) -> float:
+    """Return the length of one "m", "cm", "mm", "um" or "in" in metres."""
+    if length_unit not in METRES_PER_UNIT:
+        known = ", ".join(f'"{unit}"' for unit in METRES_PER_UNIT)
+        raise InputError(f"length unit {length_unit!r} is unknown; use one of {known}")
+    return METRES_PER_UNIT[length_unit]
+
+
+def read_tetrahedra(
+    path: str | Path, length_unit: str = "m"
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
+    """Read the linear tetrahedra of a file; other cells are left out.
+
+    Returns
+    -------
+    points_m : (n, 3) float64
+    tetrahedra : (E, 4)
+        E > 0.
+    point_arrays : dict of name to (n, ...) array
+        The file's point data, and its point sets as booleans.
+    notes : tuple of str
+        Which cells were left out, if any.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or holds no linear tetrahedra.
+    """
+    metres = length_in_metres(length_unit)
+    data = _read(path)
+    counts = _cell_counts(data)
+    blocks = [block.data for block in data.cells if block.type == "tetra" and len(block.data)]
+    if not blocks:
+        raise InputError(_explain_no_tetrahedra(counts), path)
+    return (
+        np.asarray(data.points, dtype=float) * metres,
+        np.concatenate(blocks),
+        {**_point_sets(data), **data.point_data},
+        _note_left_out(counts),
+    )
+
+
+def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray, np.ndarray]:
+    """Read the vertices (p, 3) in metres and triangles (F, 3) of a surface file.
+
+    Quadrilaterals and polygons are split into triangles.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or holds no triangles.
+    """
+    metres = length_in_metres(length_unit)
+    data = _read(path)
+    fans = [
+        _fan(np.asarray(block.data, dtype=np.int64))
+        for block in data.cells
+        if block.type in ("triangle", "quad", "polygon") and len(block.data)
+    ]
+    if not fans:
+        raise InputError(f"no triangles in this file, found {_listed(_cell_counts(data))}", path)
+    # An OBJ vertex may carry a colour after its coordinates.
+    return np.asarray(data.points, dtype=float)[:, :3] * metres, np.concatenate(fans)
+
+
+def write_tetrahedra(
+    path: str | Path,
+    points_m: np.ndarray,
+    tetrahedra: np.ndarray,
+    point_arrays: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Write a mesh, in metres, to any format meshio knows by the file's ending."""
+    import meshio  # slow to import
+
+    # Few formats have a boolean type.
+    arrays: dict[str, Any] = {
+        name: values.astype(np.uint8) if values.dtype == bool else values
+        for name, values in (point_arrays or {}).items()
+    }
+    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data=arrays)
+    with _one_error(path, "written"):
+        meshio.write(path, mesh)
+
+
+def _read(path: str | Path) -> Any:
+    import meshio  # slow to import
+
+    if not Path(path).is_file():
+        raise InputError("there is no such file", path)
+    with _one_error(path, "read"):
+        return meshio.read(path)
+
+
+@contextlib.contextmanager
+def _one_error(path: str | Path, done: str) -> Iterator[None]:
+    """Turn whatever meshio does on a bad file into one InputError."""
+    # Its readers raise whatever their parsing trips over, print, warn, and may exit.
+    said = io.StringIO()
+    try:
+        with (
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    except (Exception, SystemExit) as error:
+        reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
+        raise InputError(
+            f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
+            ".mesh and .inp are known, told by the file's ending",
+            path,
+        ) from error
+
+
+def _point_sets(data: Any) -> dict[str, np.ndarray]:
+    sets = {}
+    for name, nodes in (data.point_sets or {}).items():
+        sets[name] = np.zeros(len(data.points), dtype=bool)
+        sets[name][np.asarray(nodes, dtype=np.int64)] = True
+    return sets
+
+
+def _fan(polygons: np.ndarray) -> np.ndarray:
+    corners = range(1, polygons.shape[1] - 1)
+    return np.concatenate([polygons[:, [0, i, i + 1]] for i in corners])
+
+
+def _cell_counts(data: Any) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for block in data.cells:
+        counts[block.type] += len(block.data)
+    return counts
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
+
+
+def _note_left_out(counts: Mapping[str, int]) -> tuple[str, ...]:
+    others = {name: count for name, count in counts.items() if name != "tetra" and count}
+    if not others:
+        return ()
+    solid = any(name.startswith(_SOLID_CELLS) for name in others)
+    warning = ": that part of the body is missing" if solid else ""
+    return (f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",)
+
+
+def _explain_no_tetrahedra(counts: Mapping[str, int]) -> str:
+    if "tetra10" in counts:
+        return (
+            f"found only quadratic tetrahedra ({_listed(counts)}), which are for the quadratic "
+            "element and not supported yet; save the mesh with linear tetrahedra"
+        )
+    surface = "; a closed surface can be filled by TetMesh.from_surface" * ("triangle" in counts)
+    return f"no tetrahedra in this file, found {_listed(counts)}{surface}"

@@ -1,0 +1,112 @@
+"""Structured meshes of boxes and cylinders."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from .mesh import TetMesh
+from .mesh_checks import orient
+
+
+def box_mesh(
+    size_m: ArrayLike, divisions: ArrayLike, origin_m: ArrayLike = (0.0, 0.0, 0.0)
+) -> TetMesh:
+    """Mesh a box: each of its cells is split into the six tetrahedra around its main diagonal.
+
+    Parameters
+    ----------
+    size_m : three numbers
+        Lengths along x, y and z.
+    divisions : three integers
+        Cells along x, y and z.
+    origin_m : three numbers
+        The corner with the lowest coordinates.
+
+    Returns
+    -------
+    TetMesh
+        Nodes ordered with z fastest, then y, then x.
+    """
+    size, origin = np.asarray(size_m, dtype=float), np.asarray(origin_m, dtype=float)
+    cells = np.asarray(divisions)
+    if size.shape != (3,) or origin.shape != (3,) or not (size > 0).all():
+        raise InputError(f"a box needs three positive lengths in metres, not {size_m!r}")
+    if cells.shape != (3,) or cells.dtype.kind not in "iu" or not (cells > 0).all():
+        raise InputError(f"a box needs three positive whole divisions, not {divisions!r}")
+    ticks = [np.linspace(0, 1, n + 1) for n in cells]
+    points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) * size + origin
+
+    stride = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
+    corner = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1) @ stride
+    # A path along the cell's edges from its lowest to its highest corner, for each order of axes.
+    orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
+    paths = np.array([[0, *np.cumsum(stride[list(order)])] for order in orders])
+    tetrahedra = (corner.reshape(-1, 1, 1) + paths).reshape(-1, 4)
+    return TetMesh(points, orient(points, tetrahedra)[0])
+
+
+def cylinder_mesh(radius_m: float, height_m: float, rings: int, layers: int) -> TetMesh:
+    """Mesh an upright cylinder: axis z, base at z = 0.
+
+    Ring k of each cross-section has 6k nodes, so a mesh has (1 + 3 rings (rings + 1)) (layers + 1)
+    nodes and 18 rings² layers elements. The outermost ring is a polygon inscribed in the circle:
+    with one ring the volume is 17 % below the cylinder's, with two 4.5 %, with three 2 %.
+
+    Parameters
+    ----------
+    radius_m, height_m : float
+    rings, layers : int
+        Elements along the radius and along the height.
+
+    Returns
+    -------
+    TetMesh
+        Nodes ordered by layer from z = 0 up; in each layer the centre, then ring by ring.
+    """
+    for name, value in (("radius_m", radius_m), ("height_m", height_m)):
+        if not 0 < value < np.inf:
+            raise InputError(f"a cylinder needs a positive {name}, not {value!r}")
+    for name, value in (("rings", rings), ("layers", layers)):
+        if not isinstance(value, (int, np.integer)) or value < 1:
+            raise InputError(f"a cylinder needs a whole number of {name}, 1 or more, not {value!r}")
+    disc, triangles = _disc(rings)
+    points = np.concatenate(
+        [
+            np.column_stack([radius_m * disc, np.full(len(disc), z)])
+            for z in np.linspace(0, height_m, layers + 1)
+        ]
+    )
+    # In a prism over a, b, c each side's diagonal starts from its node that comes first, so that
+    # neighbours agree. Alternating the order from layer to layer keeps the mesh from being twisted.
+    up = np.sort(triangles, axis=1)
+    tetrahedra = [
+        np.concatenate([np.c_[a, b, c, c_], np.c_[a, b, b_, c_], np.c_[a, a_, b_, c_]])
+        for layer in range(layers)
+        for a, b, c in [(up if layer % 2 == 0 else up[:, ::-1]).T + layer * len(disc)]
+        for a_, b_, c_ in [(a + len(disc), b + len(disc), c + len(disc))]
+    ]
+    return TetMesh(points, orient(points, np.concatenate(tetrahedra))[0])
+
+
+def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (·, 2) and triangles (6 rings², 3) of the unit disc."""
+    angles = [2 * np.pi * np.arange(6 * k) / (6 * k) for k in range(1, rings + 1)]
+    circles = [
+        k / rings * np.column_stack([np.cos(angle), np.sin(angle)])
+        for k, angle in enumerate(angles, start=1)
+    ]
+
+    def node(ring: int, sector: int, step: int) -> int:
+        return 1 + 3 * ring * (ring - 1) + (sector * ring + step) % (6 * ring) if ring else 0
+
+    triangles = []
+    for k in range(1, rings + 1):
+        for s in range(6):
+            for i in range(k):
+                outer = node(k, s, i + 1)
+                triangles.append((node(k - 1, s, i), node(k, s, i), outer))
+                if i < k - 1:
+                    triangles.append((node(k - 1, s, i), outer, node(k - 1, s, i + 1)))
+    return np.concatenate([np.zeros((1, 2)), *circles]), np.array(triangles)

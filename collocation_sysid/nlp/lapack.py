@@ -1,0 +1,51 @@
+"""LAPACK's banded Cholesky without the interpreter lock, so that threads can share the work.
+
+SciPy's own wrapper holds the lock while it factorises; its Cython interface gives the address of
+the same routine.
+"""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import LowLevelCallable
+from scipy.linalg import cython_lapack
+
+
+def _routine(name: str, arguments: int) -> ctypes._CFuncPtr:
+    capsule = LowLevelCallable.from_cython(cython_lapack, name).function
+    api = ctypes.pythonapi
+    api.PyCapsule_GetName.restype = ctypes.c_char_p
+    api.PyCapsule_GetName.argtypes = [ctypes.py_object]
+    api.PyCapsule_GetPointer.restype = ctypes.c_void_p
+    api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
+    address = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)(address)
+
+
+_DPBTRF = _routine("dpbtrf", 6)
+
+
+def cholesky_in_place(band: NDArray[np.float64]) -> bool:
+    """Factorise a symmetric matrix given by its lower band; tell whether it is positive definite.
+
+    Parameters
+    ----------
+    band : (half-bandwidth + 1, n) Fortran-ordered ndarray
+        Diagonal first; overwritten by the factor.
+    """
+    rows, columns = band.shape
+    lower = ctypes.c_char(b"L")
+    size, width, leading = ctypes.c_int(columns), ctypes.c_int(rows - 1), ctypes.c_int(rows)
+    failed_at = ctypes.c_int(0)
+    _DPBTRF(
+        ctypes.addressof(lower),
+        ctypes.addressof(size),
+        ctypes.addressof(width),
+        band.ctypes.data,
+        ctypes.addressof(leading),
+        ctypes.addressof(failed_at),
+    )
+    return failed_at.value == 0

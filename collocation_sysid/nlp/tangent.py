@@ -1,0 +1,244 @@
+"""Solve linearised equations of motion forward and backward in time, block by block.
+
+The Jacobian c_x is block lower-triangular in time, so that with one factorisation a timestep
+c_x Y = −R (forward) and c_xᵀ y = −g (backward) are solved without ever forming it. With
+G = ∂F/∂ξ, C = ∂F/∂ν at evaluation t (see `nlp.schemes`), one step forward is the tangent of one
+step of the scheme:
+
+    −A Y_t = R_t + w_0 F' + Σ_{j≥1} w_j dF_{t−j} − M Σ_{i≥1} s_i Y_{t−i} / Δt²,
+    F' = F_R + G Σ_{i≥1} p_i Y_{t−i} + C Σ_{i≥1} q_i Y_{t−i} / Δt,
+    −A = −∂c_t/∂x_t = −w_0 (p_0 G + q_0 C / Δt) + s_0 M / Δt²,
+
+and dF_t follows from the row itself. For the feasibility step p, R is c and F_R is zero; for
+Z = dx/dq, R is zero and F_R is ∂F/∂q.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from ..errors import SimulationError
+from ..fem.body import Linearisation
+from .dynamics import Dynamics, Tables
+from .factorisation import Factor, Factoriser
+from .parameters import Theta
+from .segment import Segment
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Element results and factors are kept for this many timesteps at a time.
+CHUNK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """The feasibility step and the sensitivities of one experiment at (x, q).
+
+    Attributes
+    ----------
+    step : (N, 3n) p = −c_x⁻¹ c [m]
+    by_q : (N, 3n, nq) Z = −c_x⁻¹ c_q [m]
+    indefinite : int
+        Timesteps whose block −∂c_t/∂x_t is not positive definite.
+    """
+
+    step: Array
+    by_q: Array
+    indefinite: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One timestep's blocks: G, C (lower triangles), ∂F/∂θ, and −∂c_t/∂x_t factorised."""
+
+    t: int
+    by_position: Array
+    by_velocity: Array
+    by_theta: Array
+    factor: Factor
+
+
+class BlockSolver:
+    """Forward and backward substitution in time for the first rows of one experiment.
+
+    Parameters
+    ----------
+    segment : Segment
+    rows : int, optional
+        Grid times to take, all by default.
+    """
+
+    def __init__(self, segment: Segment, rows: int | None = None) -> None:
+        self.dynamics = _first_rows(segment.dynamics, rows or segment.grid_rows)
+        self.segment = segment
+        self.body = segment.body
+        self.free = segment.free_dofs
+        self.factoriser = Factoriser(self.body.pattern, self.free)
+        full_rows, full_columns, source = self.body.pattern.full
+        place = np.full(self.body.pattern.size, -1)
+        place[self.free] = np.arange(len(self.free))
+        kept = (place[full_rows] >= 0) & (place[full_columns] >= 0)
+        self._source = source[kept]
+        # Sorted by column; the matrices are symmetric, so that serves for rows as well.
+        counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
+        indptr = np.concatenate([[0], np.cumsum(counts)])
+        self._matrix = sp.csr_array(
+            (np.zeros(len(self._source)), place[full_rows[kept]], indptr),
+            shape=(len(self.free), len(self.free)),
+        )
+
+    def forward(self, x: Array, theta: Theta, theta_q: Array) -> Tangent:
+        """p and Z at x (N, 3n); θ_q is ∂θ/∂q (4, nq).
+
+        Raises
+        ------
+        SimulationError
+            Where a timestep's equations are singular or not finite.
+        """
+        residual = self.dynamics.residual(x, theta)[:, self.free]
+        columns = np.zeros((*x.shape, 1 + theta_q.shape[1]))
+        march = _Forward(self, (len(self.free), columns.shape[2]))
+        indefinite = 0
+        for step in self._steps(x, theta):
+            indefinite += not step.factor.positive_definite
+            right, force = np.zeros(march.shape), np.zeros(march.shape)
+            right[:, 0] = residual[step.t]
+            force[:, 1:] = step.by_theta[self.free] @ theta_q
+            columns[step.t, self.free] = march.advance(step, right, force)
+        return Tangent(columns[:, :, 0], columns[:, :, 1:], indefinite)
+
+    def backward(self, x: Array, theta: Theta, gradient: Array) -> Array:
+        """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m]."""
+        dynamics, reach = self.dynamics, self.dynamics.reach
+        tables, step_s = dynamics.tables, dynamics.step_s
+        mass = self.body.dof_mass[self.free]
+        y = np.zeros((dynamics.rows, len(self.free)))
+        pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
+        for step in self._steps(x, theta, backward=True):
+            t = step.t
+            lags = range(min(reach, t) + 1)
+            later = [j for j in range(1, reach + 1) if t + j < dynamics.rows]
+            known = sum(
+                (tables.w[t + j, j] * y[t + j] for j in later if tables.w[t + j, j]),
+                np.zeros(len(self.free)),
+            )
+            p, q, w = tables.p[t], tables.q[t] / step_s, tables.w[t, 0]
+            by_position, by_velocity = None, None
+            if known.any():
+                by_position = self.apply(step.by_position, known)
+                by_velocity = self.apply(step.by_velocity, known)
+                pulled[t] -= p[0] * by_position + q[0] * by_velocity
+            # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left, and the factor is of its negative.
+            y[t] = -step.factor.solve(pulled[t])
+            force_weight = known + w * y[t]
+            by_position = self.apply(step.by_position, force_weight)
+            by_velocity = self.apply(step.by_velocity, force_weight)
+            for i in lags:
+                if i > 0:
+                    pulled[t - i] -= p[i] * by_position + q[i] * by_velocity
+                    pulled[t - i] += tables.s[t, i] / step_s**2 * mass * y[t]
+        full = np.zeros_like(x)
+        full[:, self.free] = y
+        return full
+
+    def apply(self, lower: Array, columns: Array) -> Array:
+        """Product of a symmetric matrix, given by its lower triangle, on the free dofs."""
+        self._matrix.data = lower[self._source]
+        return self._matrix @ columns
+
+    def _steps(self, x: Array, theta: Theta, backward: bool = False) -> Iterator[_Step]:
+        """Blocks and factors of every row, computed in chunks side by side."""
+        dynamics, body = self.dynamics, self.body
+        tables, first = dynamics.tables, dynamics.first_row
+        xi, nu = dynamics.evaluation_states(x)
+        starts = range(first, dynamics.rows, CHUNK)
+        for start in reversed(starts) if backward else starts:
+            stop = min(start + CHUNK, dynamics.rows)
+            here = slice(start - first, stop - first)
+            at = body.linearise(xi[here], nu[here], theta)
+            factors = self._factorise(at, slice(start, stop))
+            order = range(stop - start)
+            for k in reversed(order) if backward else order:
+                yield _Step(
+                    start + k, at.by_position[k], at.by_velocity[k], at.by_theta[k], factors[k]
+                )
+
+    def _factorise(self, at: Linearisation, rows: slice) -> list[Factor]:
+        tables, step_s = self.dynamics.tables, self.dynamics.step_s
+        p = tables.w[rows, 0] * tables.p[rows, 0]
+        q = tables.w[rows, 0] * tables.q[rows, 0] / step_s
+        s = tables.s[rows, 0] / step_s**2
+        matrices = -p[:, None] * at.by_position - q[:, None] * at.by_velocity
+        matrices[:, self.body.pattern.diagonal] += s[:, None] * self.body.dof_mass
+        try:
+            return self.factoriser.factorise_all(matrices, self.body.threads)
+        except np.linalg.LinAlgError as error:
+            raise SimulationError(
+                f"experiment '{self.segment.experiment.name}': the linearised equations of "
+                f"motion cannot be solved: {error}",
+                float(self.dynamics.t_s[rows.start]),
+            ) from error
+
+
+class _Forward:
+    """The last few steps' solutions and force increments, most recent first."""
+
+    def __init__(self, solver: BlockSolver, shape: tuple[int, int]) -> None:
+        self.solver = solver
+        self.shape = shape
+        self.tables = solver.dynamics.tables
+        self.step_s = solver.dynamics.step_s
+        self.mass = solver.body.dof_mass[solver.free, None]
+        reach = solver.dynamics.reach
+        self.past: deque[Array] = deque([np.zeros(shape)] * reach, maxlen=reach)
+        self.past_force = self.past.copy()
+
+    def advance(self, step: _Step, right: Array, force: Array) -> Array:
+        """Y_t from R_t and F_R, each (free, columns)."""
+        tables, t = self.tables, step.t
+        w, s = tables.w[t], tables.s[t] / self.step_s**2
+        right += weighted(w[1:], self.past_force, self.shape)
+        right -= self.mass * weighted(s[1:], self.past, self.shape)
+        force += self._of_past(step, tables.p[t, 1:], tables.q[t, 1:] / self.step_s)
+        solution = step.factor.solve(right + w[0] * force)
+        if tables.w.shape[1] > 1 and tables.w[:, 1:].any():
+            self.past_force.appendleft((s[0] * self.mass * solution - right) / w[0])
+        self.past.appendleft(solution)
+        return solution
+
+    def _of_past(self, step: _Step, p: Array, q: Array) -> Array:
+        """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
+        lags = np.flatnonzero((p != 0) | (q != 0))
+        if len(lags) == 0:
+            return np.zeros(self.shape)
+        if len(lags) == 1:
+            i = lags[0]
+            block = p[i] * step.by_position + q[i] * step.by_velocity
+            return self.solver.apply(block, self.past[i])
+        total = self.solver.apply(step.by_velocity, weighted(q, self.past, self.shape))
+        if p.any():
+            total += self.solver.apply(step.by_position, weighted(p, self.past, self.shape))
+        return total
+
+
+def weighted(weights: Array, past: deque[Array], shape: tuple[int, ...]) -> Array:
+    """Σ_i weights[i] past[i]."""
+    total = np.zeros(shape)
+    for weight, item in zip(weights, past, strict=True):
+        if weight:
+            total += weight * item
+    return total
+
+
+def _first_rows(dynamics: Dynamics, rows: int) -> Dynamics:
+    """The same dynamics on the first grid times only."""
+    t = dynamics.tables
+    tables = Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows])
+    return replace(dynamics, tables=tables, t_s=dynamics.t_s[:rows])

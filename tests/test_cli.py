@@ -1,0 +1,452 @@
+"""The commands, in this process: what they print, how they end, and what they write."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import meshio
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from problem_files import (
+    AT_TRUTH,
+    TRUTH,
+    contents,
+    remove,
+    run_command,
+    settings,
+    write_problem,
+)
+from rich.console import Console
+
+import collocation_sysid as cs
+from collocation_sysid import terminal
+from collocation_sysid.experiment import read_markers_csv, read_poses_csv
+from collocation_sysid.problem import ProblemFile, read_problem_file
+from collocation_sysid.results.solution import Iteration
+
+RUN = import_module("collocation_sysid.run")  # in the package, `run` is the function
+RESULT_KEYS = {
+    "schema": set(),
+    "status": set(),
+    "message": set(),
+    "method": set(),
+    "parameters": {"lambda_pa", "mu_pa", "gamma_r_s", "gamma_m_1_s"},
+    "fit": {"rms_m", "experiments"},
+    "dynamics": {"max_violation_n", "max_violation_relative"},
+    "rollout": {"rms_m", "max_m"},
+    "iterations": set(),
+    "timing_s": {"build", "evaluations", "linear_algebra", "total"},
+    "problem": {"nodes", "elements", "timesteps", "variables", "constraints"},
+    "provenance": {"version", "casadi", "problem_sha256", "platform"},
+}
+
+
+def result_in(folder: Path) -> dict:
+    return json.loads((folder / "result.json").read_text())
+
+
+def frames_in(listing: Path) -> list[Path]:
+    sets = ElementTree.parse(listing).getroot().iter("DataSet")
+    return [listing.parent / item.attrib["file"] for item in sets]
+
+
+# A whole run: two recordings of different length and one to validate ------------------------------
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    folder = tmp_path_factory.mktemp("three")
+    file = write_problem(folder, {"swing": 8, "nod": 12, "twist": 6}, validation="twist")
+    outcome = run_command("solve", file, "--out", folder / "run")
+    run = folder / "run"
+    with np.load(run / "trajectory.npz") as stored:
+        arrays = dict(stored)
+    return SimpleNamespace(
+        file=file, outcome=outcome, run=run, result=result_in(run), arrays=arrays
+    )
+
+
+def test_the_answer_is_on_stdout_alone(solved):
+    assert solved.outcome.code == 0
+    assert solved.outcome.err == ""
+    for words in ("Converged", "λ Pa", "300", "roll-out 'swing'", "validation 'twist'"):
+        assert words in solved.outcome.out
+    assert f"written to {solved.run}\n" in solved.outcome.out
+
+
+def test_exact_data_give_the_exact_parameters(solved):
+    found = {name: item["value"] for name, item in solved.result["parameters"].items()}
+    assert found == pytest.approx(TRUTH, rel=1e-5)
+    assert solved.result["fit"]["rms_m"] < 1e-8
+    assert solved.result["dynamics"]["max_violation_relative"] < 1e-6
+
+
+def test_the_result_has_every_promised_key(solved):
+    assert solved.result["schema"] == 1
+    assert solved.result["status"] == "converged"
+    for key, inner in RESULT_KEYS.items():
+        assert key in solved.result
+        assert inner <= set(solved.result[key] if inner else ())
+    for item in solved.result["parameters"].values():
+        assert {"value", "guess", "std_error", "ci95", "at_bound"} <= set(item)
+        low, high = item["ci95"]
+        assert low < item["value"] < high
+    assert solved.result["parameters"]["mu_pa"]["guess"] == 200.0
+
+
+def test_every_experiment_is_reported(solved):
+    fitted = solved.result["fit"]["experiments"]
+    assert {name: item["samples"] for name, item in fitted.items()} == {"swing": 27, "nod": 39}
+    predicted = solved.result["rollout"]["experiments"]
+    assert {n: item["fitted"] for n, item in predicted.items()} == {
+        "swing": True, "nod": True, "twist": False,
+    }  # fmt: skip
+    assert max(item["rms_m"] for item in predicted.values()) < 1e-6
+
+
+def test_the_trajectory_holds_every_fitted_experiment(solved):
+    for name, rows in (("swing", 9), ("nod", 13)):
+        shapes = {
+            "t_s": (rows,),
+            "positions_m": (rows, 36, 3),
+            "markers_m": (rows, 3, 3),
+            "measured_m": (rows, 3, 3),
+            "residuals_m": (rows, 3, 3),
+        }
+        for key, shape in shapes.items():
+            assert solved.arrays[f"{name}/{key}"].shape == shape
+        difference = solved.arrays[f"{name}/markers_m"] - solved.arrays[f"{name}/measured_m"]
+        np.testing.assert_array_equal(solved.arrays[f"{name}/residuals_m"], difference)
+    assert not any(key.startswith("twist/") for key in solved.arrays)
+
+
+def test_frames_open_with_the_fitted_positions(solved):
+    for name, rows in (("swing", 9), ("nod", 13)):
+        frames = frames_in(solved.run / name / "trajectory.pvd")
+        assert len(frames) == rows
+        last = meshio.read(frames[-1])
+        np.testing.assert_array_equal(last.points, solved.arrays[f"{name}/positions_m"][-1])
+        assert len(last.cells_dict["tetra"]) == 72
+
+
+def test_plots_are_pictures(solved):
+    names = {file.stem for file in solved.run.glob("*.png")}
+    assert {"convergence", "tracks_swing", "tracks_nod", "error_swing", "error_nod"} <= names
+    for file in solved.run.glob("*.png"):
+        assert imread(file).std() > 0.01
+
+
+def test_the_problem_as_run_is_kept(solved):
+    assert (solved.run / "problem.toml").read_text() == solved.file.read_text()
+
+
+def test_plots_are_drawn_again_from_the_files(solved, tmp_path):
+    outcome = run_command("plot", solved.run, "--out", tmp_path / "again")
+    assert outcome.code == 0
+    drawn = {Path(line).name for line in outcome.out.splitlines()}
+    assert drawn == {file.name for file in (tmp_path / "again").iterdir()}
+    assert {"convergence.png", "tracks_nod.png", "error_swing.png"} <= drawn
+
+
+# Solve --------------------------------------------------------------------------------------------
+
+
+def test_a_lone_experiment_needs_no_folder_of_its_own(tiny):
+    outcome = run_command("solve", "problem.toml", "--json")
+    assert (outcome.code, outcome.err) == (0, "")
+    run = tiny / "runs" / "tiny"  # named after the problem's folder
+    assert json.loads(outcome.out) == result_in(run)
+    assert len(frames_in(run / "trajectory.pvd")) == 9
+    with np.load(run / "trajectory.npz") as stored:
+        assert stored["positions_m"].shape == (9, 36, 3)
+        assert stored["marker_names"].tolist() == ["low", "mid", "side"]
+
+
+def test_settings_change_the_run(tiny):
+    fixed = settings("parameters.gamma_m_1_s={ fixed = 0.5 }", "title=Other")
+    outcome = run_command("solve", "problem.toml", "--json", "--out", "run", *fixed)
+    result = json.loads(outcome.out)
+    assert result["parameters"]["gamma_m_1_s"]["value"] == 0.5
+    assert result["parameters"]["gamma_m_1_s"]["std_error"] is None
+    assert result["parameters"]["gamma_r_s"]["value"] != pytest.approx(TRUTH["gamma_r_s"], rel=1e-3)
+    assert 'title = "Other"' in (tiny / "run" / "problem.toml").read_text()
+    assert json.loads(outcome.out)["title"] == "Other"
+
+
+def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlier_one(tiny):
+    earlier = tiny / "run"
+    earlier.mkdir()
+    (earlier / "result.json").write_text("{}")
+    (earlier / "old.png").write_text("old")
+    short = settings("solver.max_iterations=2")
+    outcome = run_command("solve", "problem.toml", "--out", "run", "--verbose", *short)
+    assert outcome.code == 1
+    assert "iteration limit" in outcome.out
+    assert "Largest violations" in outcome.out
+    assert len(outcome.err.splitlines()) >= 3
+    result = result_in(tiny / "run")
+    assert (result["status"], result["converged"]) == ("iteration-limit", False)
+    assert result["parameters"]["mu_pa"]["std_error"] is None
+    written = set(contents(tiny / "run"))
+    assert {"trajectory.npz", "trajectory.pvd", "convergence.png", "problem.toml"} <= written
+    assert "old.png" not in written
+
+
+def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
+    def interrupt(self: terminal.Progress, line: Iteration) -> None:
+        if line.number == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(terminal.Progress, "iteration", interrupt)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 130
+    assert "Interrupted" in outcome.out
+    result = result_in(tiny / "run")
+    assert result["status"] == "interrupted"
+    assert 1 < len(result["history"]) < 4
+    assert (tiny / "run" / "trajectory.npz").is_file()
+
+
+def test_an_interruption_before_the_first_iterate_writes_nothing(tiny, monkeypatch):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("collocation_sysid.problem.load_problem", interrupt)
+    before = contents(tiny)
+    assert run_command("solve", "problem.toml", "--out", "run").code == 130
+    assert contents(tiny) == before
+
+
+def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RUN, "simulate", interrupt)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert "roll-out 'swing': failed: interrupted" in outcome.out
+    result = result_in(tiny / "run")
+    assert result["status"] == "converged"
+    assert result["rollout"]["rms_m"] is None
+
+
+def test_a_real_process_keeps_its_streams_apart(tiny):
+    program = [sys.executable, "-c", "from collocation_sysid.cli import main; main()"]
+    done = subprocess.run(
+        [*program, "solve", "problem.toml", "--json", "--out", "run"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["status"] == "converged"
+
+
+# Progress -----------------------------------------------------------------------------------------
+
+
+def test_a_terminal_shows_iterations_as_they_come(tiny):
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100)
+    with terminal.Progress(console, cs.load_problem("problem.toml")) as progress:
+        progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, cs.Theta(*TRUTH.values()), 0.5))
+        progress.say("checking")
+    assert "violation N" in screen.getvalue()
+    assert "2.5000" in screen.getvalue()
+    assert "checking" in screen.getvalue()
+
+
+@pytest.mark.parametrize(("options", "shown"), [([], True), (["--quiet"], False)])
+def test_notes_on_the_data_go_to_stderr(tiny, options, shown):
+    resampled = settings("experiment.0.resample_hz=200")
+    outcome = run_command("simulate", "problem.toml", "--out", "s", *resampled, *options)
+    assert ("note: experiment 'swing': resample_hz" in outcome.err) == shown
+
+
+# Simulate -----------------------------------------------------------------------------------------
+
+
+def test_simulation_writes_what_a_laboratory_would(tiny):
+    remove("swing_markers.csv")(tiny)
+    expected = cs.simulate(
+        cs.load_problem("problem.toml", AT_TRUTH, simulation=True).experiments[0], TRUTH
+    )
+    outcome = run_command(
+        "simulate", "problem.toml", "--out", "data", "--frames", *settings(*AT_TRUTH)
+    )
+    assert (outcome.code, outcome.err) == (0, "")
+    files = ["data/swing_markers.csv", "data/swing_poses.csv", "data/swing/trajectory.pvd"]
+    assert outcome.out.split() == files
+    table = read_markers_csv(tiny / files[0])
+    assert table.names == ("low", "mid", "side")
+    np.testing.assert_allclose(table.positions_m, expected.markers_m, atol=1e-11)
+    poses, given = read_poses_csv(tiny / files[1]), read_poses_csv(tiny / "swing_motion.csv")
+    np.testing.assert_allclose(poses.quaternions_xyzw, given.quaternions_xyzw, atol=1e-10)
+    assert len(frames_in(tiny / files[2])) == 9
+
+
+def test_noise_follows_the_seed(tiny):
+    def tracks(name: str, *options: str) -> np.ndarray:
+        outcome = run_command("simulate", "problem.toml", "--out", name, "--json", *options)
+        file, _ = json.loads(outcome.out)
+        return read_markers_csv(file).positions_m
+
+    exact = tracks("exact")
+    noisy = tracks("a", "--noise-m", "0.001", "--seed", "3")
+    assert 0.5e-3 < (noisy - exact).std() < 2e-3
+    np.testing.assert_array_equal(noisy, tracks("b", "--noise-m", "0.001", "--seed", "3"))
+    assert not np.allclose(noisy, tracks("c", "--noise-m", "0.001", "--seed", "4"), atol=1e-5)
+
+
+def test_the_integrator_is_chosen(tiny):
+    options = ["--quiet", *settings(*AT_TRUTH)]
+    run_command("simulate", "problem.toml", "--out", "a", "--integrator", "midpoint", *options)
+    run_command("simulate", "problem.toml", "--out", "b", "--timestep-s", "0.0005", *options)
+    measured = read_markers_csv(tiny / "swing_markers.csv").positions_m
+    exact = read_markers_csv(tiny / "a" / "swing_markers.csv").positions_m
+    other = read_markers_csv(tiny / "b" / "swing_markers.csv").positions_m
+    np.testing.assert_allclose(exact, measured, atol=1e-10)
+    assert 1e-6 < np.abs(other - measured).max() < 5e-3
+
+
+def test_a_simulation_that_breaks_down_says_when_and_where(tiny):
+    soft = settings(
+        "parameters.lambda_pa={ fixed = 1e-3 }", "parameters.mu_pa={ fixed = 1e-3 }",
+        "object.density_kg_m3=1e5",
+    )  # fmt: skip
+    before = contents(tiny)
+    outcome = run_command("simulate", "problem.toml", "--out", "s", *soft)
+    assert outcome.code == 1
+    assert outcome.out == ""
+    assert outcome.err.startswith("simulation failed: ")
+    assert "t = " in outcome.err
+    assert "element" in outcome.err
+    assert contents(tiny) == before
+
+
+# Check, schema, new, and help ---------------------------------------------------------------------
+
+
+def test_check_reports_sizes_and_derivatives(tiny):
+    before = contents(tiny)
+    outcome = run_command("check", "problem.toml", "--json")
+    found = json.loads(outcome.out)
+    assert outcome.code == 0
+    assert (found["nodes"], found["elements"], found["samples"]) == (36, 72, 27)
+    assert max(found["jacobian_error"], found["hessian_error"]) < 1e-6
+    assert "derivatives agree" in run_command("check", "problem.toml").out
+    assert contents(tiny) == before
+
+
+def test_check_fails_where_derivatives_do_not_agree(tiny, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.check.AGREEMENT", 0.0)
+    outcome = run_command("check", "problem.toml")
+    assert outcome.code == 1
+    assert "do not agree" in outcome.out
+
+
+def test_the_schema_describes_the_problem_file():
+    outcome = run_command("schema")
+    schema = json.loads(outcome.out)
+    assert outcome.code == 0
+    assert set(schema["properties"]) == set(ProblemFile.model_fields)
+    assert schema["additionalProperties"] is False
+
+
+@pytest.mark.parametrize("name", ["my_object", 'deep/the "soft" one'])
+def test_a_new_problem_file_is_valid(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    outcome = run_command("new", name)
+    assert outcome.code == 0
+    file, _ = read_problem_file(outcome.out.strip())
+    assert file.title == Path(name).name
+    assert file.experiment[0].grasps[0].poses == "poses.csv"
+
+
+def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_command("new", "mine")
+    text = (tmp_path / "mine" / "problem.toml").read_text()
+    commented = [line for line in text.splitlines() if line.startswith("# ") and " = " in line]
+    assert len(commented) >= 8
+    for line in commented:
+        if line.startswith("# surface"):
+            text = text.replace('mesh = "body.vtu"', "")
+        text = text.replace(line, line.removeprefix("# "))
+    text = text.replace("# [rollout]", "[rollout]")
+    (tmp_path / "all.toml").write_text(text)
+    file, _ = read_problem_file(tmp_path / "all.toml")
+    assert file.object.surface == "scan.stl"
+    assert file.rollout.timestep_s == 0.002
+
+
+def test_version_and_help():
+    assert run_command("--version").out == f"{cs.__version__}\n"
+    listed = run_command("--help")
+    assert listed.code == 0
+    for command in ("solve", "simulate", "check", "plot", "schema", "new"):
+        assert command in listed.out
+        assert run_command(command, "--help").code == 0
+
+
+def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device", "run/trajectory.npz")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 2
+    assert outcome.err == "error: run/trajectory.npz: No space left on device\n"
+    assert not (tiny / "run").exists()
+    assert not list(tiny.glob(".run*"))
+
+
+# Python -------------------------------------------------------------------------------------------
+
+
+def test_the_same_from_python(tiny):
+    problem = cs.load_problem("problem.toml")
+    solution = cs.solve(problem, method="interior-point")
+    assert solution.status.converged
+    assert solution.parameters == pytest.approx(TRUTH, rel=1e-5)
+    trajectory = cs.simulate(problem.experiments[0], solution.parameters, "midpoint")
+    measured = problem.experiments[0].markers.positions_m
+    np.testing.assert_allclose(trajectory.markers_m, measured, atol=1e-8)
+
+
+def test_options_of_the_method_are_given_by_name(tiny):
+    problem = cs.load_problem("problem.toml")
+    seen: list[Iteration] = []
+    solution = cs.solve(problem, watch=seen.append, max_iterations=1)
+    assert solution.status is cs.Status.ITERATION_LIMIT
+    assert len(seen) == len(solution.history) == 2
+    with pytest.raises(cs.InputError, match=r"no option 'max_iter'.*max_iterations"):
+        cs.solve(problem, max_iter=1)
+    with pytest.raises(cs.InputError, match=r"found 'newton'.*interior-point"):
+        cs.solve(problem, "newton")
+
+
+def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):
+    read = cs.TetMesh.read(tiny_problem / "body.vtu")
+    mesh = cs.TetMesh(read.points_m, read.tetrahedra)
+    body = cs.Body(mesh, material="neo-hookean", density_kg_m3=30.0, element="tet4")
+    x = mesh.points_m + 1e-3 * rng.normal(size=mesh.points_m.shape)
+    force = body.elastic_force(x, 200.0, 300.0)
+    stiffness = body.stiffness(x, 200.0, 300.0)
+    assert force.shape == (36, 3)
+    assert stiffness.shape == (108, 108)
+    assert body.energy(x, 200.0, 300.0) > 0
+    assert body.node_mass.sum() == pytest.approx(30.0 * 0.06**2 * 0.09)
+
+
+def test_a_run_from_python_is_written_like_any_other(tiny):
+    finished = cs.run(cs.load_problem("problem.toml"))
+    folder = cs.write_run(finished, tiny / "mine", frames=False)
+    assert result_in(folder)["status"] == "converged"
+    assert not (folder / "frames").exists()

@@ -1,0 +1,332 @@
+"""What a problem file says is what gets loaded."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from problem_files import (
+    AT_TRUTH,
+    GRASP,
+    REFERENCES,
+    SIZE_M,
+    both,
+    contents,
+    remove,
+    replace_cell,
+    replace_text,
+    write,
+)
+
+from collocation_sysid.check import check_problem
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import read_markers_csv, read_poses_csv
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.problem import ProblemFile, load_problem, read_problem_file
+
+POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
+BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
+SHIPPED = sorted((Path(__file__).parents[1] / "problems").glob("*/*.toml"))
+
+
+def load(tiny: Path, *overrides: str, **options):
+    return load_problem(tiny / "problem.toml", overrides, **options)
+
+
+def experiment_of(tiny: Path, *overrides: str):
+    return load(tiny, *overrides).experiments[0]
+
+
+def top_nodes() -> np.ndarray:
+    mesh = box_mesh(SIZE_M, (2, 2, 3))
+    return np.flatnonzero(mesh.points_m[:, 2] > SIZE_M[2] - 1e-6)
+
+
+# Overrides ----------------------------------------------------------------------------------------
+
+
+def test_overrides_are_written_as_in_toml(tiny):
+    overrides = [
+        "title=Two words",
+        "object.mass_kg=0.01",
+        "experiment.0.gravity_m_s2=[0, 0, -1.62]",
+        "experiment.swing.start = undeformed",
+        'experiment.swing.grasp.nodes.name="top"',
+        "parameters.mu_pa={ fixed = 300 }",
+        "solver.max_iterations=7",
+    ]
+    replace_text("density_kg_m3 = 30.0", "")(tiny)
+    replace_text(BOX, "{}")(tiny)
+    file = load(tiny, *overrides).file
+    assert file.title == "Two words"
+    assert file.object.mass_kg == 0.01
+    assert file.experiment[0].gravity_m_s2 == (0, 0, -1.62)
+    assert file.experiment[0].start == "undeformed"
+    assert file.parameters.mu_pa.fixed == 300
+    assert file.solver.max_iterations == 7
+
+
+def test_the_text_as_run_has_the_overrides_in_it(tiny):
+    given = (tiny / "problem.toml").read_text()
+    assert load(tiny).text == given
+    text = load(tiny, "parameters.mu_pa.guess=250").text
+    assert tomllib.loads(text)["parameters"]["mu_pa"]["guess"] == 250
+    write("problem.toml", text)(tiny)
+    assert read_problem_file(tiny / "problem.toml")[0].parameters.mu_pa.guess == 250
+
+
+def test_a_file_from_a_windows_editor_is_read(tiny):
+    text = (tiny / "problem.toml").read_text()
+    write("problem.toml", text.replace("\n", "\r\n").encode("utf-8-sig"))(tiny)
+    assert load(tiny).file.title == "A tiny foam bar"
+
+
+# Body and parameters ------------------------------------------------------------------------------
+
+
+def test_the_body_weighs_what_was_weighed(tiny):
+    replace_text("density_kg_m3 = 30.0", "mass_kg = 0.02")(tiny)
+    assert load(tiny).body.node_mass.sum() == pytest.approx(0.02)
+
+
+def test_lengths_of_a_mesh_have_a_unit(tiny):
+    mesh = meshio.read(tiny / "body.vtu")
+    mesh.points = 1e3 * mesh.points
+    mesh.write(tiny / "body.vtu")
+    assert load(tiny, "object.length_unit=mm").body.mesh.volume_m3 == pytest.approx(0.06**2 * 0.09)
+
+
+def test_elastic_parameters_may_be_young_and_poisson(tiny):
+    young, poisson = 720.0, 0.2
+    both(
+        replace_text("lambda_pa   = { guess = 400.0,", f"young_pa = {{ guess = {young},"),
+        replace_text(
+            "mu_pa       = { guess = 200.0, lower = 10.0, upper = 1e5 }",
+            f"poisson = {{ fixed = {poisson} }}",
+        ),
+    )(tiny)
+    parameters = load(tiny).parameters
+    theta = parameters.theta(parameters.guess_q)
+    assert (theta.lambda_pa, theta.mu_pa) == pytest.approx((200.0, 300.0))
+    assert [item.name for item in parameters.free] == ["young_pa", "gamma_r_s", "gamma_m_1_s"]
+
+
+def test_bounds_and_priors_reach_the_parameters(tiny):
+    prior = "parameters.mu_pa.prior={ mean = 250.0, relative = 0.2 }"
+    replace_text("{ guess = 0.5, lower = 1e-3, upper = 100.0 }", "{ guess = 0.5 }")(tiny)
+    _, mu, _, gamma_m = load(tiny, prior).parameters.items
+    assert (mu.guess, mu.lower, mu.upper, mu.prior) == (200.0, 10.0, 1e5, (250.0, 0.2))
+    assert gamma_m.lower < 1e-3 < 100 < gamma_m.upper
+
+
+def test_what_was_cleaned_is_noted(tiny):
+    mesh = meshio.read(tiny / "body.vtu")
+    mesh.points = np.vstack([mesh.points, [9.0, 9.0, 9.0]])
+    mesh.cells[0].data[0] = mesh.cells[0].data[0][[0, 1, 3, 2]]
+    meshio.Mesh(mesh.points, mesh.cells).write(tiny / "body.vtu")
+    notes = " ".join(load(tiny).notes)
+    assert "1 of 37 nodes were dropped" in notes
+    assert "1 of 72 elements had a negative volume" in notes
+
+
+def test_a_surface_is_filled_once_and_kept(tiny):
+    pytest.importorskip("pytetwild")
+    box = box_mesh(SIZE_M, (1, 1, 1))
+    meshio.Mesh(1e3 * box.points_m, [("triangle", box.surface)]).write(tiny / "scan.stl")
+    surface = 'surface = "scan.stl"\nedge_length_m = 0.03\nlength_unit = "mm"'
+    replace_text('mesh = "body.vtu"', surface)(tiny)
+    mesh = load(tiny).body.mesh
+    assert mesh.volume_m3 == pytest.approx(0.06**2 * 0.09, rel=0.05)
+    assert load(tiny).body.mesh.sha256 == mesh.sha256
+
+
+# Grasps -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [
+        BOX,
+        "{ ball_m = [[0.03, 0.03, 0.19], 0.11] }",
+        f"{{ indices = {top_nodes().tolist()} }}",
+        '{ name = "top" }',
+        '"top"',
+    ],
+    ids=["box", "ball", "indices", "name", "bare-name"],
+)
+def test_every_kind_of_selection_finds_its_nodes(tiny, selection):
+    replace_text(BOX, selection)(tiny)
+    np.testing.assert_array_equal(experiment_of(tiny).held_nodes, top_nodes())
+
+
+def test_a_grasp_is_a_table_or_a_list_of_tables(tiny):
+    one = experiment_of(tiny).grasps
+    replace_text(f"grasp = {GRASP}", f"grasp = [{GRASP}]")(tiny)
+    listed = experiment_of(tiny).grasps
+    assert len(one) == len(listed) == 1
+    np.testing.assert_array_equal(one[0].poses.positions_m, listed[0].poses.positions_m)
+
+
+def test_a_second_hand_without_poses_stays_where_it_is(tiny):
+    second = "{ nodes = { box_m = [[-1, -1, -1], [1, 1, 0.001]] } }"
+    replace_text(GRASP, f"[{GRASP}, {second}]")(tiny)
+    experiment = experiment_of(tiny)
+    assert len(experiment.held_nodes) == 18
+    nodes = experiment.grasps[1].nodes
+    still = experiment.grasps[1].poses.carry(experiment.body.nodes_m[nodes], experiment.t_s)
+    np.testing.assert_allclose(still - experiment.body.nodes_m[nodes], 0.0, atol=1e-15)
+
+
+def test_poses_are_interpolated_or_held_as_asked(tiny):
+    assert experiment_of(tiny).grasps[0].poses.interpolation == "linear"
+    held = experiment_of(tiny, "experiment.0.grasp.interpolation=hold")
+    assert held.grasps[0].poses.interpolation == "hold"
+
+
+# Markers ------------------------------------------------------------------------------------------
+
+
+def test_markers_without_a_reference_are_placed_by_their_first_sample(tiny):
+    known = experiment_of(tiny).markers
+    replace_text(f"reference_m = {REFERENCES}", "")(tiny)
+    found = experiment_of(tiny, *AT_TRUTH).markers
+    rng = np.random.default_rng(0)
+    shape = rng.normal(size=(known.placement.node_count, 3))
+    np.testing.assert_allclose(found.observe(shape), known.observe(shape), atol=1e-6)
+
+
+def test_some_markers_may_have_a_reference_and_others_not(tiny):
+    known = experiment_of(tiny).markers
+    replace_text("mid = [0.03, 0.02, 0.03], ", "")(tiny)
+    found = experiment_of(tiny, *AT_TRUTH).markers
+    assert found.names == known.names
+    shape = np.eye(36, 3)
+    np.testing.assert_allclose(found.observe(shape), known.observe(shape), atol=1e-6)
+
+
+def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
+    replace_text(f"reference_m = {REFERENCES}", "")(tiny)
+    replace_cell(MARKERS, 2, 1, "")(tiny)
+    markers = experiment_of(tiny, *AT_TRUTH).markers
+    assert markers.missing.tolist() == [1, 0, 0]
+    assert markers.placement.distance_m[0] < 2e-3
+
+
+def test_markers_are_chosen_by_name_and_weighted_by_sigma(tiny):
+    replace_text(f"reference_m = {REFERENCES}", "")(tiny)
+    markers = experiment_of(
+        tiny,
+        'experiment.0.markers.names=["side", "low"]',
+        "experiment.0.markers.sigma_m={ low = 1e-3, side = 2e-3 }",
+    ).markers
+    assert markers.names == ("side", "low")
+    assert markers.sigma_m.tolist() == [2e-3, 1e-3]
+
+
+def test_lengths_of_a_marker_file_have_a_unit(tiny):
+    expected = experiment_of(tiny).markers.positions_m
+    head, *rows = (tiny / MARKERS).read_text().splitlines()
+    table = np.array([row.split(",") for row in rows], dtype=float) * [1.0, *[1e3] * 9]
+    np.savetxt(tiny / MARKERS, table, delimiter=",", header=head, comments="")
+    markers = experiment_of(tiny, "experiment.0.markers.length_unit=mm").markers
+    np.testing.assert_allclose(markers.positions_m, expected, atol=1e-12)
+
+
+# Time ---------------------------------------------------------------------------------------------
+
+
+def test_a_window_cuts_poses_and_markers(tiny):
+    experiment = experiment_of(tiny, "experiment.0.window_s=[0.02, 0.06]")
+    np.testing.assert_allclose(experiment.t_s, [0.02, 0.03, 0.04, 0.05, 0.06])
+    whole = read_markers_csv(tiny / MARKERS).positions_m
+    np.testing.assert_array_equal(experiment.markers.positions_m, whole[2:7])
+    np.testing.assert_allclose(experiment.grasps[0].poses.t_s, experiment.t_s)
+
+
+def test_resampling_puts_everything_on_the_new_rate(tiny):
+    problem = load(tiny, "experiment.0.resample_hz=50")
+    np.testing.assert_allclose(problem.experiments[0].t_s, [0, 0.02, 0.04, 0.06, 0.08])
+    assert problem.notes == ()
+
+
+def test_resampling_above_the_measured_rate_is_noted(tiny):
+    problem = load(tiny, "experiment.0.resample_hz=200")
+    assert len(problem.experiments[0].t_s) == 17
+    (note,) = problem.notes
+    assert "resample_hz is above the markers' own rate" in note
+
+
+def test_poses_may_be_faster_than_markers(tiny):
+    poses = read_poses_csv(tiny / POSES)
+    every = experiment_of(tiny)
+    head, *rows = (tiny / MARKERS).read_text().splitlines()
+    write(MARKERS, "\n".join([head, *rows[::2]]))(tiny)
+    experiment = experiment_of(tiny)
+    np.testing.assert_allclose(experiment.t_s, poses.t_s[::2])
+    assert len(experiment.grasps[0].poses.t_s) == len(poses.t_s)
+    np.testing.assert_allclose(
+        experiment.held_positions(poses.t_s), every.held_positions(poses.t_s), atol=1e-15
+    )
+
+
+# Several experiments ------------------------------------------------------------------------------
+
+
+def test_experiments_for_validation_are_loaded_but_not_fitted(tiny):
+    text = (tiny / "problem.toml").read_text()
+    added = text[text.index("[[experiment]]") :].replace('"swing"', '"again"')
+    write("problem.toml", text + "\n" + added)(tiny)
+    problem = load(tiny, "experiment.again.validation=true")
+    assert [e.name for e in problem.experiments] == ["swing", "again"]
+    collocation = Collocation(problem.experiments, problem.parameters)
+    assert [s.experiment.name for s in collocation.segments] == ["swing"]
+
+
+# Simulation ---------------------------------------------------------------------------------------
+
+
+def test_before_anything_is_measured_markers_are_sampled_at_the_poses_times(tiny):
+    remove(MARKERS)(tiny)
+    experiment = load(tiny, simulation=True).experiments[0]
+    np.testing.assert_allclose(experiment.t_s, read_poses_csv(tiny / POSES).t_s)
+    assert experiment.markers.names == ("low", "mid", "side")
+    with pytest.raises(InputError, match=r"swing_markers\.csv does not exist"):
+        load(tiny)
+
+
+def test_loading_writes_nothing(tiny):
+    before = contents(tiny)
+    load(tiny)
+    assert contents(tiny) == before
+
+
+# The problems that come with the project ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
+    try:
+        problem = load_problem(path)
+    except InputError as error:
+        if "how to get it" not in str(error):
+            raise
+        pytest.skip(str(error))
+    findings = check_problem(problem)
+    assert findings.derivatives_agree
+    assert findings.samples > 0
+    assert findings.smallest_element_quality > 0.1
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_a_shipped_problem_follows_the_schema(path):
+    content = tomllib.loads(path.read_text())
+    ProblemFile.model_validate(content)
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(json.dumps(ProblemFile.model_json_schema()))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(content, schema)
