@@ -70,7 +70,9 @@ def convert(recording: Path, release: int, target: Path) -> None:
     except ImportError:
         sys.exit("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
     data = ezc3d.c3d(str(recording))
-    labels = [str(label).replace(" - ", "") for label in data["parameters"]["POINT"]["LABELS"]["value"]]
+    labels = [
+        str(label).replace(" - ", "") for label in data["parameters"]["POINT"]["LABELS"]["value"]
+    ]
     rate_hz = float(data["parameters"]["POINT"]["RATE"]["value"][0])
     tracks = np.moveaxis(data["data"]["points"][:3], 0, -1).swapaxes(0, 1)  # frame, marker, xyz
     template = np.array([TEMPLATE_M[label] for label in labels])

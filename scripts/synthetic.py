@@ -25,8 +25,8 @@ def swing(
     rise = t**2 / (t**2 + rise_s**2)
     angular = 2 * np.pi * np.array(frequency_hz)
     phase = np.outer(t, angular)
-    positions = rise[:, None] * amplitude_m * np.sin(phase + [0.0, 0.7, 1.4])
-    turns = rise[:, None] * amplitude_rad * np.sin(1.2 * phase + [0.3, 1.0, 1.7])
+    positions = rise[:, None] * amplitude_m * np.sin(phase + np.array([0.0, 0.7, 1.4]))
+    turns = rise[:, None] * amplitude_rad * np.sin(1.2 * phase + np.array([0.3, 1.0, 1.7]))
     rotations = Rotation.from_rotvec(turns) * start
     return PoseSequence(np.asarray(t_s), positions, rotations.as_quat())
 

@@ -14,9 +14,9 @@ from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.batched.combine import combine_with_numpy
 from collocation_sysid.nlp import block_band
 from collocation_sysid.nlp.collocation import Collocation, marker_distances_m
+from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.simulation import with_markers
 
 THETA = as_theta(TRUTH)

@@ -20,8 +20,8 @@ from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.parameters import Theta, as_theta
 from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.parameters import Theta, as_theta
 
 THETA = as_theta(TRUTH)
 

@@ -11,8 +11,8 @@ from problems_small import GUESS, TRUTH, bar_in_two_hands, hung_cube, measured, 
 
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.results.plots import (
     RESOLUTION_DPI,
     convergence,

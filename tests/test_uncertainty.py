@@ -18,9 +18,9 @@ from scipy.stats import chi2
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, Parameter, Parameters, Theta
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.results.uncertainty import (
     covariance,

@@ -67,6 +67,10 @@ class InteriorPointOptions:
         replaced by Gauss–Newton's with Levenberg's damping, which keeps every parameter within
         about a factor of two a step: far from the answer, multipliers of a large residual make
         the full Hessian indefinite and the steps wild. 0 is exact from the start.
+    proximal : float
+        Added to the Hessian's diagonal at the positions, most of which is zero otherwise. It
+        changes the steps a little and the answer not at all, and spares the linear solver
+        factorisations that rounding spoils (wrong inertia).
     linear_solver : str
         IPOPT's linear solver; the wheel brings "mumps" and "spral".
     tolerance : float
@@ -79,6 +83,7 @@ class InteriorPointOptions:
 
     hessian: Hessian = "exact"
     warm_up: float = 0.1
+    proximal: float = 1e-5
     linear_solver: str = "mumps"
     tolerance: float = 1e-8
     max_iterations: int = 200
@@ -269,8 +274,7 @@ class _Functions:
         jacobian = ca.Sparsity(rows, variables, *map(_ints, collocation.jacobian_structure))
         hessian = ca.Sparsity(variables, variables, *map(_ints, collocation.hessian_structure))
 
-        # The first entries are the upper triangle of the block of q, column by column.
-        diagonal = np.cumsum(np.arange(1, collocation.nq + 1)) - 1
+        of_q, of_x = collocation.hessian_diagonals
 
         def nlp(inputs: list[Array], outputs: list[Array | None]) -> None:
             value, values = outputs
@@ -304,10 +308,11 @@ class _Functions:
             if not (self._exact and settled):
                 multipliers = np.zeros_like(multipliers)
             collocation.hessian_values(point, float(weight[0]), multipliers, entries)
+            entries[of_x] += options.proximal
             if not settled:
                 # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
                 damping = collocation.objective(point) / (2 * STEP_LIMIT**2)
-                entries[diagonal] += float(weight[0]) * damping
+                entries[of_q] += float(weight[0]) * damping
 
         self.nlp = _Timed("nlp", [z, p], [scalar, g], nlp, errors)
         self.gradient = _Timed("grad_f", [z, p], [scalar, z], gradient, errors)

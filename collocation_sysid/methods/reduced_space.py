@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march_on
 from ..nlp.tangent import BlockSolver, Tangent
-from ..results.solution import Iteration, Solution, Status, Timing
+from ..results.solution import Iteration, Status
 
 Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]

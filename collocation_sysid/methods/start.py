@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
-from ..nlp.parameters import Theta
-from ..nlp.segment import Segment
 from ..nlp.marching import march
 from ..nlp.newton import Solver
+from ..nlp.parameters import Theta
 from ..nlp.rest import start_state
+from ..nlp.segment import Segment
 
 Array = NDArray[np.float64]
 

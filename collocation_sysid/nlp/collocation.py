@@ -240,6 +240,16 @@ class Collocation:
             used += band.nnz
         return np.concatenate(indptr), np.concatenate(indices)
 
+    @cached_property
+    def hessian_diagonals(self) -> tuple[Index, Index]:
+        """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        used = self.nq * (self.nq + 1) // 2
+        of_x = []
+        for segment in self.segments:
+            of_x.append(used + segment.hessian_diagonal)
+            used += segment.hessian.nnz
+        return np.cumsum(np.arange(1, self.nq + 1)) - 1, np.concatenate(of_x)
+
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
     ) -> Array:

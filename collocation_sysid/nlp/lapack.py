@@ -7,11 +7,15 @@ the same routine.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import LowLevelCallable
 from scipy.linalg import cython_lapack
+from threadpoolctl import ThreadpoolController
 
 
 def _routine(name: str, arguments: int) -> ctypes._CFuncPtr:
@@ -26,6 +30,18 @@ def _routine(name: str, arguments: int) -> ctypes._CFuncPtr:
 
 
 _DPBTRF = _routine("dpbtrf", 6)
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keep BLAS to one thread: several gain nothing on narrow bands, and wait for each other."""
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
 
 
 def cholesky_in_place(band: NDArray[np.float64]) -> bool:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from .dynamics import Dynamics
+from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
 from .parameters import Theta
 from .rest import start_state
@@ -38,6 +39,7 @@ def march(
     return x
 
 
+@one_blas_thread()
 def march_on(
     experiment: Experiment,
     dynamics: Dynamics,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
+from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
 from .parameters import Theta
 from .rest import start_state
@@ -28,6 +29,7 @@ class _NewmarkState:
     a: Array
 
 
+@one_blas_thread()
 def newmark(
     experiment: Experiment,
     theta: Theta,

@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
+from .lapack import one_blas_thread
 from .newton import NewtonFailure, Solver, simulation_error
 from .parameters import Theta
 
 Array = NDArray[np.float64]
 
 
+@one_blas_thread()
 def rest_state(
     experiment: Experiment,
     theta: Theta,

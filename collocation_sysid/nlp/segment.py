@@ -291,6 +291,12 @@ class Segment:
         return np.zeros((self.constraint_times, self.body.curvature_width))
 
     @cached_property
+    def hessian_diagonal(self) -> Index:
+        """Positions of the diagonal entries of x in the values of `hessian`."""
+        dofs = np.arange(self.dofs)
+        return self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
+
+    @cached_property
     def _loss_positions(self) -> tuple[Index, Array]:
         """Positions of the loss's Hessian in the values, and its values in metres⁻²."""
         pattern = self.body.pattern

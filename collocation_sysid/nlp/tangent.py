@@ -27,6 +27,7 @@ from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .dynamics import Dynamics, Tables
 from .factorisation import Factor, Factoriser
+from .lapack import one_blas_thread
 from .parameters import Theta
 from .segment import Segment
 
@@ -94,8 +95,9 @@ class BlockSolver:
             shape=(len(self.free), len(self.free)),
         )
 
+    @one_blas_thread()
     def forward(self, x: Array, theta: Theta, theta_q: Array) -> Tangent:
-        """p and Z at x (N, 3n); θ_q is ∂θ/∂q (4, nq).
+        """P and Z at x (N, 3n); θ_q is ∂θ/∂q (4, nq).
 
         Raises
         ------
@@ -114,6 +116,7 @@ class BlockSolver:
             columns[step.t, self.free] = march.advance(step, right, force)
         return Tangent(columns[:, :, 0], columns[:, :, 1:], indefinite)
 
+    @one_blas_thread()
     def backward(self, x: Array, theta: Theta, gradient: Array) -> Array:
         """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m]."""
         dynamics, reach = self.dynamics, self.dynamics.reach
@@ -156,7 +159,7 @@ class BlockSolver:
     def _steps(self, x: Array, theta: Theta, backward: bool = False) -> Iterator[_Step]:
         """Blocks and factors of every row, computed in chunks side by side."""
         dynamics, body = self.dynamics, self.body
-        tables, first = dynamics.tables, dynamics.first_row
+        first = dynamics.first_row
         xi, nu = dynamics.evaluation_states(x)
         starts = range(first, dynamics.rows, CHUNK)
         for start in reversed(starts) if backward else starts:
