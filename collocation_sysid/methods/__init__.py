@@ -9,6 +9,8 @@ from typing import Any
 from ..results.solution import Solution
 from .interior_point import InteriorPointOptions
 from .interior_point import solve as interior_point
+from .reduced_space import ReducedSpaceOptions
+from .reduced_space import solve as reduced_space
 
 
 @dataclass(frozen=True)
@@ -21,4 +23,5 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "interior-point": Method(interior_point, InteriorPointOptions),
+    "reduced-space": Method(reduced_space, ReducedSpaceOptions),
 }

@@ -28,8 +28,9 @@ from scipy.optimize import lsq_linear
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march_on
+from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver, Tangent
-from ..results.solution import Iteration, Status
+from ..results.solution import Iteration, Solution, Status, Timing
 
 Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
@@ -49,15 +50,19 @@ class ReducedSpaceOptions:
         First trust region: longest step of a parameter's logarithm.
     ladder : tuple of float
         Shares of the recording solved one after another, ending with 1.
-    rung_tolerance : float
-        `tolerance` on all rungs but the last.
+    rung_decrease : float
+        All rungs but the last end when a step promises to lower the loss by less than this share.
+    rung_prior : float
+        On them a prior of this standard deviation of the logarithm holds each parameter near its
+        guess: a short horizon says nothing about some, and would let them run to their bounds.
     """
 
     tolerance: float = 1e-8
     max_iterations: int = 200
     trust: float = 1.0
     ladder: tuple[float, ...] = (0.25, 0.5, 1.0)
-    rung_tolerance: float = 0.05
+    rung_decrease: float = 0.05
+    rung_prior: float = 2.3
 
 
 # Fewest grid rows of a rung.
@@ -101,9 +106,10 @@ class _Point:
 class _Rung:
     """The NLP on the first rows of every experiment."""
 
-    def __init__(self, collocation: Collocation, share: float) -> None:
+    def __init__(self, collocation: Collocation, share: float, prior: float | None = None) -> None:
         self.collocation = collocation
         self.segments = collocation.segments
+        self.prior = prior
         self.solvers = []
         for segment in self.segments:
             rows = min(segment.grid_rows, max(MIN_ROWS, round(share * segment.grid_rows)))
@@ -132,6 +138,9 @@ class _Rung:
             residuals.append(residual)
             slopes.append(slope)
         prior, prior_slopes = parameters.prior(q)
+        if self.prior is not None:
+            residuals.append((q - parameters.guess_q) / self.prior)
+            slopes.append(np.eye(len(q)) / self.prior)
         return _Point(
             q,
             x,
@@ -175,8 +184,9 @@ class _Search:
         self.history: list[Iteration] = []
         self.lower, self.upper = collocation.parameters.bounds_q
 
-    def descend(self, rung: _Rung, point: _Point, tolerance: float) -> tuple[_Point, Status]:
-        """Gauss–Newton steps on one rung until they are shorter than the tolerance."""
+    def descend(self, rung: _Rung, point: _Point, last: bool) -> tuple[_Point, Status]:
+        """Gauss–Newton steps on one rung until they promise no more."""
+        tolerance = self.options.tolerance
         size_m = float(np.ptp(point.x[0].reshape(-1, 3), axis=0).max())
         self._record(point)
         while True:
@@ -184,6 +194,9 @@ class _Search:
             length = float(np.abs(step).max(initial=0.0))
             feasible = point.feasibility_m <= max(FEASIBLE, 1e-3 * tolerance) * size_m
             if length <= tolerance and feasible:
+                return point, Status.CONVERGED
+            promised = 1.0 - self._predicted_loss(point, step) / max(point.loss, 1e-300)
+            if not last and promised < self.options.rung_decrease:
                 return point, Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return point, Status.ITERATION_LIMIT
@@ -221,8 +234,7 @@ class _Search:
 
     def _accept(self, point: _Point, step: Array, trial: _Point, size_m: float) -> bool:
         """Judge a trial, and widen or narrow the trust region after it."""
-        linear = point.residual + point.slope @ step
-        predicted = point.loss - float(linear @ linear)
+        predicted = point.loss - self._predicted_loss(point, step)
         actual = point.loss - trial.loss
         moved_m = max(
             float(np.abs(after - before).max())
@@ -240,24 +252,136 @@ class _Search:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
 
+    @staticmethod
+    def _predicted_loss(point: _Point, step: Array) -> float:
+        linear = point.residual + point.slope @ step
+        return float(linear @ linear)
+
     def _record(self, point: _Point) -> None:
-        rows = [len(x) for x in point.x]
-        measured = [
-            segment.observation.squared_distances_m2(x + tangent.step)
-            for segment, x, tangent in zip(
-                self.collocation.segments, point.x, point.tangents, strict=True
-            )
-        ]
-        squares = np.concatenate(measured)
+        squares = np.concatenate(
+            [
+                segment.observation.squared_distances_m2(x + tangent.step)
+                for segment, x, tangent in zip(
+                    self.collocation.segments, point.x, point.tangents, strict=True
+                )
+            ]
+        )
         line = Iteration(
             number=self.sweeps,
             loss=point.loss,
             rms_m=float(np.sqrt(squares.mean())) if len(squares) else 0.0,
-            violation_n=max(tangent.residual_n for tangent in point.tangents),
+            violation_n=max(tangent.violation_n for tangent in point.tangents),
             theta=self.collocation.parameters.theta(point.q),
             time_s=time.perf_counter() - self.began,
         )
-        del rows
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)
+
+
+def solve(
+    collocation: Collocation,
+    options: ReducedSpaceOptions | None = None,
+    watch: Watch | None = None,
+) -> Solution:
+    """Solve the NLP in the reduced space.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    options : ReducedSpaceOptions, optional
+    watch : callable, optional
+        Called with every accepted `Iteration`; its number counts sweeps.
+
+    Returns
+    -------
+    Solution
+        With the multipliers of the whole NLP. Also when it did not converge or was interrupted.
+    """
+    options = options or ReducedSpaceOptions()
+    search = _Search(collocation, options, watch)
+    q, x, notes = collocation.parameters.guess_q, None, []
+    status, why = Status.CONVERGED, ""
+    try:
+        for share in options.ladder:
+            last = share == options.ladder[-1]
+            rung = _Rung(collocation, share, None if last else options.rung_prior)
+            x = rung.extend(q, x)
+            search.sweeps += 1
+            point, status = search.descend(rung, rung.evaluate(q, x), last)
+            q, x = point.q, point.x
+            if status is Status.ITERATION_LIMIT:
+                break
+            search.trust = options.trust
+    except SimulationError as error:
+        status, why = Status.NOT_SIMULABLE, f" {error}."
+    except KeyboardInterrupt:
+        status = Status.INTERRUPTED
+    return _solution(collocation, search, status, why, q, x, notes)
+
+
+def _solution(
+    collocation: Collocation,
+    search: _Search,
+    status: Status,
+    why: str,
+    q: Array,
+    x: list[Array] | None,
+    notes: list[str],
+) -> Solution:
+    whole = [
+        _filled(segment, x[k] if x else None) for k, segment in enumerate(collocation.segments)
+    ]
+    z = collocation.pack(q, whole)
+    multipliers = np.zeros(collocation.constraints)
+    if status.converged:
+        multipliers = constraint_multipliers(collocation, z)
+    total = time.perf_counter() - search.began
+    return Solution(
+        status=status,
+        message=f"{status.sentence}{why}",
+        method="reduced-space",
+        collocation=collocation,
+        z=z,
+        multipliers=multipliers,
+        iterations=search.sweeps,
+        history=tuple(search.history),
+        timing=Timing(total=total),
+        notes=tuple(notes),
+    )
+
+
+def _filled(segment: Segment, x: Array | None) -> Array:
+    """All rows of a trajectory; those not reached are carried rigidly by the grasp."""
+    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(segment.grid_rows, -1)
+    if x is not None:
+        rigid[: len(x)] = x
+    return rigid
+
+
+def constraint_multipliers(collocation: Collocation, z: Array) -> Array:
+    """Multipliers (constraints,) that make the Lagrangian stationary in the positions.
+
+    From c_xᵀ y = −∂L/∂x, one backward sweep in time, in the scaling of the NLP.
+    """
+    q, positions = collocation.unpack(z)
+    theta = collocation.parameters.theta(q)
+    parts = []
+    for segment, x in zip(collocation.segments, positions, strict=True):
+        gradient = collocation.loss_scale * segment.observation.gradient(x)
+        y = BlockSolver(segment).backward(x, theta, gradient) * segment.force_n
+        parts.append(y[segment.dynamics.first_row :, segment.row_dofs].ravel())
+    multipliers = np.concatenate(parts)
+    if collocation.segments[0].explicit_grasps:
+        # The grasp rows are unit rows: they take what is left.
+        slope = collocation.gradient(z) + collocation.jacobian(z).T @ multipliers
+        _, left = collocation.unpack(slope)
+        start = 0
+        for segment, rest in zip(collocation.segments, left, strict=True):
+            rows = multipliers[start : start + segment.constraints].reshape(
+                segment.constraint_times, -1
+            )
+            held = rest[segment.dynamics.first_row :, segment.held_dofs] / segment.length_m
+            rows[:, segment.held_dofs] = -held
+            start += segment.constraints
+    return multipliers

@@ -50,6 +50,36 @@ class Observation:
         predicted = (self.markers.operator @ x[self.grid_rows].T).T
         return (predicted - self._measured) * self._weights
 
+    def linearised(self, x: Array, step: Array, by_q: Array) -> tuple[Array, Array]:
+        """Residuals after a step of the positions, and their derivative by q.
+
+        Only samples within the rows given count.
+
+        Parameters
+        ----------
+        x, step : (rows, 3n), the first grid rows
+        by_q : (rows, 3n, nq)
+
+        Returns
+        -------
+        residual : (t · 3M,) ndarray, slope : (t · 3M, nq) ndarray
+        """
+        rows = self.grid_rows[self.grid_rows < len(x)]
+        count, operator = len(rows), self.markers.operator
+        weights = self._weights[:count]
+        predicted = (operator @ (x[rows] + step[rows]).T).T
+        residual = (predicted - self._measured[:count]) * weights
+        columns = by_q[rows].transpose(1, 0, 2).reshape(by_q.shape[1], -1)
+        slope = (operator @ columns).reshape(-1, count, by_q.shape[2]).transpose(1, 0, 2)
+        return residual.ravel(), (slope * weights[..., None]).reshape(residual.size, -1)
+
+    def squared_distances_m2(self, x: Array) -> Array:
+        """Squared distances of present samples within the first grid rows x (rows, 3n)."""
+        rows = self.grid_rows[self.grid_rows < len(x)]
+        predicted = self.markers.observe(x[rows].reshape(len(rows), -1, 3))
+        squares = np.sum((predicted - self.markers.positions_m[: len(rows)]) ** 2, axis=2)
+        return squares[self.markers.present[: len(rows)]]
+
     def loss(self, x: Array) -> float:
         """L(x)."""
         return float(np.sum(self.residuals(x) ** 2))

@@ -46,12 +46,15 @@ class Tangent:
     ----------
     step : (N, 3n) p = −c_x⁻¹ c [m]
     by_q : (N, 3n, nq) Z = −c_x⁻¹ c_q [m]
+    violation_n : float
+        Largest |c|.
     indefinite : int
         Timesteps whose block −∂c_t/∂x_t is not positive definite.
     """
 
     step: Array
     by_q: Array
+    violation_n: float
     indefinite: int
 
 
@@ -114,7 +117,8 @@ class BlockSolver:
             right[:, 0] = residual[step.t]
             force[:, 1:] = step.by_theta[self.free] @ theta_q
             columns[step.t, self.free] = march.advance(step, right, force)
-        return Tangent(columns[:, :, 0], columns[:, :, 1:], indefinite)
+        violation = float(np.abs(residual).max(initial=0.0))
+        return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite)
 
     @one_blas_thread()
     def backward(self, x: Array, theta: Theta, gradient: Array) -> Array:
