@@ -57,12 +57,15 @@ class Run:
     solution : Solution
     rollouts : mapping of experiment name to Rollout, or to the reason why there is none
     uncertainty : Uncertainty or None, where the solve did not converge
+    notes : tuple of str
+        What went wrong after the solve.
     """
 
     problem: Problem
     solution: Solution
     rollouts: Mapping[str, Rollout | str]
     uncertainty: Uncertainty | None
+    notes: tuple[str, ...] = ()
 
 
 def build_collocation(problem: Problem) -> Collocation:
@@ -131,10 +134,13 @@ def run(
     solution = solve(problem, method, watch)
     say("checking the answer by a forward simulation")
     rollouts = {e.name: _roll_out(problem, e, solution) for e in problem.experiments}
-    uncertainty = None
+    uncertainty, notes = None, ()
     if solution.status.converged and solution.collocation.nq:
-        uncertainty = covariance(solution.collocation, solution.z)
-    return Run(problem, solution, rollouts, uncertainty)
+        try:
+            uncertainty = covariance(solution.collocation, solution.z)
+        except SimulationError as error:
+            notes = (f"no error bars: {error}",)
+    return Run(problem, solution, rollouts, uncertainty, notes)
 
 
 def _roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
@@ -259,7 +265,12 @@ def result(finished: Run) -> dict[str, Any]:
             "constraints": collocation.constraints,
             "scheme": collocation.scheme,
         },
-        "notes": [*problem.notes, *solution.notes, *_uncertainty_notes(finished)],
+        "notes": [
+            *problem.notes,
+            *solution.notes,
+            *finished.notes,
+            *_uncertainty_notes(finished),
+        ],
         "history": [
             {
                 "iteration": line.number,

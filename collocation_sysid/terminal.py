@@ -116,7 +116,7 @@ def summary(finished: Run, folder: Path) -> RenderableType:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
     parts += [_parameter_table(finished), *_verdict(finished)]
-    notes = list(solution.notes)
+    notes = [*solution.notes, *finished.notes]
     if finished.uncertainty is not None:
         notes += finished.uncertainty.notes
     parts += [Text(f"note: {note}") for note in notes]
