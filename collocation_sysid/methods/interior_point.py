@@ -7,7 +7,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..results.solution import Iteration, Solution, Status, Timing
+from ..results.solution import Solution, Status, Timing
+from .callbacks import Monitor, NlpFunctions, Watch
 from .start import initial_variables
 
 Array = NDArray[np.float64]
-Watch = Callable[[Iteration], None]
 
 Hessian = Literal["exact", "gauss-newton", "limited-memory"]
 
@@ -127,8 +127,8 @@ def solve(
     if start is None:
         start, notes = initial_variables(collocation)
     errors: list[BaseException] = []
-    functions = _Functions(collocation, options, errors)
-    monitor = _Monitor(collocation, watch, began, errors)
+    functions = NlpFunctions(collocation, _DampedHessian(collocation, options), errors)
+    monitor = Monitor(collocation, watch, began, errors)
     solver = _build_solver(functions, monitor, options)
     lower, upper = collocation.bounds()
     built = time.perf_counter()
@@ -168,7 +168,7 @@ def solve(
 
 
 def _build_solver(
-    functions: _Functions, monitor: _Monitor, options: InteriorPointOptions
+    functions: NlpFunctions, monitor: Monitor, options: InteriorPointOptions
 ) -> ca.Function:
     collocation = functions.collocation
     z = ca.MX.sym("z", collocation.variables)
@@ -206,206 +206,35 @@ def _build_solver(
         raise InputError(f"IPOPT cannot be set up: {reason}", None, "solver") from error
 
 
-class _Timed(ca.Callback):
-    """A CasADi function of (z, …) whose outputs are written straight into CasADi's memory.
+class _DampedHessian:
+    """Hessian of the Lagrangian with the warm-up and proximal terms of the options."""
 
-    CasADi would print exceptions and go on: they are put in `errors`, for `solve` to raise.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        inputs: list[ca.Sparsity],
-        outputs: list[ca.Sparsity],
-        evaluate: Callable[[list[Array], list[Array | None]], None],
-        errors: list[BaseException],
-    ) -> None:
-        ca.Callback.__init__(self)
-        self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
-        self._errors = errors
-        self.seconds = 0.0
-        self.construct(name)
-
-    def get_n_in(self) -> int:
-        return len(self._inputs)
-
-    def get_n_out(self) -> int:
-        return len(self._outputs)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return self._inputs[i]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return self._outputs[i]
-
-    def has_eval_buffer(self) -> bool:
-        return True
-
-    def eval_buffer(self, arguments, results) -> int:
-        began = time.perf_counter()
-        try:
-            self._evaluate(
-                [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
-                [np.frombuffer(r) if r is not None else None for r in results],
-            )
-        except BaseException as error:
-            self._errors.append(error)
-            return 1
-        self.seconds += time.perf_counter() - began
-        return 0
-
-
-class _Functions:
-    """The NLP's functions as CasADi callbacks over the shared assembly."""
-
-    def __init__(
-        self,
-        collocation: Collocation,
-        options: InteriorPointOptions,
-        errors: list[BaseException],
-    ) -> None:
+    def __init__(self, collocation: Collocation, options: InteriorPointOptions) -> None:
         self.collocation = collocation
-        self._exact = options.hessian == "exact"
-        self._warm_up = options.warm_up
+        self.options = options
         self._last_q = np.full(collocation.nq, np.inf)
-        variables, rows = collocation.variables, collocation.constraints
-        z, g = ca.Sparsity.dense(variables, 1), ca.Sparsity.dense(rows, 1)
-        p, scalar = ca.Sparsity(0, 1), ca.Sparsity.dense(1, 1)
-        jacobian = ca.Sparsity(rows, variables, *map(_ints, collocation.jacobian_structure))
-        hessian = ca.Sparsity(variables, variables, *map(_ints, collocation.hessian_structure))
+        self._of_q, self._of_x = collocation.hessian_diagonals
 
-        of_q, of_x = collocation.hessian_diagonals
-
-        def nlp(inputs: list[Array], outputs: list[Array | None]) -> None:
-            value, values = outputs
-            if value is not None:
-                value[0] = collocation.objective(inputs[0])
-            if values is not None:
-                values[:] = collocation.constraint_values(inputs[0])
-
-        def gradient(inputs: list[Array], outputs: list[Array | None]) -> None:
-            value, slope = outputs
-            if value is not None:
-                value[0] = collocation.objective(inputs[0])
-            if slope is not None:
-                slope[:] = collocation.gradient(inputs[0])
-
-        def jacobian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
-            rows, entries = outputs
-            if entries is not None:
-                values, _ = collocation.constraints_and_jacobian(inputs[0], entries)
-                if rows is not None:
-                    rows[:] = values
-            elif rows is not None:
-                rows[:] = collocation.constraint_values(inputs[0])
-
-        def hessian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
-            point, _, weight, multipliers = inputs
-            (entries,) = outputs
-            if entries is None:
-                return
-            settled = self._is_settled(point[: collocation.nq])
-            if not (self._exact and settled):
-                multipliers = np.zeros_like(multipliers)
-            collocation.hessian_values(point, float(weight[0]), multipliers, entries)
-            entries[of_x] += options.proximal
-            if not settled:
-                # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
-                damping = collocation.objective(point) / (2 * STEP_LIMIT**2)
-                entries[of_q] += float(weight[0]) * damping
-
-        self.nlp = _Timed("nlp", [z, p], [scalar, g], nlp, errors)
-        self.gradient = _Timed("grad_f", [z, p], [scalar, z], gradient, errors)
-        self.jacobian = _Timed("jac_g", [z, p], [g, jacobian], jacobian_values, errors)
-        inputs = [z, p, scalar, g]
-        self.hessian = _Timed("hess_lag", inputs, [hessian], hessian_values, errors)
+    def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
+        """Write the values at z."""
+        settled = self._is_settled(z[: self.collocation.nq])
+        if not (self.options.hessian == "exact" and settled):
+            multipliers = np.zeros_like(multipliers)
+        self.collocation.hessian_values(z, weight, multipliers, values)
+        values[self._of_x] += self.options.proximal
+        if not settled:
+            # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
+            values[self._of_q] += weight * self.collocation.objective(z) / (2 * STEP_LIMIT**2)
 
     def _is_settled(self, q: Array) -> bool:
         """Whether the last step to q was short enough to end the warm-up."""
         moved = np.abs(q - self._last_q).max(initial=0.0)
         self._last_q = q.copy()
-        return self._warm_up == 0 or bool(moved < self._warm_up)
-
-    @property
-    def seconds(self) -> float:
-        """Time spent evaluating."""
-        functions = (self.nlp, self.gradient, self.jacobian, self.hessian)
-        return sum(function.seconds for function in functions)
-
-
-def _ints(values: NDArray[np.int64]) -> list[int]:
-    return values.tolist()
-
-
-class _Monitor(ca.Callback):
-    """Follows the iterates: history, best point, and the wish to stop."""
-
-    def __init__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None,
-        began: float,
-        errors: list[BaseException],
-    ) -> None:
-        ca.Callback.__init__(self)
-        self.errors = errors
-        self.collocation = collocation
-        self.watch = watch
-        self.began = began
-        self.stop = False
-        self.history: list[Iteration] = []
-        self.best: tuple[Array, Array] | None = None
-        self.seconds = 0.0
-        self._best_merit = np.inf
-        self.construct("monitor")
-
-    def get_n_in(self) -> int:
-        return ca.nlpsol_n_out()
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        sizes = {
-            "x": self.collocation.variables,
-            "f": 1,
-            "g": self.collocation.constraints,
-            "lam_x": self.collocation.variables,
-            "lam_g": self.collocation.constraints,
-        }
-        return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
-
-    def eval(self, arguments):
-        began = time.perf_counter()
-        try:
-            self._follow(arguments)
-        except BaseException as error:
-            self.errors.append(error)
-        self.seconds += time.perf_counter() - began
-        return [1 if self.stop or self.errors else 0]
-
-    def _follow(self, arguments) -> None:
-        z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
-        # Objective and constraints are both of order one.
-        merit = float(value[0] + np.abs(rows).max(initial=0.0))
-        if merit < self._best_merit:
-            self._best_merit, self.best = merit, (z, multipliers)
-        violation = max(np.abs(r).max(initial=0.0) for r in self.collocation.violations_n(z))
-        iteration = Iteration(
-            number=len(self.history),
-            loss=float(value[0]) / self.collocation.loss_scale,
-            rms_m=self.collocation.rms_m(z),
-            violation_n=float(violation),
-            theta=self.collocation.theta(z),
-            time_s=time.perf_counter() - self.began,
-        )
-        self.history.append(iteration)
-        if self.watch is not None:
-            self.watch(iteration)
+        return self.options.warm_up == 0 or bool(moved < self.options.warm_up)
 
 
 @contextmanager
-def _interruptible(monitor: _Monitor) -> Iterator[None]:
+def _interruptible(monitor: Monitor) -> Iterator[None]:
     """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program."""
     if threading.current_thread() is not threading.main_thread():
         yield
