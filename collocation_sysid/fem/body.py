@@ -225,7 +225,13 @@ class Body:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
         x = self._states(positions)[0].reshape(-1, len(self.nodes_m), 3)
         gradients = self.geometry[..., :-1].reshape(len(self.cells), -1, self.element.nodes, 3)
-        return np.linalg.det(np.einsum("teai,eqaj->teqij", x[:, self.cells], gradients))
+        f = np.einsum("teai,eqaj->ijteq", x[:, self.cells], gradients)
+        a, b = f[1], f[2]
+        return (
+            f[0, 0] * (a[1] * b[2] - a[2] * b[1])
+            + f[0, 1] * (a[2] * b[0] - a[0] * b[2])
+            + f[0, 2] * (a[0] * b[1] - a[1] * b[0])
+        )
 
     # Assembly -------------------------------------------------------------------------------
 

@@ -12,7 +12,8 @@ with r the markers' residuals and S_p, S the markers' parts of p and Z.
 A trial is accepted when the loss of its own projected trajectory (r + S_p there) has decreased,
 and when its remaining infeasibility, measured by the length of p in metres, is short against
 the step. That converges from where trajectories can be simulated; a ladder of horizons, the
-first quarter, half and whole of the recording, widens it to where only the start can be.
+first quarter, half and whole of the recording, widens it to where only the start can be. Where
+even a rung cannot be simulated as a whole, the rows that can be are solved first.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from scipy.optimize import lsq_linear
 
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
-from ..nlp.marching import march_on
 from ..nlp.segment import Segment
-from ..nlp.tangent import BlockSolver, Tangent
+from ..nlp.stopwatch import Stopwatch
 from ..results.solution import Iteration, Solution, Status, Timing
+from .horizon import Horizon, Point
+from .multipliers import constraint_multipliers
 
 Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
@@ -67,110 +69,24 @@ class ReducedSpaceOptions:
 
 # Fewest grid rows of a rung.
 MIN_ROWS = 8
-# A trial's infeasibility may be this share of its step's length.
-CONTRACTION = 0.5
+# A trial's infeasibility may be this share of its step's length, or this share of an edge of
+# the mesh: the strain it causes is then small enough for Newton's next step to remove it.
+CONTRACTION, SMALL_STRAIN = 0.5, 0.02
 # Share of the predicted decrease a trial must reach.
 DECREASE = 1e-3
-# Shorter than this over the body's size, feasibility is at rounding.
-FEASIBLE = 1e-12
+# Shorter than this over the body's size, feasibility is at rounding; shorter than the second,
+# it is where steps no longer change the parameters and it does not decrease any more.
+FEASIBLE, NEARLY_FEASIBLE = 1e-12, 1e-8
 SMALLEST_TRUST = 1e-10
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """Parameters and trajectories of a rung, with what one sweep found there.
-
-    Attributes
-    ----------
-    q : (nq,)
-    x : list of (rows, 3n), one per experiment
-    tangents : list of Tangent
-    residual : (M,) r + S_p and prior residuals
-    slope : (M, nq) S and prior slopes
-    feasibility_m : float, longest coordinate of p
-    """
-
-    q: Array
-    x: list[Array]
-    tangents: list[Tangent]
-    residual: Array
-    slope: Array
-    feasibility_m: float
-
-    @property
-    def loss(self) -> float:
-        """Loss of the projected trajectory, priors included."""
-        return float(self.residual @ self.residual)
-
-
-class _Rung:
-    """The NLP on the first rows of every experiment."""
-
-    def __init__(self, collocation: Collocation, share: float, prior: float | None = None) -> None:
-        self.collocation = collocation
-        self.segments = collocation.segments
-        self.prior = prior
-        self.solvers = []
-        for segment in self.segments:
-            rows = min(segment.grid_rows, max(MIN_ROWS, round(share * segment.grid_rows)))
-            self.solvers.append(BlockSolver(segment, rows))
-
-    @property
-    def rows(self) -> list[int]:
-        return [solver.dynamics.rows for solver in self.solvers]
-
-    def evaluate(self, q: Array, x: list[Array]) -> _Point:
-        """One sweep.
-
-        Raises
-        ------
-        SimulationError
-            Where it is singular or not finite.
-        """
-        parameters = self.collocation.parameters
-        theta = parameters.theta(q)
-        theta_q, _ = parameters.theta_derivatives(q)
-        tangents, residuals, slopes = [], [], []
-        for segment, solver, x_k in zip(self.segments, self.solvers, x, strict=True):
-            tangent = solver.forward(x_k, theta, theta_q)
-            residual, slope = segment.observation.linearised(x_k, tangent.step, tangent.by_q)
-            tangents.append(tangent)
-            residuals.append(residual)
-            slopes.append(slope)
-        prior, prior_slopes = parameters.prior(q)
-        if self.prior is not None:
-            residuals.append((q - parameters.guess_q) / self.prior)
-            slopes.append(np.eye(len(q)) / self.prior)
-        return _Point(
-            q,
-            x,
-            tangents,
-            np.concatenate([*residuals, prior]),
-            np.concatenate([*slopes, np.diag(prior_slopes)]),
-            max(float(np.abs(tangent.step).max()) for tangent in tangents),
-        )
-
-    def extend(self, q: Array, x: list[Array] | None) -> list[Array]:
-        """Trajectories of this rung's length at q, continuing those of the last rung.
-
-        Raises
-        ------
-        SimulationError
-            At the first step that cannot be made.
-        """
-        theta = self.collocation.parameters.theta(q)
-        extended = []
-        for k, (segment, solver) in enumerate(zip(self.segments, self.solvers, strict=True)):
-            known = None if x is None else x[k]
-            rows, failure = march_on(segment.experiment, solver.dynamics, theta, known)
-            if failure is not None:
-                raise failure
-            extended.append(rows)
-        return extended
+# Doublings of the moduli where not even the first rows can be simulated at the guess.
+STIFFENINGS = 10
+MODULI = ("lambda_pa", "mu_pa", "young_pa")
+# Misfits above this many standard deviations of the markers are worth a note.
+MISFIT = 3.0
 
 
 class _Search:
-    """The state of a solve: budget, history, and the trust region."""
+    """The state of a solve: the best point, the trust region, budget, history and notes."""
 
     def __init__(
         self, collocation: Collocation, options: ReducedSpaceOptions, watch: Watch | None
@@ -179,37 +95,125 @@ class _Search:
         self.options = options
         self.watch = watch
         self.began = time.perf_counter()
+        self.stopwatch = Stopwatch()
         self.sweeps = 0
         self.trust = options.trust
         self.history: list[Iteration] = []
+        self.notes: list[str] = []
+        self.indefinite = 0
         self.lower, self.upper = collocation.parameters.bounds_q
+        self.q = collocation.parameters.guess_q
+        self.x: list[Array] | None = None
+        nodes = [segment.body.nodes_m for segment in collocation.segments]
+        self.edge_m = min(segment.length_m for segment in collocation.segments)
+        self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
 
-    def descend(self, rung: _Rung, point: _Point, last: bool) -> tuple[_Point, Status]:
+    # The ladder -------------------------------------------------------------------------------
+
+    def climb(self) -> Status:
+        """Solve rung after rung.
+
+        Raises
+        ------
+        SimulationError
+            Where not even the rows that were reached help to reach more.
+        """
+        status = Status.CONVERGED
+        for share in self.options.ladder:
+            last = share == self.options.ladder[-1]
+            rung = self._horizon(self._rows(share), last)
+            self._reach(rung)
+            status = self._descend(rung, last)
+            if status is Status.ITERATION_LIMIT:
+                break
+        return status
+
+    def _rows(self, share: float) -> list[int]:
+        return [
+            min(segment.grid_rows, max(MIN_ROWS, round(share * segment.grid_rows)))
+            for segment in self.collocation.segments
+        ]
+
+    def _horizon(self, rows: list[int], last: bool) -> Horizon:
+        prior = None if last else self.options.rung_prior
+        return Horizon(self.collocation, rows, prior, self.stopwatch)
+
+    def _reach(self, rung: Horizon) -> None:
+        """Extend the trajectories to a rung's length; where that fails, first solve what is."""
+        furthest = 0
+        while True:
+            known = self.x
+            reached, failure = rung.extend(self.q, known)
+            self.sweeps += 1
+            if failure is None:
+                self.x = reached
+                return
+            rows = [len(x) for x in reached]
+            fewest = min(MIN_ROWS, *rung.rows)
+            if known is None and min(rows) < fewest:
+                self._stiffen(failure)
+                continue
+            if sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
+                raise failure
+            furthest = sum(rows)
+            self.x = reached
+            self._descend(self._horizon(rows, last=False), last=False)
+
+    def _stiffen(self, failure: SimulationError) -> None:
+        """Double the moduli of the guess.
+
+        Raises
+        ------
+        SimulationError
+            The failure, where they cannot be raised further.
+        """
+        names = [item.name for item in self.collocation.parameters.free]
+        moduli = np.array([name in MODULI for name in names], dtype=bool)
+        stiffer = np.minimum(self.q + np.log(2) * moduli, self.upper)
+        started = self.collocation.parameters.guess_q
+        factor = float(np.exp(np.max(stiffer - started, initial=0.0)))
+        if np.allclose(stiffer, self.q) or factor > 1.01 * 2**STIFFENINGS:
+            raise failure
+        self.q = stiffer
+        note = (
+            f"the body cannot be simulated at the guess ({failure}); "
+            f"started from moduli {factor:.3g} times as stiff"
+        )
+        self.notes[:] = [note]
+
+    # One rung ---------------------------------------------------------------------------------
+
+    def _descend(self, rung: Horizon, last: bool) -> Status:
         """Gauss–Newton steps on one rung until they promise no more."""
+        assert self.x is not None
         tolerance = self.options.tolerance
-        size_m = float(np.ptp(point.x[0].reshape(-1, 3), axis=0).max())
-        self._record(point)
+        self.trust = self.options.trust
+        point = self._accepted(rung.evaluate(self.q, self.x))
+        rejections = 0
         while True:
             step = self._step(point)
             length = float(np.abs(step).max(initial=0.0))
-            feasible = point.feasibility_m <= max(FEASIBLE, 1e-3 * tolerance) * size_m
-            if length <= tolerance and feasible:
-                return point, Status.CONVERGED
-            promised = 1.0 - self._predicted_loss(point, step) / max(point.loss, 1e-300)
+            if length <= tolerance and point.feasibility_m <= FEASIBLE * self.size_m:
+                return Status.CONVERGED
+            promised = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not last and promised < self.options.rung_decrease:
-                return point, Status.CONVERGED
+                return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
-                return point, Status.ITERATION_LIMIT
+                return Status.ITERATION_LIMIT
             trial = self._try(rung, point, step)
-            if trial is not None and self._accept(point, step, trial, size_m):
-                point = trial
-                self._record(point)
+            if trial is not None and self._is_better(point, step, trial):
+                point, rejections = self._accepted(trial), 0
                 continue
+            if length <= tolerance and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
+                return Status.CONVERGED  # rounding keeps it from getting better
             if length <= SMALLEST_TRUST:
-                return point, Status.STALLED
+                return Status.STALLED
             self.trust = 0.25 * length
+            rejections += 1
+            if rejections == 2 and point.feasibility_m > SMALL_STRAIN * self.edge_m:
+                point = self._restored(rung, point)
 
-    def _step(self, point: _Point) -> Array:
+    def _step(self, point: Point) -> Array:
         if len(point.q) == 0:
             return np.zeros(0)
         low = np.maximum(self.lower - point.q, -self.trust)
@@ -220,27 +224,24 @@ class _Search:
         answer = lsq_linear(triangle[:, :-1], -triangle[:, -1], (low, high), method="bvls")
         return np.clip(answer.x, low, high)
 
-    def _try(self, rung: _Rung, point: _Point, step: Array) -> _Point | None:
-        moved = [
-            x + tangent.step + tangent.by_q @ step
-            for x, tangent in zip(point.x, point.tangents, strict=True)
-        ]
+    def _try(self, rung: Horizon, point: Point, step: Array) -> Point | None:
         self.sweeps += 1
+        q = np.clip(point.q + step, self.lower, self.upper)
         try:
-            trial = rung.evaluate(point.q + step, moved)
+            trial = rung.evaluate(q, point.moved(step))
         except SimulationError:
             return None
-        return trial if np.isfinite(trial.loss) and np.isfinite(trial.feasibility_m) else None
+        return trial if trial.finite else None
 
-    def _accept(self, point: _Point, step: Array, trial: _Point, size_m: float) -> bool:
+    def _is_better(self, point: Point, step: Array, trial: Point) -> bool:
         """Judge a trial, and widen or narrow the trust region after it."""
-        predicted = point.loss - self._predicted_loss(point, step)
+        predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
         moved_m = max(
             float(np.abs(after - before).max())
             for before, after in zip(point.x, trial.x, strict=True)
         )
-        if trial.feasibility_m > max(CONTRACTION * moved_m, FEASIBLE * size_m):
+        if trial.feasibility_m > max(CONTRACTION * moved_m, SMALL_STRAIN * self.edge_m):
             return False
         noise = 1e-12 * point.loss + 1e-20
         if actual < DECREASE * predicted - noise:
@@ -252,12 +253,21 @@ class _Search:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
 
-    @staticmethod
-    def _predicted_loss(point: _Point, step: Array) -> float:
-        linear = point.residual + point.slope @ step
-        return float(linear @ linear)
+    def _restored(self, rung: Horizon, point: Point) -> Point:
+        """The point with a simulated trajectory, where that exists."""
+        self.sweeps += 1
+        x, failure = rung.extend(point.q)
+        if failure is not None:
+            return point
+        try:
+            restored = rung.evaluate(point.q, x)
+        except SimulationError:
+            return point
+        return self._accepted(restored) if restored.finite else point
 
-    def _record(self, point: _Point) -> None:
+    def _accepted(self, point: Point) -> Point:
+        self.q, self.x = point.q, point.x
+        self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
         squares = np.concatenate(
             [
                 segment.observation.squared_distances_m2(x + tangent.step)
@@ -277,6 +287,7 @@ class _Search:
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)
+        return point
 
 
 def solve(
@@ -291,52 +302,25 @@ def solve(
     collocation : Collocation
     options : ReducedSpaceOptions, optional
     watch : callable, optional
-        Called with every accepted `Iteration`; its number counts sweeps.
+        Called with every accepted `Iteration`; its number counts sweeps, rejected ones included.
+        The first iterations are those of short horizons.
 
     Returns
     -------
     Solution
         With the multipliers of the whole NLP. Also when it did not converge or was interrupted.
     """
-    options = options or ReducedSpaceOptions()
-    search = _Search(collocation, options, watch)
-    q, x, notes = collocation.parameters.guess_q, None, []
-    status, why = Status.CONVERGED, ""
+    search = _Search(collocation, options or ReducedSpaceOptions(), watch)
+    why = ""
     try:
-        for share in options.ladder:
-            last = share == options.ladder[-1]
-            rung = _Rung(collocation, share, None if last else options.rung_prior)
-            x = rung.extend(q, x)
-            search.sweeps += 1
-            point, status = search.descend(rung, rung.evaluate(q, x), last)
-            q, x = point.q, point.x
-            if status is Status.ITERATION_LIMIT:
-                break
-            search.trust = options.trust
+        status = search.climb()
     except SimulationError as error:
         status, why = Status.NOT_SIMULABLE, f" {error}."
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
-    return _solution(collocation, search, status, why, q, x, notes)
-
-
-def _solution(
-    collocation: Collocation,
-    search: _Search,
-    status: Status,
-    why: str,
-    q: Array,
-    x: list[Array] | None,
-    notes: list[str],
-) -> Solution:
-    whole = [
-        _filled(segment, x[k] if x else None) for k, segment in enumerate(collocation.segments)
-    ]
-    z = collocation.pack(q, whole)
-    multipliers = np.zeros(collocation.constraints)
-    if status.converged:
-        multipliers = constraint_multipliers(collocation, z)
-    total = time.perf_counter() - search.began
+    z, multipliers = _whole(collocation, search)
+    search.notes += _notes(collocation, search, z, status)
+    watch_s = search.stopwatch
     return Solution(
         status=status,
         message=f"{status.sentence}{why}",
@@ -346,9 +330,27 @@ def _solution(
         multipliers=multipliers,
         iterations=search.sweeps,
         history=tuple(search.history),
-        timing=Timing(total=total),
-        notes=tuple(notes),
+        timing=Timing(
+            watch_s.build,
+            watch_s.evaluations,
+            watch_s.linear_algebra,
+            time.perf_counter() - search.began,
+        ),
+        notes=tuple(search.notes),
     )
+
+
+def _whole(collocation: Collocation, search: _Search) -> tuple[Array, Array]:
+    """Variables and multipliers of the whole NLP."""
+    x = search.x
+    whole = [_filled(s, x[k] if x else None) for k, s in enumerate(collocation.segments)]
+    z = collocation.pack(search.q, whole)
+    if x and all(len(a) == s.grid_rows for a, s in zip(x, collocation.segments, strict=True)):
+        try:
+            return z, constraint_multipliers(collocation, z, search.stopwatch)
+        except SimulationError:
+            pass
+    return z, np.zeros(collocation.constraints)
 
 
 def _filled(segment: Segment, x: Array | None) -> Array:
@@ -359,29 +361,24 @@ def _filled(segment: Segment, x: Array | None) -> Array:
     return rigid
 
 
-def constraint_multipliers(collocation: Collocation, z: Array) -> Array:
-    """Multipliers (constraints,) that make the Lagrangian stationary in the positions.
-
-    From c_xᵀ y = −∂L/∂x, one backward sweep in time, in the scaling of the NLP.
-    """
-    q, positions = collocation.unpack(z)
-    theta = collocation.parameters.theta(q)
-    parts = []
-    for segment, x in zip(collocation.segments, positions, strict=True):
-        gradient = collocation.loss_scale * segment.observation.gradient(x)
-        y = BlockSolver(segment).backward(x, theta, gradient) * segment.force_n
-        parts.append(y[segment.dynamics.first_row :, segment.row_dofs].ravel())
-    multipliers = np.concatenate(parts)
-    if collocation.segments[0].explicit_grasps:
-        # The grasp rows are unit rows: they take what is left.
-        slope = collocation.gradient(z) + collocation.jacobian(z).T @ multipliers
-        _, left = collocation.unpack(slope)
-        start = 0
-        for segment, rest in zip(collocation.segments, left, strict=True):
-            rows = multipliers[start : start + segment.constraints].reshape(
-                segment.constraint_times, -1
+def _notes(collocation: Collocation, search: _Search, z: Array, status: Status) -> list[str]:
+    notes = []
+    if search.indefinite:
+        steps = sum(segment.constraint_times for segment in collocation.segments)
+        notes.append(
+            f"the equations of {search.indefinite} of {steps} timesteps are not positive definite "
+            "at the answer: the body is near buckling, or damped more than its motion allows"
+        )
+    if status in (Status.CONVERGED, Status.STALLED):
+        squares = sum(
+            segment.observation.loss(x)
+            for segment, x in zip(collocation.segments, collocation.unpack(z)[1], strict=True)
+        )
+        misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
+        if misfit > MISFIT:
+            notes.append(
+                f"the markers are missed by {misfit:.3g} of their standard deviations "
+                f"({1e3 * collocation.rms_m(z):.3g} mm rms): sigma_m, the model or the recording "
+                "is off, or a better fit lies elsewhere; another guess may tell"
             )
-            held = rest[segment.dynamics.first_row :, segment.held_dofs] / segment.length_m
-            rows[:, segment.held_dofs] = -held
-            start += segment.constraints
-    return multipliers
+    return notes

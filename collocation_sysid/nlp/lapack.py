@@ -10,16 +10,18 @@ import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import LowLevelCallable
-from scipy.linalg import cython_lapack
 from threadpoolctl import ThreadpoolController
 
 
-def _routine(name: str, arguments: int) -> ctypes._CFuncPtr:
-    capsule = LowLevelCallable.from_cython(cython_lapack, name).function
+def _routine(name: str, arguments: int) -> Any:
+    module = import_module("scipy.linalg.cython_lapack")
+    capsule = LowLevelCallable.from_cython(module, name).function
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype = ctypes.c_char_p
     api.PyCapsule_GetName.argtypes = [ctypes.py_object]

@@ -14,6 +14,7 @@ from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
 from .parameters import Theta
 from .rest import start_state
+from .stopwatch import Stopwatch
 
 Array = NDArray[np.float64]
 Progress = Callable[[float], None]
@@ -47,6 +48,7 @@ def march_on(
     known: Array | None = None,
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
+    stopwatch: Stopwatch | None = None,
 ) -> tuple[Array, SimulationError | None]:
     """Continue a trajectory as far as it goes.
 
@@ -62,7 +64,7 @@ def march_on(
     failure : SimulationError or None
         Why it stopped.
     """
-    solver = Solver(experiment, options)
+    solver = Solver(experiment, options, stopwatch)
     held = experiment.held_positions(dynamics.t_s).reshape(dynamics.rows, -1)
     x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
@@ -82,7 +84,7 @@ def march_on(
         forces[first:done] = internal + dynamics.external_force_n
     for t in range(done, dynamics.rows):
         row = _Row(dynamics, theta, x, forces, t)
-        guess = x[t - 1] + (x[t - 1] - x[t - 2] if t > 1 else dynamics.step_s * v0)
+        guess = _predicted(x[:t], dynamics.step_s * v0)
         try:
             x[t] = _solve_row(solver, row, guess, x[t - 1], held[t])
         except NewtonFailure as failure:
@@ -92,6 +94,13 @@ def march_on(
         if progress:
             progress(t / (dynamics.rows - 1))
     return x, None
+
+
+def _predicted(x: Array, first_step: Array) -> Array:
+    """The next row, extrapolated."""
+    if len(x) > 2:
+        return 3 * (x[-1] - x[-2]) + x[-3]
+    return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
 
 
 class _Row:

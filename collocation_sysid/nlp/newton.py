@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from .factorisation import Factor, Factoriser
+from .stopwatch import Stopwatch
 
 Array = NDArray[np.float64]
 Residual = Callable[[Array], Array]
 Linearise = Callable[[Array], tuple[Array, Array]]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -56,9 +59,16 @@ class Solver:
     experiment : Experiment
         Its body and which nodes are held.
     options : NewtonOptions
+    stopwatch : Stopwatch, optional
     """
 
-    def __init__(self, experiment: Experiment, options: NewtonOptions | None = None) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        options: NewtonOptions | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         self.options = options or NewtonOptions()
         self.free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
@@ -87,7 +97,7 @@ class Solver:
         x = x.copy()
         self._require_upright(x)
         tolerance = self.options.tolerance * self._size_m
-        value, matrix = linearise(x)
+        value, matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         for _ in range(self.options.iterations):
             step = factor.solve(value[self.free])
@@ -113,9 +123,15 @@ class Solver:
             trial = x.copy()
             trial[self.free] += share * step
             if self.is_upright(trial):
-                next_step = factor.solve(residual(trial)[self.free])
+                # A whole step is mostly taken: it is evaluated with its derivatives at once.
+                if share == 1:
+                    value, matrix = self._timed(linearise, trial)
+                else:
+                    value, matrix = self._timed(residual, trial), None
+                next_step = factor.solve(value[self.free])
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
-                    value, matrix = linearise(trial)
+                    if matrix is None:
+                        value, matrix = self._timed(linearise, trial)
                     try:
                         return trial, self._factorise(matrix, trial, keep_definite), value
                     except NewtonFailure:
@@ -125,12 +141,17 @@ class Solver:
 
     def _factorise(self, matrix: Array, x: Array, keep_definite: bool) -> Factor:
         try:
-            factor = self.factoriser.factorise(matrix)
+            with self.stopwatch.solving():
+                factor = self.factoriser.factorise(matrix)
         except np.linalg.LinAlgError as error:
             raise NewtonFailure(x, f"the equations are singular: {error}") from error
         if keep_definite and not factor.positive_definite:
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
+
+    def _timed(self, function: Callable[[Array], T], x: Array) -> T:
+        with self.stopwatch.evaluating():
+            return function(x)
 
     def is_upright(self, x: Array) -> bool:
         """Whether no element is inverted at x (3n,)."""

@@ -30,6 +30,7 @@ from .factorisation import Factor, Factoriser
 from .lapack import one_blas_thread
 from .parameters import Theta
 from .segment import Segment
+from .stopwatch import Stopwatch
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -77,9 +78,13 @@ class BlockSolver:
     segment : Segment
     rows : int, optional
         Grid times to take, all by default.
+    stopwatch : Stopwatch, optional
     """
 
-    def __init__(self, segment: Segment, rows: int | None = None) -> None:
+    def __init__(
+        self, segment: Segment, rows: int | None = None, stopwatch: Stopwatch | None = None
+    ) -> None:
+        self.stopwatch = stopwatch or Stopwatch()
         self.dynamics = _first_rows(segment.dynamics, rows or segment.grid_rows)
         self.segment = segment
         self.body = segment.body
@@ -107,18 +112,38 @@ class BlockSolver:
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        residual = self.dynamics.residual(x, theta)[:, self.free]
-        columns = np.zeros((*x.shape, 1 + theta_q.shape[1]))
-        march = _Forward(self, (len(self.free), columns.shape[2]))
+        with self.stopwatch.evaluating():
+            residual = self.dynamics.residual(x, theta)[:, self.free]
+        count = 1 + theta_q.shape[1]
+        columns = np.zeros((*x.shape, count))
+        march = _Forward(self, (len(self.free), count))
         indefinite = 0
         for step in self._steps(x, theta):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
             right[:, 0] = residual[step.t]
             force[:, 1:] = step.by_theta[self.free] @ theta_q
-            columns[step.t, self.free] = march.advance(step, right, force)
+            with self.stopwatch.solving():
+                columns[step.t, self.free] = march.advance(step, right, force)
         violation = float(np.abs(residual).max(initial=0.0))
         return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite)
+
+    def sensitivities(self, x: Array, theta: Theta, theta_q: Array) -> Iterator[Array]:
+        """Z_t (3n, nq), row by row; nothing but the last few rows is kept.
+
+        Raises
+        ------
+        SimulationError
+            Where a timestep's equations are singular or not finite.
+        """
+        shape = (x.shape[1], theta_q.shape[1])
+        march = _Forward(self, (len(self.free), shape[1]))
+        yield from np.zeros((self.dynamics.first_row, *shape))
+        for step in self._steps(x, theta):
+            row = np.zeros(shape)
+            force = step.by_theta[self.free] @ theta_q
+            row[self.free] = march.advance(step, np.zeros(march.shape), force)
+            yield row
 
     @one_blas_thread()
     def backward(self, x: Array, theta: Theta, gradient: Array) -> Array:
@@ -169,8 +194,10 @@ class BlockSolver:
         for start in reversed(starts) if backward else starts:
             stop = min(start + CHUNK, dynamics.rows)
             here = slice(start - first, stop - first)
-            at = body.linearise(xi[here], nu[here], theta)
-            factors = self._factorise(at, slice(start, stop))
+            with self.stopwatch.evaluating():
+                at = body.linearise(xi[here], nu[here], theta)
+            with self.stopwatch.solving():
+                factors = self._factorise(at, slice(start, stop))
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(

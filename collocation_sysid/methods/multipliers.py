@@ -1,0 +1,51 @@
+"""Multipliers of the equations of motion, from one sweep backward in time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..nlp.collocation import Collocation
+from ..nlp.stopwatch import Stopwatch
+from ..nlp.tangent import BlockSolver
+
+Array = NDArray[np.float64]
+
+
+def constraint_multipliers(
+    collocation: Collocation, z: Array, stopwatch: Stopwatch | None = None
+) -> Array:
+    """Multipliers (constraints,) that make the Lagrangian stationary in the positions.
+
+    From c_xᵀ y = −∂L/∂x, in the scaling of the NLP.
+
+    Raises
+    ------
+    SimulationError
+        Where a timestep's equations are singular.
+    """
+    q, positions = collocation.unpack(z)
+    theta = collocation.parameters.theta(q)
+    parts = []
+    for segment, x in zip(collocation.segments, positions, strict=True):
+        gradient = collocation.loss_scale * segment.observation.gradient(x)
+        y = BlockSolver(segment, stopwatch=stopwatch).backward(x, theta, gradient)
+        y *= segment.force_n
+        parts.append(y[segment.dynamics.first_row :, segment.row_dofs].ravel())
+    multipliers = np.concatenate(parts)
+    if collocation.segments[0].explicit_grasps:
+        _add_grasps(collocation, z, multipliers)
+    return multipliers
+
+
+def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
+    """Give the grasp rows, which are unit rows, what is left of the gradient."""
+    slope = collocation.gradient(z) + collocation.jacobian(z).T @ multipliers
+    _, left = collocation.unpack(slope)
+    start = 0
+    for segment, rest in zip(collocation.segments, left, strict=True):
+        stop = start + segment.constraints
+        rows = multipliers[start:stop].reshape(segment.constraint_times, -1)
+        held = rest[segment.dynamics.first_row :, segment.held_dofs] / segment.length_m
+        rows[:, segment.held_dofs] = -held
+        start = stop
