@@ -31,7 +31,7 @@ def main() -> None:
         axes.scatter(*held.T, s=9, color="#000000", depthshade=False)
         axes.scatter(*measured[t].T, s=14, color="#d55e00", depthshade=False)
         axes.set(**{f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=True)})
-        axes.set_box_aspect(high - low, zoom=1.25)
+        axes.set_box_aspect(high - low, zoom=1.25)  # pyright: ignore[reportArgumentType]
         axes.view_init(elev=12, azim=-60)
         axes.set_axis_off()
         axes.set_title(f"{experiment.t_s[t] - experiment.t_s[0]:.2f} s", y=-0.05, fontsize=9)

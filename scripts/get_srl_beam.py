@@ -77,8 +77,8 @@ def convert(recording: Path, release: int, target: Path) -> None:
     tracks = np.moveaxis(data["data"]["points"][:3], 0, -1).swapaxes(0, 1)  # frame, marker, xyz
     template = np.array([TEMPLATE_M[label] for label in labels])
     before = tracks[:release].mean(axis=0)
-    rotation, _ = Rotation.align_vectors(template - template.mean(0), before - before.mean(0))
-    world = (tracks - before.mean(axis=0)) @ rotation.as_matrix().T + template.mean(axis=0)
+    fit = Rotation.align_vectors(template - template.mean(0), before - before.mean(0))
+    world = (tracks - before.mean(axis=0)) @ fit[0].as_matrix().T + template.mean(axis=0)
     write_markers_csv(target, np.arange(len(world)) / rate_hz, labels, world)
 
 

@@ -274,9 +274,13 @@ class SolverSection(Section):
     method: MethodName = "interior-point"
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
     warm_up: float = Field(
-        0.1, ge=0, description="Gauss–Newton while a step changes a parameter by more than this."
+        default=0.1,
+        ge=0,
+        description="Gauss–Newton while a step changes a parameter by more than this.",
     )
-    proximal: float = Field(1e-5, ge=0, description="Added to the Hessian at the positions.")
+    proximal: float = Field(
+        default=1e-5, ge=0, description="Added to the Hessian at the positions."
+    )
     linear_solver: Text = Field(default="mumps", description="IPOPT's linear solver.")
     tolerance: Positive = 1e-8
     max_iterations: Whole = Field(default=200, ge=0)
