@@ -169,17 +169,17 @@ def parameters(values: NDArray[np.float64]) -> Parameters:
 @contextmanager
 def counted_factorisations() -> Iterator[list[int]]:
     """Count the matrices factorised meanwhile."""
-    count, original = [0], Factoriser.factorise_all
+    count, original = [0], Factoriser.factorise
 
-    def counting(self: Factoriser, values: NDArray[np.float64], threads: int):
-        count[0] += len(values)
-        return original(self, values, threads)
+    def counting(self: Factoriser, values: NDArray[np.float64]):
+        count[0] += 1
+        return original(self, values)
 
-    Factoriser.factorise_all = counting
+    Factoriser.factorise = counting
     try:
         yield count
     finally:
-        Factoriser.factorise_all = original
+        Factoriser.factorise = original
 
 
 def summary(outcomes: list[Outcome]) -> str:

@@ -1,14 +1,16 @@
 """Factorise symmetric matrices on the mesh graph, again and again with one pattern.
 
 Reverse Cuthill–McKee makes the mesh graph a narrow band; a banded Cholesky factorisation then
-also tells whether the matrix is positive definite. Wide bands and indefinite matrices go to
-SuperLU.
+also tells whether the matrix is positive definite. Indefinite matrices go to SuperLU, and so do
+all where its fill-in is estimated to cost less than the band.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import Literal, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,8 +26,12 @@ from .lapack import cholesky_in_place
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Above this share of the matrix size SuperLU's fill-in is cheaper than the band's.
-WIDE_BAND = 0.4
+Choice = Literal["auto", "band", "sparse"]
+
+# LAPACK works on a band about this many times as fast as SuperLU on its columns (measured: 40
+# against 4 GFlop/s on one core), and below this work there is nothing to choose.
+BAND_SPEED = 10.0
+LITTLE_WORK = 1e8
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 
@@ -73,9 +79,12 @@ class Factoriser:
     ----------
     pattern : SymmetricPattern
     free : (k,) sorted degrees of freedom kept
+    choice : {"auto", "band", "sparse"}
+        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
     """
 
-    def __init__(self, pattern: SymmetricPattern, free: Index) -> None:
+    def __init__(self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> None:
+        self.choice: Choice = choice
         position = np.full(pattern.size, -1)
         position[free] = np.arange(len(free))
         rows, columns = position[pattern.rows], position[pattern.columns]
@@ -94,11 +103,34 @@ class Factoriser:
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
         self._full_source = np.concatenate([self._kept, self._kept[strict]])
+        self._entries = pattern.entries
+
+    @cached_property
+    def banded(self) -> bool:
+        """Whether banded Cholesky is chosen."""
+        if self.choice != "auto":
+            return self.choice == "band"
+        band_work = self._size * self.half_bandwidth**2
+        return band_work <= LITTLE_WORK or band_work <= BAND_SPEED * self._sparse_work
 
     @property
-    def banded(self) -> bool:
-        """Whether the band is narrow enough for banded Cholesky."""
-        return self.half_bandwidth <= WIDE_BAND * self._size or self._size < 200
+    def numbers(self) -> int:
+        """Numbers that one factor holds."""
+        if self.banded:
+            return self._size * (self.half_bandwidth + 1)
+        return 3 * int(self._column_counts.sum())  # L, U, and their row numbers at half the size
+
+    @property
+    def _sparse_work(self) -> float:
+        return float(np.sum(self._column_counts.astype(float) ** 2))
+
+    @cached_property
+    def _column_counts(self) -> Index:
+        """Entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
+        values = np.full(self._entries, -1.0)
+        degree = np.bincount(self._full_rows, minlength=self._size)
+        values[self._full_source[self._full_rows == self._full_columns]] = degree
+        return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
     def factorise(self, values: Array) -> Factor:
         """Factorise the matrix with (m,) lower-triangle values.
@@ -108,26 +140,6 @@ class Factoriser:
         numpy.linalg.LinAlgError
             If the matrix is singular or not finite.
         """
-        return self.factorise_all(values[None], threads=1)[0]
-
-    def factorise_all(self, values: Array, threads: int) -> list[Factor]:
-        """Factorise K matrices with lower-triangle values (K, m), side by side on threads.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If one is singular or not finite.
-        """
-        factors: list[Factor | None] = [None] * len(values)
-
-        def run(start: int, stop: int) -> None:
-            for k in range(start, stop):
-                factors[k] = self._factorise(values[k])
-
-        in_slices(run, len(values), threads)
-        return [factor for factor in factors if factor is not None]
-
-    def _factorise(self, values: Array) -> Factor:
         if not np.isfinite(values).all():
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
         if not self.banded:
@@ -136,25 +148,45 @@ class Factoriser:
         band.T.reshape(-1)[self._band_places] = values[self._kept]
         if cholesky_in_place(band):
             return _BandFactor(band, self._order)
-        return self._sparse(values, known_indefinite=True)
+        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
 
-    def _sparse(self, values: Array, known_indefinite: bool = False) -> Factor:
+    def factorise_each(
+        self, matrix: Callable[[int], Array], count: int, threads: int
+    ) -> list[Factor]:
+        """Factorise `count` matrices, side by side on threads; matrix(k) gives values (m,).
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If one is singular or not finite.
+        """
+        factors: dict[int, Factor] = {}
+
+        def run(start: int, stop: int) -> None:
+            for k in range(start, stop):
+                factors[k] = self.factorise(matrix(k))
+
+        in_slices(run, count, threads)
+        return [factors[k] for k in range(count)]
+
+    def _sparse(self, values: Array) -> Factor:
+        lu = self._superlu(values, pivot_below=0.0)
+        if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
+            return _SparseFactor(lu, positive_definite=True)
+        # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
+        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
+
+    def _superlu(self, values: Array, pivot_below: float) -> SuperLU:
         matrix = sp.csc_array(
             (values[self._full_source], (self._full_rows, self._full_columns)),
             shape=(self._size, self._size),
         )
         try:
-            lu = splu(
+            return splu(
                 matrix,
                 permc_spec="MMD_AT_PLUS_A",
                 options={"SymmetricMode": True},
-                diag_pivot_thresh=0.0 if not known_indefinite else 0.1,
+                diag_pivot_thresh=pivot_below,
             )
         except RuntimeError as error:
             raise np.linalg.LinAlgError(str(error)) from error
-        if known_indefinite:
-            return _SparseFactor(lu, positive_definite=False)
-        if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
-            return _SparseFactor(lu, positive_definite=True)
-        # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
-        return self._sparse(values, known_indefinite=True)

@@ -69,9 +69,10 @@ class Observation:
         weights = self._weights[:count]
         predicted = (operator @ (x[rows] + step[rows]).T).T
         residual = (predicted - self._measured[:count]) * weights
-        columns = by_q[rows].transpose(1, 0, 2).reshape(by_q.shape[1], -1)
-        slope = (operator @ columns).reshape(-1, count, by_q.shape[2]).transpose(1, 0, 2)
-        return residual.ravel(), (slope * weights[..., None]).reshape(residual.size, -1)
+        _, dofs, nq = by_q.shape
+        columns = by_q[rows].transpose(1, 0, 2).reshape(dofs, count * nq)
+        slope = (operator @ columns).reshape(self._weights.shape[1], count, nq).transpose(1, 0, 2)
+        return residual.ravel(), (slope * weights[..., None]).reshape(residual.size, nq)
 
     def squared_distances_m2(self, x: Array) -> Array:
         """Squared distances of present samples within the first grid rows x (rows, 3n)."""

@@ -35,8 +35,8 @@ from .stopwatch import Stopwatch
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Element results and factors are kept for this many timesteps at a time.
-CHUNK = 64
+# Element results and factors of this size at most are kept at a time.
+CHUNK_BYTES = 128e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +180,12 @@ class BlockSolver:
         full[:, self.free] = y
         return full
 
+    @property
+    def chunk(self) -> int:
+        """Timesteps that are evaluated and factorised at a time."""
+        numbers = self.body.linearisation_width + self.factoriser.numbers
+        return max(1, min(self.dynamics.rows, int(CHUNK_BYTES / (8 * numbers))))
+
     def apply(self, lower: Array, columns: Array) -> Array:
         """Product of a symmetric matrix, given by its lower triangle, on the free dofs."""
         self._matrix.data = lower[self._source]
@@ -190,9 +196,9 @@ class BlockSolver:
         dynamics, body = self.dynamics, self.body
         first = dynamics.first_row
         xi, nu = dynamics.evaluation_states(x)
-        starts = range(first, dynamics.rows, CHUNK)
+        starts = range(first, dynamics.rows, self.chunk)
         for start in reversed(starts) if backward else starts:
-            stop = min(start + CHUNK, dynamics.rows)
+            stop = min(start + self.chunk, dynamics.rows)
             here = slice(start - first, stop - first)
             with self.stopwatch.evaluating():
                 at = body.linearise(xi[here], nu[here], theta)
@@ -209,10 +215,16 @@ class BlockSolver:
         p = tables.w[rows, 0] * tables.p[rows, 0]
         q = tables.w[rows, 0] * tables.q[rows, 0] / step_s
         s = tables.s[rows, 0] / step_s**2
-        matrices = -p[:, None] * at.by_position - q[:, None] * at.by_velocity
-        matrices[:, self.body.pattern.diagonal] += s[:, None] * self.body.dof_mass
+        diagonal, mass = self.body.pattern.diagonal, self.body.dof_mass
+
+        def matrix(k: int) -> Array:
+            values = -p[k] * at.by_position[k]
+            values -= q[k] * at.by_velocity[k]
+            values[diagonal] += s[k] * mass
+            return values
+
         try:
-            return self.factoriser.factorise_all(matrices, self.body.threads)
+            return self.factoriser.factorise_each(matrix, len(p), self.body.threads)
         except np.linalg.LinAlgError as error:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "

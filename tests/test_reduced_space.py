@@ -1,0 +1,264 @@
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problems_small import (
+    GUESS,
+    SMALL_EXPERIMENTS,
+    TRUTH,
+    bar_in_two_hands,
+    hung_cube,
+    measured,
+    released_cube,
+)
+
+from collocation_sysid.experiment import Experiment
+from collocation_sysid.methods.interior_point import InteriorPointOptions
+from collocation_sysid.methods.interior_point import solve as interior_point
+from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, solve
+from collocation_sysid.methods.start import carried_rigidly
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.results.solution import Iteration, Solution, Status
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+KKT = 1e-8
+
+
+def relative_errors(solution: Solution) -> np.ndarray:
+    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
+
+
+def noisy(experiment: Experiment, scheme: str = "midpoint", noise_m: float = 1e-3) -> Experiment:
+    made = measured(experiment, scheme)
+    tracks = made.markers.positions_m
+    return with_markers(made, tracks + noise_m * np.random.default_rng(7).normal(size=tracks.shape))
+
+
+def with_parameter(name: str, **changes) -> Parameters:
+    return Parameters(
+        tuple(replace(item, **changes) if item.name == name else item for item in GUESS.items)
+    )
+
+
+@cache
+def cube() -> Collocation:
+    return Collocation([measured(hung_cube())], GUESS)
+
+
+@cache
+def solved_cube() -> Solution:
+    return solve(cube())
+
+
+# The answer
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
+def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
+    made = measured(SMALL_EXPERIMENTS[experiment](), scheme)
+    solution = solve(Collocation([made], GUESS, scheme))
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.rms_m < 1e-9
+    assert solution.kkt_residual < KKT
+
+
+@pytest.mark.parametrize("make", [hung_cube, released_cube, bar_in_two_hands])
+def test_with_noise_it_is_the_optimum_of_interior_point(make):
+    collocation = Collocation([noisy(make(15))], GUESS)
+    solution = solve(collocation)
+    reference = interior_point(collocation, InteriorPointOptions(tolerance=1e-12))
+    assert solution.status.converged
+    assert reference.status.converged
+    np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
+    np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-8)
+    np.testing.assert_allclose(solution.multipliers, reference.multipliers, atol=1e-6)
+    assert solution.kkt_residual < KKT
+
+
+def test_experiments_of_different_lengths_and_grasps_are_fitted_together():
+    held_out = replace(measured(hung_cube(5)), name="held out", validation=True)
+    made = [measured(hung_cube(9)), measured(bar_in_two_hands(14)), measured(released_cube(8))]
+    solution = solve(Collocation([*made, held_out], GUESS))
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert [len(x) for x in solution.positions_m] == [10, 15, 9]
+    assert solution.kkt_residual < KKT
+
+
+@pytest.mark.parametrize("options", [{"substeps": 3}, {"explicit_grasps": True}])
+def test_every_layout_is_fitted(options: dict):
+    made = measured(hung_cube(8), substeps=options.get("substeps", 1))
+    solution = solve(Collocation([made], GUESS, **options))
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.kkt_residual < KKT
+
+
+def test_fixed_parameters_stay_and_the_others_are_found():
+    fixed = [Parameter(name, TRUTH[name], fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
+    collocation = Collocation([measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed)))
+    solution = solve(collocation)
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.parameters["gamma_r_s"] == TRUTH["gamma_r_s"]
+
+
+def test_with_all_parameters_fixed_it_simulates():
+    fixed = Parameters(tuple(Parameter(name, TRUTH[name], fixed=True) for name in TRUTH))
+    solution = solve(Collocation([measured(hung_cube())], fixed))
+    assert solution.status is Status.CONVERGED
+    assert solution.rms_m < 1e-9
+    assert solution.kkt_residual < KKT
+
+
+def test_young_and_poisson_are_found_as_well():
+    elastic = (Parameter("young_pa", 300.0, 10.0, 1e5), Parameter("poisson", 0.4, 0.01, 0.49))
+    parameters = Parameters((*elastic, *GUESS.items[2:]))
+    solution = solve(Collocation([measured(hung_cube())], parameters))
+    truth = as_theta(TRUTH)
+    assert solution.parameters["young_pa"] == pytest.approx(truth.young_pa, rel=1e-6)
+    assert solution.parameters["poisson"] == pytest.approx(truth.poisson, rel=1e-6)
+
+
+@pytest.mark.parametrize("bound", [{"lower": 350.0}, {"upper": 250.0}])
+def test_a_bound_that_excludes_the_truth_is_active_at_the_answer(bound: dict):
+    parameters = with_parameter("mu_pa", guess=next(iter(bound.values())), **bound)
+    collocation = Collocation([measured(hung_cube())], parameters)
+    solution = solve(collocation)
+    reference = interior_point(collocation, InteriorPointOptions(tolerance=1e-11))
+    assert solution.status is Status.CONVERGED
+    assert solution.parameters["mu_pa"] == pytest.approx(next(iter(bound.values())), rel=1e-12)
+    np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-4)
+    assert solution.kkt_residual < KKT
+
+
+def test_a_prior_pulls_as_it_does_in_interior_point():
+    parameters = with_parameter("lambda_pa", prior=(220.0, 0.01))
+    collocation = Collocation([measured(hung_cube())], parameters)
+    solution = solve(collocation)
+    reference = interior_point(collocation, InteriorPointOptions(tolerance=1e-12))
+    np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
+    assert 201 < solution.parameters["lambda_pa"] < 220
+    assert solution.kkt_residual < KKT
+
+
+# The start
+
+
+def test_too_soft_a_guess_is_stiffened_with_a_note():
+    soft = [replace(item, guess=item.guess / 100, lower=1e-3) for item in GUESS.items[:2]]
+    solution = solve(Collocation([measured(hung_cube())], Parameters((*soft, *GUESS.items[2:]))))
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert len(solution.notes) == 1
+    assert solution.notes[0].startswith("the body cannot be simulated at the guess (")
+    assert "times as stiff" in solution.notes[0]
+
+
+def test_moduli_that_may_not_be_raised_are_a_status_that_tells_what_to_change():
+    soft = [
+        replace(item, guess=guess, lower=1e-4, upper=guess * 1.001)
+        for item, guess in zip(GUESS.items[:2], (0.4, 0.15), strict=True)
+    ]
+    collocation = Collocation([measured(hung_cube())], Parameters((*soft, *GUESS.items[2:])))
+    solution = solve(collocation)
+    assert solution.status is Status.NOT_SIMULABLE
+    for part in ("stiffer or less damped parameters", "rest state", "t = 0 s, element "):
+        assert part in solution.message
+    assert np.isfinite(solution.z).all()
+    assert solution.rms_m > 0
+
+
+def test_few_starts_far_away_all_succeed():
+    from study_starts import guesses, hanging_cylinder, study
+
+    experiment = hanging_cylinder(layers=4, steps=24, scheme="midpoint")
+    outcomes = study(experiment, "midpoint", guesses(8, 10.0, seed=0), noisy=False)
+    assert [outcome.number for outcome in outcomes if not outcome.success] == []
+    assert np.median([outcome.sweeps for outcome in outcomes]) < 12
+
+
+# Ends other than convergence
+
+
+def test_the_iteration_limit_is_a_status():
+    solution = solve(cube(), ReducedSpaceOptions(max_iterations=3))
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.iterations <= 4
+    assert solution.theta == solution.history[-1].theta
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_an_interruption_keeps_the_best_iterate(number: int):
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number >= number:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    solution = solve(cube(), watch=interrupt)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.theta == solution.history[-1].theta
+    assert np.isfinite(solution.z).all()
+
+
+def test_rows_not_reached_are_carried_by_the_grasp():
+    def interrupt(_: Iteration) -> None:
+        raise KeyboardInterrupt
+
+    solution = solve(Collocation([measured(hung_cube(40))], GUESS), watch=interrupt)
+    (segment,) = solution.collocation.segments
+    expected = carried_rigidly(segment, as_theta(GUESS)).reshape(solution.positions_m[0].shape)
+    held = segment.experiment.held_nodes
+    np.testing.assert_allclose(solution.positions_m[0][:, held], expected[:, held], atol=1e-12)
+
+
+def test_an_error_in_the_callers_function_reaches_the_caller():
+    def broken(iteration: Iteration) -> None:
+        raise ZeroDivisionError("in watch")
+
+    with pytest.raises(ZeroDivisionError, match="in watch"):
+        solve(cube(), watch=broken)
+
+
+def test_a_misfit_far_above_the_noise_is_noted():
+    made = measured(hung_cube())
+    shifted = with_markers(made, made.markers.positions_m + np.array([0.01, 0.0, 0.0]))
+    solution = solve(Collocation([shifted], GUESS))
+    assert "of their standard deviations" in solution.notes[-1]
+    assert not solved_cube().notes
+
+
+# History and timing
+
+
+def test_the_history_is_what_was_watched_and_ends_at_the_answer():
+    seen: list[Iteration] = []
+    solution = solve(cube(), watch=seen.append)
+    assert list(solution.history) == seen
+    numbers = [iteration.number for iteration in seen]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] <= solution.iterations
+    np.testing.assert_allclose(seen[0].theta, as_theta(GUESS))
+    np.testing.assert_allclose(seen[-1].theta, solution.theta)
+    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurements)
+
+
+def test_timings_are_parts_of_the_whole():
+    timing = solved_cube().timing
+    parts = (timing.build, timing.evaluations, timing.linear_algebra)
+    assert min(parts) > 0
+    assert sum(parts) <= timing.total
+
+
+def test_nothing_is_printed(capfd):
+    solve(cube())
+    assert capfd.readouterr() == ("", "")

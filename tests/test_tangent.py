@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems_small import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, measured, released_cube
+
+from collocation_sysid.errors import SimulationError
+from collocation_sysid.methods.multipliers import constraint_multipliers
+from collocation_sysid.nlp import tangent
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.parameters import as_theta
+from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.stopwatch import Stopwatch
+from collocation_sysid.nlp.tangent import BlockSolver, Tangent
+
+LAYOUTS = {
+    "bounds": {},
+    "explicit-grasps": {"explicit_grasps": True},
+    "substeps": {"substeps": 2},
+}
+
+
+def disturbed(
+    collocation: Collocation, size_m: float = 1e-3, seed: int = 0
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Variables near the truth whose free dofs do not satisfy the equations of motion."""
+    rng = np.random.default_rng(seed)
+    positions = []
+    for segment in collocation.segments:
+        x = march(segment.experiment, segment.dynamics, as_theta(TRUTH))
+        change = size_m * rng.standard_normal((len(x), len(segment.free_dofs)))
+        x[segment.dynamics.first_row :, segment.free_dofs] += change[segment.dynamics.first_row :]
+        positions.append(x)
+    return collocation.pack(collocation.parameters.guess_q, positions), positions
+
+
+def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tangent]:
+    parameters = collocation.parameters
+    q = parameters.guess_q
+    return [
+        BlockSolver(segment).forward(x, parameters.theta(q), parameters.theta_derivatives(q)[0])
+        for segment, x in zip(collocation.segments, positions, strict=True)
+    ]
+
+
+@pytest.fixture(
+    params=[(name, scheme, "bounds") for name in SMALL_EXPERIMENTS for scheme in SCHEMES]
+    + [("hung-cube", scheme, layout) for scheme in SCHEMES for layout in list(LAYOUTS)[1:]],
+    ids="-".join,
+)
+def collocation(request: pytest.FixtureRequest) -> Collocation:
+    name, scheme, layout = request.param
+    return Collocation([SMALL_EXPERIMENTS[name](5)], GUESS, scheme, **LAYOUTS[layout])
+
+
+def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Collocation):
+    z, positions = disturbed(collocation)
+    step = [tangent.step for tangent in forward(collocation, positions)]
+    values = collocation.constraint_values(z)
+    change = collocation.jacobian(z) @ collocation.pack(np.zeros(4), step)
+    assert np.abs(values).max() > 1e-4
+    np.testing.assert_allclose(change, -values, atol=1e-9 * np.abs(values).max())
+
+
+def test_sensitivities_keep_the_linearised_constraints(collocation: Collocation):
+    z, positions = disturbed(collocation)
+    jacobian = collocation.jacobian(z)
+    (found,) = forward(collocation, positions)
+    for k, direction in enumerate(np.eye(4)):
+        change = jacobian @ collocation.pack(direction, [found.by_q[:, :, k]])
+        largest = np.abs(jacobian[:, [k]].toarray()).max()
+        assert np.abs(change).max() < 1e-9 * largest
+
+
+def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation: Collocation):
+    measurable = [measured(s.experiment) for s in collocation.segments]
+    scheme, explicit = collocation.scheme, collocation.segments[0].explicit_grasps
+    collocation = Collocation(measurable, GUESS, scheme, collocation.substeps, explicit)
+    z, _ = disturbed(collocation)
+    multipliers = constraint_multipliers(collocation, z)
+    gradient = collocation.gradient(z)
+    slope = gradient + collocation.jacobian(z).T @ multipliers
+    lower, upper = collocation.bounds()
+    free = np.flatnonzero(lower < upper)[collocation.nq :]
+    assert np.abs(gradient[free]).max() > 0
+    assert np.abs(slope[free]).max() < 1e-9 * np.abs(gradient[free]).max()
+
+
+def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
+    """gᵀ p = yᵀ c for y with c_xᵀ y = −g and p = −c_x⁻¹ c."""
+    z, (x,) = disturbed(collocation)
+    (segment,) = collocation.segments
+    theta = collocation.parameters.theta(z[:4])
+    gradient = rng.standard_normal(x.shape)
+    y = BlockSolver(segment).backward(x, theta, gradient)
+    (found,) = forward(collocation, [x])
+    residual = segment.dynamics.residual(x, theta)
+    free = segment.free_dofs
+    left = np.sum(gradient[:, free] * found.step[:, free])
+    assert left == pytest.approx(np.sum(y[:, free] * residual[:, free]), rel=1e-9)
+
+
+def test_what_is_given_does_not_move():
+    collocation = Collocation([released_cube(4)], GUESS)
+    _, positions = disturbed(collocation)
+    (found,) = forward(collocation, positions)
+    held = collocation.segments[0].held_dofs
+    for part in (found.step[0], found.by_q[0], found.step[:, held], found.by_q[:, held]):
+        assert not part.any()
+
+
+def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch):
+    collocation = Collocation([measured(hung_cube(7))], GUESS, "bdf2")
+    z, positions = disturbed(collocation)
+    (whole,) = forward(collocation, positions)
+    multipliers = constraint_multipliers(collocation, z)
+    monkeypatch.setattr(tangent, "CHUNK_BYTES", 1)
+    (parts,) = forward(collocation, positions)
+    np.testing.assert_allclose(parts.step, whole.step, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(parts.by_q, whole.by_q, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(constraint_multipliers(collocation, z), multipliers, rtol=1e-9)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
+    collocation = Collocation([hung_cube(8)], GUESS, scheme)
+    _, (x,) = disturbed(collocation)
+    (whole,) = forward(collocation, [x])
+    (segment,) = collocation.segments
+    q = GUESS.guess_q
+    solver = BlockSolver(segment, rows=5)
+    part = solver.forward(x[:5], GUESS.theta(q), GUESS.theta_derivatives(q)[0])
+    np.testing.assert_allclose(part.step, whole.step[:5], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(part.by_q, whole.by_q[:5], rtol=1e-9, atol=1e-15)
+
+
+def test_rows_one_by_one_are_the_same_sensitivities():
+    collocation = Collocation([hung_cube(5)], GUESS)
+    _, (x,) = disturbed(collocation)
+    (whole,) = forward(collocation, [x])
+    q = GUESS.guess_q
+    rows = BlockSolver(collocation.segments[0]).sensitivities(
+        x, GUESS.theta(q), GUESS.theta_derivatives(q)[0]
+    )
+    np.testing.assert_allclose(np.stack(list(rows)), whole.by_q, rtol=1e-9, atol=1e-15)
+
+
+def test_indefinite_blocks_are_counted():
+    collocation = Collocation([hung_cube(6)], GUESS)
+    (segment,) = collocation.segments
+    x = np.tile(segment.body.nodes_m.ravel(), (segment.grid_rows, 1))
+    x.reshape(len(x), -1, 3)[3:, :, 2] *= 0.05
+    jacobian = collocation.jacobian(collocation.pack(GUESS.guess_q, [x])).toarray()
+    count, expected = len(segment.free_dofs), 0
+    for t in range(segment.grid_rows):
+        columns = collocation.nq + t * segment.dofs + segment.free_dofs
+        block = jacobian[t * count : (t + 1) * count, columns]
+        expected += int(np.linalg.eigvalsh(-block)[0] <= 0)
+    assert expected > 0
+    assert forward(collocation, [x])[0].indefinite == expected
+
+
+def test_states_that_are_not_finite_are_refused_with_their_time():
+    collocation = Collocation([hung_cube(5)], GUESS)
+    _, (x,) = disturbed(collocation)
+    x[3] = np.nan
+    with pytest.raises(SimulationError, match=r"'hung cube'.*not finite"):
+        forward(collocation, [x])
+
+
+def test_time_is_accounted_for():
+    collocation = Collocation([hung_cube(5)], GUESS)
+    _, (x,) = disturbed(collocation)
+    stopwatch, q = Stopwatch(), GUESS.guess_q
+    solver = BlockSolver(collocation.segments[0], stopwatch=stopwatch)
+    solver.forward(x, GUESS.theta(q), GUESS.theta_derivatives(q)[0])
+    assert stopwatch.evaluations > 0
+    assert stopwatch.linear_algebra > 0
