@@ -1,0 +1,213 @@
+"""Time whole identifications: simulation alone, reduced space, and interior point where it can run.
+
+A cylinder of table1's material is hung, swung, and "measured" by the midpoint scheme itself;
+every run starts from table1's guess in a process of its own. Writes a table, JSON and plots.
+
+    python scripts/benchmark_methods.py                      # the paper's size, both methods
+    python scripts/benchmark_methods.py --scaling            # T = 50 … 1600, 95 … 5000 nodes
+    python scripts/benchmark_methods.py --mesh 4x32 --steps 1000 --methods reduced-space
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import resource
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
+from synthetic import swing
+
+from collocation_sysid import (
+    Body,
+    Collocation,
+    Experiment,
+    Grasp,
+    Markers,
+    Parameter,
+    Parameters,
+    Theta,
+    simulate,
+)
+from collocation_sysid.experiment import place_markers
+from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.methods import METHODS
+from collocation_sysid.nlp.simulation import with_markers
+
+TRUTH = Theta(200.0, 300.0, 0.009, 1.0)
+PARAMETERS = Parameters(
+    (
+        Parameter("lambda_pa", 400.0, 10.0, 1e5),
+        Parameter("mu_pa", 150.0, 10.0, 1e5),
+        Parameter("gamma_r_s", 0.02, 1e-5, 1.0),
+        Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0),
+    )
+)
+STEP_S = 0.01
+PAPER_SIZE = ("2x8", 100)
+# Rings x layers of the cylinder: 95 to about 5,000 nodes.
+MESHES = ("2x4", "2x8", "3x12", "4x16", "4x32", "6x38")
+STEPS = (50, 100, 200, 400, 800, 1600)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run."""
+
+    method: str
+    nodes: int
+    elements: int
+    steps: int
+    status: str
+    iterations: int
+    simulation_s: float
+    evaluations_s: float
+    linear_algebra_s: float
+    total_s: float
+    peak_mb: float
+    kkt_residual: float
+    theta_error: float
+
+    @property
+    def us_per_node_and_step(self) -> float:
+        """Cost of the whole solve over nodes and steps."""
+        return 1e6 * self.total_s / self.nodes / self.steps
+
+
+def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) -> Experiment:
+    """A hung and swung cylinder with tracks from the midpoint scheme."""
+    rings, layers = map(int, mesh.split("x"))
+    body = Body(cylinder_mesh(0.04, 0.16, rings, layers), density_kg_m3=20.0)
+    t_s = np.arange(steps) * STEP_S
+    poses = swing(
+        t_s,
+        amplitude_m=(0.05, 0.04, 0.03),
+        amplitude_rad=(0.1, 0.1, 0.6),
+        frequency_hz=(0.9, 1.1, 1.3),
+        rise_s=0.3,
+        start=Rotation.from_rotvec([np.pi, 0, 0]),
+    )
+    angle = np.arange(8) * 2.4
+    height = np.linspace(0.04, 0.16, 8)
+    places = np.column_stack([0.035 * np.cos(angle), 0.035 * np.sin(angle), height])
+    markers = Markers(
+        tuple(f"m{k}" for k in range(8)),
+        t_s,
+        np.zeros((steps, 8, 3)),
+        np.full(8, 0.001),
+        place_markers(places, body.nodes_m, body, "vertex"),
+    )
+    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    experiment = Experiment(
+        "swing", body, t_s, (Grasp(held, poses),), markers, np.array([0.0, 0.0, -9.81])
+    )
+    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
+    return with_markers(experiment, tracks)
+
+
+def measure(mesh: str, steps: int, method: str) -> Row:
+    """One identification from the guess; kernels are warm, the process is fresh."""
+    experiment = experiment_of(mesh, steps)
+    began = time.perf_counter()
+    simulate(experiment, TRUTH, "midpoint")
+    simulation_s = time.perf_counter() - began
+    collocation = Collocation([experiment], PARAMETERS)
+    experiment.body.linearise(experiment.body.nodes_m, 0 * experiment.body.nodes_m, TRUTH)
+    chosen = METHODS[method]
+    began = time.perf_counter()
+    solution = chosen.solve(collocation, chosen.options())
+    total_s = time.perf_counter() - began
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    # The full Jacobian of a large problem would take more memory than its solution did.
+    small = collocation.variables < 500_000
+    return Row(
+        method=method,
+        nodes=len(experiment.body.nodes_m),
+        elements=len(experiment.body.cells),
+        steps=steps,
+        status=solution.status.value,
+        iterations=solution.iterations,
+        simulation_s=simulation_s,
+        evaluations_s=solution.timing.evaluations,
+        linear_algebra_s=solution.timing.linear_algebra,
+        total_s=total_s,
+        peak_mb=peak_mb,
+        kkt_residual=solution.kkt_residual if small else float("nan"),
+        theta_error=float(np.abs(np.array(solution.theta) / np.array(TRUTH) - 1).max()),
+    )
+
+
+def in_own_process(mesh: str, steps: int, method: str) -> Row:
+    """`measure` in a fresh interpreter, so that peak memory is its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(measure, (mesh, steps, method))
+
+
+def show(row: Row) -> None:
+    print(
+        f"{row.method:15s} {row.nodes:5d} nodes {row.steps:5d} steps  {row.status:10s} "
+        f"{row.iterations:3d} iterations  total {row.total_s:8.2f} s "
+        f"(evaluations {row.evaluations_s:.2f}, linear algebra {row.linear_algebra_s:.2f})  "
+        f"simulation {row.simulation_s:.2f} s  {row.us_per_node_and_step:8.1f} µs/node/step  "
+        f"{row.peak_mb:6.0f} MB  KKT {row.kkt_residual:.1e}  θ error {row.theta_error:.1e}",
+        flush=True,
+    )
+
+
+def plot(rows: list[Row], folder: Path) -> None:
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    for place, (key, fixed) in enumerate((("steps", "nodes"), ("nodes", "steps"))):
+        axes = figure.add_subplot(1, 2, place + 1)
+        for method in sorted({row.method for row in rows}):
+            common = [row for row in rows if row.method == method]
+            values = [getattr(row, fixed) for row in common]
+            most = max(set(values), key=values.count)
+            chosen = sorted(
+                (row for row in common if getattr(row, fixed) == most),
+                key=lambda row: getattr(row, key),
+            )
+            x = [getattr(row, key) for row in chosen]
+            axes.loglog(x, [row.total_s for row in chosen], "o-", label=f"{method}, {most} {fixed}")
+            axes.loglog(x, [row.simulation_s for row in chosen], ":", color="0.5")
+        axes.set(xlabel=key, ylabel="s (dotted: one simulation)")
+        axes.legend(frameon=False, fontsize=8)
+    figure.savefig(folder / "benchmark_methods.png", dpi=150)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--mesh", nargs="*", default=[PAPER_SIZE[0]], help="rings x layers")
+    parser.add_argument("--steps", nargs="*", type=int, default=[PAPER_SIZE[1]])
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--scaling", action="store_true", help="reduced space over T and meshes")
+    parser.add_argument("--out", type=Path, default=Path("results"))
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    cases = [(m, t, k) for m in arguments.mesh for t in arguments.steps for k in arguments.methods]
+    if arguments.scaling:
+        cases = [(PAPER_SIZE[0], steps, "reduced-space") for steps in STEPS]
+        cases += [(mesh, PAPER_SIZE[1], "reduced-space") for mesh in MESHES if mesh != "2x8"]
+    rows = []
+    for case in cases:
+        rows.append(in_own_process(*case))
+        if not arguments.json:
+            show(rows[-1])
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    content = json.dumps([asdict(row) for row in rows], indent=1)
+    (arguments.out / "benchmark_methods.json").write_text(content + "\n")
+    plot(rows, arguments.out)
+    if arguments.json:
+        sys.stdout.write(content + "\n")
+
+
+if __name__ == "__main__":
+    main()
