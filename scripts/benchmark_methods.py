@@ -84,7 +84,7 @@ def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) ->
     """A hung and swung cylinder with tracks from the midpoint scheme."""
     rings, layers = map(int, mesh.split("x"))
     body = Body(cylinder_mesh(0.04, 0.16, rings, layers), density_kg_m3=20.0)
-    t_s = np.arange(steps) * STEP_S
+    t_s = np.arange(steps, dtype=np.float64) * STEP_S
     poses = swing(
         t_s,
         amplitude_m=(0.05, 0.04, 0.03),
