@@ -33,6 +33,7 @@ from ..nlp.stopwatch import Stopwatch
 from ..results.solution import Iteration, Solution, Status, Timing
 from .horizon import Horizon, Point
 from .multipliers import constraint_multipliers
+from .secant import updated, with_curvature
 
 Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
@@ -71,13 +72,20 @@ class ReducedSpaceOptions:
 MIN_ROWS = 8
 # A trial's infeasibility may be this share of its step's length, or this share of an edge of
 # the mesh: the strain it causes is then small enough for Newton's next step to remove it.
-CONTRACTION, SMALL_STRAIN = 0.5, 0.02
+CONTRACTION, SMALL_STRAIN = 0.5, 0.1
 # Share of the predicted decrease a trial must reach.
 DECREASE = 1e-3
 # Shorter than this over the body's size, feasibility is at rounding; shorter than the second,
 # it is where steps no longer change the parameters and it does not decrease any more.
 FEASIBLE, NEARLY_FEASIBLE = 1e-12, 1e-8
 SMALLEST_TRUST = 1e-10
+# The last step is taken without another sweep when its error, judged by the rate at which steps
+# shrink, is this share of the tolerance, and no equation is violated by more than this in the
+# scaling of the NLP.
+SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
+SHRINK = 0.25
+# Steps shorter than this tell about the curvature at the answer.
+LOCAL = 0.1
 # Doublings of the moduli where not even the first rows can be simulated at the guess.
 STIFFENINGS = 10
 MODULI = ("lambda_pa", "mu_pa", "young_pa")
@@ -189,12 +197,18 @@ class _Search:
         tolerance = self.options.tolerance
         self.trust = self.options.trust
         point = self._accepted(rung.evaluate(self.q, self.x))
-        rejections = 0
+        rejections, curvature = 0, np.zeros((len(point.q), len(point.q)))
+        previous = np.inf
         while True:
-            step = self._step(point)
+            step = self._step(point, curvature)
             length = float(np.abs(step).max(initial=0.0))
             if length <= tolerance and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
+            if last and length * min(1.0, length / previous) <= SAFETY * tolerance:
+                final = point.moved(step)
+                if self._are_feasible(final, point.q + step):
+                    self._record(point.q + step, final, point.predicted_loss(step))
+                    return Status.CONVERGED
             promised = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not last and promised < self.options.rung_decrease:
                 return Status.CONVERGED
@@ -202,18 +216,20 @@ class _Search:
                 return Status.ITERATION_LIMIT
             trial = self._try(rung, point, step)
             if trial is not None and self._is_better(point, step, trial):
-                point, rejections = self._accepted(trial), 0
+                if last and length <= LOCAL:
+                    curvature = updated(curvature, point, trial)
+                point, rejections, previous = self._accepted(trial), 0, length
                 continue
             if length <= tolerance and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
             if length <= SMALLEST_TRUST:
                 return Status.STALLED
-            self.trust = 0.25 * length
+            self.trust = SHRINK * length
             rejections += 1
             if rejections == 2 and point.feasibility_m > SMALL_STRAIN * self.edge_m:
                 point = self._restored(rung, point)
 
-    def _step(self, point: Point) -> Array:
+    def _step(self, point: Point, curvature: Array) -> Array:
         if len(point.q) == 0:
             return np.zeros(0)
         low = np.maximum(self.lower - point.q, -self.trust)
@@ -221,7 +237,9 @@ class _Search:
         # Rounding may leave q on its bound by a hair.
         low, high = np.minimum(low, 0.0) - 1e-15, np.maximum(high, 0.0) + 1e-15
         _, triangle = np.linalg.qr(np.column_stack([point.slope, point.residual]))
-        answer = lsq_linear(triangle[:, :-1], -triangle[:, -1], (low, high), method="bvls")
+        count = len(point.q)
+        slope, right = with_curvature(triangle[:count, :count], triangle[:count, -1], curvature)
+        answer = lsq_linear(slope, -right, (low, high), method="bvls")
         return np.clip(answer.x, low, high)
 
     def _try(self, rung: Horizon, point: Point, step: Array) -> Point | None:
@@ -265,29 +283,42 @@ class _Search:
             return point
         return self._accepted(restored) if restored.finite else point
 
-    def _accepted(self, point: Point) -> Point:
-        self.q, self.x = point.q, point.x
-        self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
-        squares = np.concatenate(
-            [
-                segment.observation.squared_distances_m2(x + tangent.step)
-                for segment, x, tangent in zip(
-                    self.collocation.segments, point.x, point.tangents, strict=True
-                )
-            ]
+    def _are_feasible(self, x: list[Array], q: Array) -> bool:
+        """Whether trajectories satisfy the equations of motion well within the tolerance."""
+        theta = self.collocation.parameters.theta(q)
+        return all(
+            np.abs(segment.residual_n(x_k, theta)).max() <= FEASIBLE_FORCE * segment.force_n
+            for segment, x_k in zip(self.collocation.segments, x, strict=True)
         )
+
+    def _accepted(self, point: Point) -> Point:
+        self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
+        self._record(point.q, point.x, point.loss, point)
+        return point
+
+    def _record(self, q: Array, x: list[Array], loss: float, point: Point | None = None) -> None:
+        """Make it the answer so far; markers are those after the feasibility step of a point."""
+        self.q, self.x = q, x
+        theta = self.collocation.parameters.theta(q)
+        squares, violation_n = [], 0.0
+        for k, segment in enumerate(self.collocation.segments):
+            tangent = point.tangents[k] if point else None
+            projected = x[k] + tangent.step if tangent else x[k]
+            squares.append(segment.observation.squared_distances_m2(projected))
+            here = tangent.violation_n if tangent else np.abs(segment.residual_n(x[k], theta)).max()
+            violation_n = max(violation_n, float(here))
+        distances = np.concatenate(squares)
         line = Iteration(
             number=self.sweeps,
-            loss=point.loss,
-            rms_m=float(np.sqrt(squares.mean())) if len(squares) else 0.0,
-            violation_n=max(tangent.violation_n for tangent in point.tangents),
-            theta=self.collocation.parameters.theta(point.q),
+            loss=loss,
+            rms_m=float(np.sqrt(distances.mean())) if len(distances) else 0.0,
+            violation_n=violation_n,
+            theta=theta,
             time_s=time.perf_counter() - self.began,
         )
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)
-        return point
 
 
 def solve(

@@ -1,0 +1,55 @@
+"""What Gauss–Newton leaves out of the Hessian, learned from the steps taken.
+
+The Hessian of ‖r‖² is 2 (SᵀS + B) with B = Σ r_i ∇²r_i, which is small where the residuals are.
+Where they are not, as with measurement noise, Gauss–Newton converges slowly; the update of
+Dennis, Gay and Welsch (NL2SOL, 1981) makes it superlinear at no cost.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from .horizon import Point
+
+Array = NDArray[np.float64]
+
+# B may not take more than this share of the curvature of SᵀS away in any direction.
+LARGEST_SHARE = 0.9
+
+
+def updated(b: Array, before: Point, after: Point) -> Array:
+    """B (nq, nq) after a step between two points."""
+    step = after.q - before.q
+    change = after.slope.T @ after.residual - before.slope.T @ before.residual
+    wanted = (after.slope - before.slope).T @ after.residual  # B · step
+    along = float(change @ step)
+    if along <= 0:
+        return b
+    old = float(step @ b @ step)
+    if old != 0:  # a B that has become too large shrinks to what this step saw
+        b = b * min(1.0, abs(float(step @ wanted) / old))
+    missing = wanted - b @ step
+    rank_two = np.outer(missing, change) / along
+    return b + rank_two + rank_two.T - (missing @ step) / along**2 * np.outer(change, change)
+
+
+def with_curvature(triangle: Array, right: Array, b: Array) -> tuple[Array, Array]:
+    """R' and c' with R'ᵀR' = RᵀR + B and R'ᵀc' = Rᵀc; R and c as they are where that is indefinite.
+
+    Parameters
+    ----------
+    triangle : (nq, nq) R, upper triangular
+    right : (nq,) c
+    b : (nq, nq)
+    """
+    if not b.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
+        return triangle, right
+    half = solve_triangular(triangle, b, trans="T")
+    relative = solve_triangular(triangle, half.T, trans="T")
+    relative = (relative + relative.T) / 2
+    if np.linalg.eigvalsh(relative)[0] < -LARGEST_SHARE:
+        return triangle, right
+    factor = np.linalg.cholesky(np.eye(len(b)) + relative)
+    return factor.T @ triangle, solve_triangular(factor, right, lower=True)
