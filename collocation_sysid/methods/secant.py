@@ -46,8 +46,8 @@ def with_curvature(triangle: Array, right: Array, b: Array) -> tuple[Array, Arra
     """
     if not b.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
         return triangle, right
-    half = solve_triangular(triangle, b, trans="T")
-    relative = solve_triangular(triangle, half.T, trans="T")
+    half = solve_triangular(triangle, b, trans=1)
+    relative = solve_triangular(triangle, half.T, trans=1)
     relative = (relative + relative.T) / 2
     if np.linalg.eigvalsh(relative)[0] < -LARGEST_SHARE:
         return triangle, right
