@@ -135,6 +135,22 @@ def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
     np.testing.assert_allclose(part.by_q, whole.by_q[:5], rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.parametrize("done", [1, 3, 5])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_first_rows_can_be_continued(scheme: str, done: int):
+    collocation = Collocation([hung_cube(8)], GUESS, scheme)
+    _, (x,) = disturbed(collocation)
+    (whole,) = forward(collocation, [x])
+    (segment,) = collocation.segments
+    q = GUESS.guess_q
+    theta, theta_q = GUESS.theta(q), GUESS.theta_derivatives(q)[0]
+    first = BlockSolver(segment, done).forward(x[:done], theta, theta_q)
+    continued = BlockSolver(segment).forward(x, theta, theta_q, first)
+    np.testing.assert_allclose(continued.step, whole.step, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(continued.by_q, whole.by_q, rtol=1e-9, atol=1e-15)
+    assert continued.violation_n == pytest.approx(whole.violation_n)
+
+
 def test_rows_one_by_one_are_the_same_sensitivities():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)

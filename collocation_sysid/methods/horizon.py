@@ -100,8 +100,8 @@ class Horizon:
                 for segment, count in zip(collocation.segments, rows, strict=True)
             ]
 
-    def evaluate(self, q: Array, x: list[Array]) -> Point:
-        """One sweep.
+    def evaluate(self, q: Array, x: list[Array], known: Point | None = None) -> Point:
+        """One sweep; a point of the first rows, at the same q and positions, is continued.
 
         Raises
         ------
@@ -112,8 +112,9 @@ class Horizon:
         theta = parameters.theta(q)
         theta_q, _ = parameters.theta_derivatives(q)
         tangents, residuals, slopes = [], [], []
-        for solver, x_k in zip(self.solvers, x, strict=True):
-            tangent = solver.forward(x_k, theta, theta_q)
+        for k, (solver, x_k) in enumerate(zip(self.solvers, x, strict=True)):
+            first = known.tangents[k] if known else None
+            tangent = solver.forward(x_k, theta, theta_q, first)
             observation = solver.segment.observation
             residual, slope = observation.linearised(x_k, tangent.step, tangent.by_q)
             tangents.append(tangent)

@@ -112,6 +112,7 @@ class _Search:
         self.lower, self.upper = collocation.parameters.bounds_q
         self.q = collocation.parameters.guess_q
         self.x: list[Array] | None = None
+        self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
         self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
@@ -196,7 +197,7 @@ class _Search:
         assert self.x is not None
         tolerance = self.options.tolerance
         self.trust = self.options.trust
-        point = self._accepted(rung.evaluate(self.q, self.x))
+        point = self._accepted(rung.evaluate(self.q, self.x, self.point))
         rejections, curvature = 0, np.zeros((len(point.q), len(point.q)))
         previous = np.inf
         while True:
@@ -292,6 +293,7 @@ class _Search:
         )
 
     def _accepted(self, point: Point) -> Point:
+        self.point = point
         self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
         self._record(point.q, point.x, point.loss, point)
         return point

@@ -129,9 +129,13 @@ class Dynamics:
         """The same from the internal forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
         total[self.first_row :] = force + self.external_force_n
-        inertia = self.combine(self.tables.s, x) / self.step_s**2
-        inertia += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
-        return self.combine(self.tables.w, total) - inertia * self.body.dof_mass
+        return self.combine(self.tables.w, total) - self.inertia(x)
+
+    def inertia(self, x: Array) -> Array:
+        """Mass times acceleration of every row, (N, 3n) [N]."""
+        acceleration = self.combine(self.tables.s, x) / self.step_s**2
+        acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
+        return acceleration * self.body.dof_mass
 
     def linearise(self, x: Array, theta: Theta, out: Array | None = None) -> Linearisation:
         """Forces and derivatives at the evaluation states of x (N, 3n)."""

@@ -51,19 +51,39 @@ class Tangent:
         Largest |c|.
     indefinite : int
         Timesteps whose block −∂c_t/∂x_t is not positive definite.
+    memory : Memory
+        To continue with later rows.
     """
 
     step: Array
     by_q: Array
     violation_n: float
     indefinite: int
+    memory: Memory
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What the next row depends on, most recent row first; (free, 1 + nq) each.
+
+    Attributes
+    ----------
+    solutions : Y_{t−i}
+    increments : dF_{t−j}
+    forces : (3n,) total forces F_{t−j} at the evaluations
+    """
+
+    solutions: tuple[Array, ...]
+    increments: tuple[Array, ...]
+    forces: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One timestep's blocks: G, C (lower triangles), ∂F/∂θ, and −∂c_t/∂x_t factorised."""
+    """One timestep's F, G, C (lower triangles), ∂F/∂θ, and −∂c_t/∂x_t factorised."""
 
     t: int
+    force: Array
     by_position: Array
     by_velocity: Array
     by_theta: Array
@@ -104,29 +124,39 @@ class BlockSolver:
         )
 
     @one_blas_thread()
-    def forward(self, x: Array, theta: Theta, theta_q: Array) -> Tangent:
+    def forward(
+        self, x: Array, theta: Theta, theta_q: Array, known: Tangent | None = None
+    ) -> Tangent:
         """P and Z at x (N, 3n); θ_q is ∂θ/∂q (4, nq).
+
+        Parameters
+        ----------
+        known : Tangent, optional
+            That of the first rows, at the same positions and parameters: it is continued.
 
         Raises
         ------
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        with self.stopwatch.evaluating():
-            residual = self.dynamics.residual(x, theta)[:, self.free]
         count = 1 + theta_q.shape[1]
         columns = np.zeros((*x.shape, count))
-        march = _Forward(self, (len(self.free), count))
-        indefinite = 0
-        for step in self._steps(x, theta):
+        march = _Forward(self, (len(self.free), count), known.memory if known else None)
+        violation, indefinite, done = 0.0, 0, 0
+        if known is not None:
+            violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
+            columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_q
+        inertia = self.dynamics.inertia(x)
+        for step in self._steps(x, theta, first=done):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
-            right[:, 0] = residual[step.t]
+            residual = march.residual(step, inertia[step.t])
+            violation = max(violation, float(np.abs(residual).max(initial=0.0)))
+            right[:, 0] = residual
             force[:, 1:] = step.by_theta[self.free] @ theta_q
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force)
-        violation = float(np.abs(residual).max(initial=0.0))
-        return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite)
+        return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite, march.memory)
 
     def sensitivities(self, x: Array, theta: Theta, theta_q: Array) -> Iterator[Array]:
         """Z_t (3n, nq), row by row; nothing but the last few rows is kept.
@@ -191,15 +221,16 @@ class BlockSolver:
         self._matrix.data = lower[self._source]
         return self._matrix @ columns
 
-    def _steps(self, x: Array, theta: Theta, backward: bool = False) -> Iterator[_Step]:
-        """Blocks and factors of every row, computed in chunks side by side."""
+    def _steps(
+        self, x: Array, theta: Theta, backward: bool = False, first: int = 0
+    ) -> Iterator[_Step]:
+        """Blocks and factors of every row from `first` on, computed in chunks side by side."""
         dynamics, body = self.dynamics, self.body
-        first = dynamics.first_row
         xi, nu = dynamics.evaluation_states(x)
-        starts = range(first, dynamics.rows, self.chunk)
+        starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         for start in reversed(starts) if backward else starts:
             stop = min(start + self.chunk, dynamics.rows)
-            here = slice(start - first, stop - first)
+            here = slice(start - dynamics.first_row, stop - dynamics.first_row)
             with self.stopwatch.evaluating():
                 at = body.linearise(xi[here], nu[here], theta)
             with self.stopwatch.solving():
@@ -207,7 +238,12 @@ class BlockSolver:
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
-                    start + k, at.by_position[k], at.by_velocity[k], at.by_theta[k], factors[k]
+                    start + k,
+                    at.force[k],
+                    at.by_position[k],
+                    at.by_velocity[k],
+                    at.by_theta[k],
+                    factors[k],
                 )
 
     def _factorise(self, at: Linearisation, rows: slice) -> list[Factor]:
@@ -234,28 +270,49 @@ class BlockSolver:
 
 
 class _Forward:
-    """The last few steps' solutions and force increments, most recent first."""
+    """Substitution row by row; remembers the last few rows."""
 
-    def __init__(self, solver: BlockSolver, shape: tuple[int, int]) -> None:
+    def __init__(
+        self, solver: BlockSolver, shape: tuple[int, int], memory: Memory | None = None
+    ) -> None:
         self.solver = solver
         self.shape = shape
         self.tables = solver.dynamics.tables
         self.step_s = solver.dynamics.step_s
         self.mass = solver.body.dof_mass[solver.free, None]
         reach = solver.dynamics.reach
-        self.past: deque[Array] = deque([np.zeros(shape)] * reach, maxlen=reach)
-        self.past_force = self.past.copy()
+        nothing = (np.zeros(shape),) * reach
+        memory = memory or Memory(nothing, nothing, (np.zeros(len(solver.free)),) * reach)
+        self.past = deque(memory.solutions, maxlen=reach)
+        self.past_increments = deque(memory.increments, maxlen=reach)
+        self.past_forces = deque(memory.forces, maxlen=reach)
+        self.weighs_past = bool(self.tables.w[:, 1:].any())
+
+    @property
+    def memory(self) -> Memory:
+        """What later rows depend on."""
+        return Memory(tuple(self.past), tuple(self.past_increments), tuple(self.past_forces))
+
+    def residual(self, step: _Step, inertia: Array) -> Array:
+        """c_t on the free dofs; to be called for every row in turn."""
+        free, w = self.solver.free, self.tables.w[step.t]
+        force = step.force[free] + self.solver.dynamics.external_force_n[free]
+        total = w[0] * force - inertia[free]
+        if self.weighs_past:
+            total += weighted(w[1:], self.past_forces, force.shape)
+            self.past_forces.appendleft(force)
+        return total
 
     def advance(self, step: _Step, right: Array, force: Array) -> Array:
         """Y_t from R_t and F_R, each (free, columns)."""
         tables, t = self.tables, step.t
         w, s = tables.w[t], tables.s[t] / self.step_s**2
-        right += weighted(w[1:], self.past_force, self.shape)
+        right += weighted(w[1:], self.past_increments, self.shape)
         right -= self.mass * weighted(s[1:], self.past, self.shape)
         force += self._of_past(step, tables.p[t, 1:], tables.q[t, 1:] / self.step_s)
         solution = step.factor.solve(right + w[0] * force)
-        if tables.w.shape[1] > 1 and tables.w[:, 1:].any():
-            self.past_force.appendleft((s[0] * self.mass * solution - right) / w[0])
+        if self.weighs_past:
+            self.past_increments.appendleft((s[0] * self.mass * solution - right) / w[0])
         self.past.appendleft(solution)
         return solution
 
