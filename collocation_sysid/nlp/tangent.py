@@ -286,7 +286,8 @@ class _Forward:
         self.past = deque(memory.solutions, maxlen=reach)
         self.past_increments = deque(memory.increments, maxlen=reach)
         self.past_forces = deque(memory.forces, maxlen=reach)
-        self.weighs_past = bool(self.tables.w[:, 1:].any())
+        # Also where these rows do not: they may be continued.
+        self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
 
     @property
     def memory(self) -> Memory:
