@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, Protocol
 
 import numpy as np
@@ -105,6 +105,11 @@ class Factoriser:
         self._full_source = np.concatenate([self._kept, self._kept[strict]])
         self._entries = pattern.entries
 
+    @classmethod
+    def of(cls, pattern: SymmetricPattern, free: Index) -> Factoriser:
+        """The analysis of a pattern; that of the last few is kept."""
+        return _analysed(pattern, free.tobytes())
+
     @cached_property
     def banded(self) -> bool:
         """Whether banded Cholesky is chosen."""
@@ -190,3 +195,8 @@ class Factoriser:
             )
         except RuntimeError as error:
             raise np.linalg.LinAlgError(str(error)) from error
+
+
+@lru_cache(maxsize=8)
+def _analysed(pattern: SymmetricPattern, free: bytes) -> Factoriser:
+    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64))

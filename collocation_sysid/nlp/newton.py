@@ -73,7 +73,7 @@ class Solver:
         self.options = options or NewtonOptions()
         self.free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
         self.held = (3 * experiment.held_nodes[:, None] + np.arange(3)).ravel()
-        self.factoriser = Factoriser(self.body.pattern, self.free)
+        self.factoriser = Factoriser.of(self.body.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 
     def newton(

@@ -109,7 +109,7 @@ class BlockSolver:
         self.segment = segment
         self.body = segment.body
         self.free = segment.free_dofs
-        self.factoriser = Factoriser(self.body.pattern, self.free)
+        self.factoriser = Factoriser.of(self.body.pattern, self.free)
         full_rows, full_columns, source = self.body.pattern.full
         place = np.full(self.body.pattern.size, -1)
         place[self.free] = np.arange(len(self.free))
