@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from .methods.reduced_space import memory_mb
 from .methods.start import initial_variables
 from .nlp.collocation import Collocation
 from .problem import Problem
@@ -89,7 +90,9 @@ def check_problem(problem: Problem) -> Findings:
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
         # Values and row numbers, and the element results that are kept between calls.
-        memory_mb=(16 * (jacobian + hessian) + 8 * rows) / 1e6,
+        memory_mb=memory_mb(collocation)
+        if problem.file.solver.method == "reduced-space"
+        else (16 * (jacobian + hessian) + 8 * rows) / 1e6,
         jacobian_error=jacobian_error,
         hessian_error=hessian_error,
         notes=(*problem.notes, *notes, quality.describe()),

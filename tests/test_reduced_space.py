@@ -22,7 +22,7 @@ from problems_small import (
 from collocation_sysid.experiment import Experiment
 from collocation_sysid.methods.interior_point import InteriorPointOptions
 from collocation_sysid.methods.interior_point import solve as interior_point
-from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, solve
+from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, memory_mb, solve
 from collocation_sysid.methods.start import carried_rigidly
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
@@ -150,6 +150,17 @@ def test_a_prior_pulls_as_it_does_in_interior_point():
     np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
     assert 201 < solution.parameters["lambda_pa"] < 220
     assert solution.kkt_residual < KKT
+
+
+@pytest.mark.parametrize("factorisation", ["band", "sparse"])
+def test_every_factorisation_leads_to_the_same_answer(factorisation):
+    solution = solve(cube(), ReducedSpaceOptions(factorisation=factorisation))
+    np.testing.assert_allclose(solution.theta, solved_cube().theta, rtol=1e-9)
+
+
+def test_memory_grows_no_faster_than_the_number_of_timesteps():
+    short, long = (Collocation([hung_cube(steps)], GUESS) for steps in (49, 199))
+    assert memory_mb(short) < memory_mb(long) <= 4 * memory_mb(short)
 
 
 # The start

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
+from ..nlp.factorisation import Choice
 from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
@@ -81,6 +82,7 @@ class Horizon:
     prior : float, optional
         Standard deviation of a prior that holds q near the guess.
     stopwatch : Stopwatch, optional
+    factorisation : {"auto", "band", "sparse"}
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Horizon:
         rows: Sequence[int],
         prior: float | None = None,
         stopwatch: Stopwatch | None = None,
+        factorisation: Choice = "auto",
     ) -> None:
         self.collocation = collocation
         self.rows = list(rows)
@@ -96,7 +99,7 @@ class Horizon:
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
             self.solvers = [
-                BlockSolver(segment, count, self.stopwatch)
+                BlockSolver(segment, count, self.stopwatch, factorisation)
                 for segment, count in zip(collocation.segments, rows, strict=True)
             ]
 

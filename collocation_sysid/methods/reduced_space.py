@@ -28,8 +28,10 @@ from scipy.optimize import lsq_linear
 
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
+from ..nlp.factorisation import Choice
 from ..nlp.segment import Segment
 from ..nlp.stopwatch import Stopwatch
+from ..nlp.tangent import BlockSolver
 from ..results.solution import Iteration, Solution, Status, Timing
 from .horizon import Horizon, Point
 from .multipliers import constraint_multipliers
@@ -58,6 +60,8 @@ class ReducedSpaceOptions:
     rung_prior : float
         On them a prior of this standard deviation of the logarithm holds each parameter near its
         guess: a short horizon says nothing about some, and would let them run to their bounds.
+    factorisation : {"auto", "band", "sparse"}
+        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
     """
 
     tolerance: float = 1e-8
@@ -66,6 +70,7 @@ class ReducedSpaceOptions:
     ladder: tuple[float, ...] = (0.25, 0.5, 1.0)
     rung_decrease: float = 0.05
     rung_prior: float = 2.3
+    factorisation: Choice = "auto"
 
 
 # Fewest grid rows of a rung.
@@ -145,7 +150,7 @@ class _Search:
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         prior = None if last else self.options.rung_prior
-        return Horizon(self.collocation, rows, prior, self.stopwatch)
+        return Horizon(self.collocation, rows, prior, self.stopwatch, self.options.factorisation)
 
     def _reach(self, rung: Horizon) -> None:
         """Extend the trajectories to a rung's length; where that fails, first solve what is."""
@@ -371,6 +376,15 @@ def solve(
         ),
         notes=tuple(search.notes),
     )
+
+
+def memory_mb(collocation: Collocation) -> float:
+    """Memory that a solve takes, estimated: linear in the number of timesteps."""
+    # Two points with positions, p and Z; positions of the answer and of its gradients.
+    columns = 2 * (2 + collocation.nq) + 6
+    numbers = columns * collocation.variables
+    chunks = [BlockSolver(segment).chunk_bytes for segment in collocation.segments]
+    return (8 * numbers + max(chunks)) / 1e6
 
 
 def _whole(collocation: Collocation, search: _Search) -> tuple[Array, Array]:

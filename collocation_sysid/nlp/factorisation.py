@@ -106,9 +106,9 @@ class Factoriser:
         self._entries = pattern.entries
 
     @classmethod
-    def of(cls, pattern: SymmetricPattern, free: Index) -> Factoriser:
+    def of(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
         """The analysis of a pattern; that of the last few is kept."""
-        return _analysed(pattern, free.tobytes())
+        return _analysed(pattern, free.tobytes(), choice)
 
     @cached_property
     def banded(self) -> bool:
@@ -198,5 +198,5 @@ class Factoriser:
 
 
 @lru_cache(maxsize=8)
-def _analysed(pattern: SymmetricPattern, free: bytes) -> Factoriser:
-    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64))
+def _analysed(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
+    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice)

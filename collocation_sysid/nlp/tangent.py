@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .dynamics import Dynamics, Tables
-from .factorisation import Factor, Factoriser
+from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .parameters import Theta
 from .segment import Segment
@@ -99,17 +99,23 @@ class BlockSolver:
     rows : int, optional
         Grid times to take, all by default.
     stopwatch : Stopwatch, optional
+    factorisation : {"auto", "band", "sparse"}
+        See `nlp.factorisation`.
     """
 
     def __init__(
-        self, segment: Segment, rows: int | None = None, stopwatch: Stopwatch | None = None
+        self,
+        segment: Segment,
+        rows: int | None = None,
+        stopwatch: Stopwatch | None = None,
+        factorisation: Choice = "auto",
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.dynamics = _first_rows(segment.dynamics, rows or segment.grid_rows)
         self.segment = segment
         self.body = segment.body
         self.free = segment.free_dofs
-        self.factoriser = Factoriser.of(self.body.pattern, self.free)
+        self.factoriser = Factoriser.of(self.body.pattern, self.free, factorisation)
         full_rows, full_columns, source = self.body.pattern.full
         place = np.full(self.body.pattern.size, -1)
         place[self.free] = np.arange(len(self.free))
@@ -213,8 +219,16 @@ class BlockSolver:
     @property
     def chunk(self) -> int:
         """Timesteps that are evaluated and factorised at a time."""
-        numbers = self.body.linearisation_width + self.factoriser.numbers
-        return max(1, min(self.dynamics.rows, int(CHUNK_BYTES / (8 * numbers))))
+        return max(1, min(self.dynamics.rows, int(CHUNK_BYTES / self._step_bytes)))
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Memory that takes."""
+        return self.chunk * self._step_bytes
+
+    @property
+    def _step_bytes(self) -> int:
+        return 8 * (self.body.linearisation_width + self.factoriser.numbers)
 
     def apply(self, lower: Array, columns: Array) -> Array:
         """Product of a symmetric matrix, given by its lower triangle, on the free dofs."""

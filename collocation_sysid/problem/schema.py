@@ -282,6 +282,9 @@ class SolverSection(Section):
         default=1e-5, ge=0, description="Added to the Hessian at the positions."
     )
     linear_solver: Text = Field(default="mumps", description="IPOPT's linear solver.")
+    factorisation: Literal["auto", "band", "sparse"] = Field(
+        default="auto", description="How reduced-space factorises a timestep's equations."
+    )
     tolerance: Positive = 1e-8
     max_iterations: Whole = Field(default=200, ge=0)
     max_time_s: Positive = 1e6
