@@ -19,7 +19,9 @@ from problems_small import (
     released_cube,
 )
 
+from collocation_sysid.errors import SimulationError
 from collocation_sysid.experiment import Experiment
+from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.interior_point import InteriorPointOptions
 from collocation_sysid.methods.interior_point import solve as interior_point
 from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, memory_mb, solve
@@ -200,6 +202,49 @@ def test_few_starts_far_away_all_succeed():
 
 
 # Ends other than convergence
+
+
+def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
+    def first_only(self: Horizon, q, x, known=None):
+        if not np.array_equal(q, GUESS.guess_q):
+            raise SimulationError("it fails", 0.0)
+        return evaluate(self, q, x, known)
+
+    evaluate = Horizon.evaluate
+    monkeypatch.setattr(Horizon, "evaluate", first_only)
+    solution = solve(cube())
+    assert solution.status is Status.STALLED
+    np.testing.assert_allclose(solution.theta, as_theta(GUESS), rtol=1e-12)
+    assert solution.max_violation_relative < 1e-3
+
+
+def test_rows_that_can_be_simulated_are_solved_first(monkeypatch: pytest.MonkeyPatch):
+    """As long as the parameters are those of the guess, the last rows cannot be reached."""
+
+    def short_at_the_guess(self: Horizon, q, x=None):
+        rows, failure = extend(self, q, x)
+        if np.array_equal(q, GUESS.guess_q) and len(rows[0]) > 12:
+            return [rows[0][:12]], SimulationError("it fails", 0.12)
+        return rows, failure
+
+    extend = Horizon.extend
+    monkeypatch.setattr(Horizon, "extend", short_at_the_guess)
+    collocation = Collocation([measured(hung_cube(30))], GUESS)
+    solution = solve(collocation, ReducedSpaceOptions(ladder=(0.5, 1.0)))
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+
+
+def test_rows_that_stay_out_of_reach_are_a_status(monkeypatch: pytest.MonkeyPatch):
+    def short(self: Horizon, q, x=None):
+        rows, _ = extend(self, q, x)
+        return [rows[0][:12]], SimulationError("it fails", 0.12, 7)
+
+    extend = Horizon.extend
+    monkeypatch.setattr(Horizon, "extend", short)
+    solution = solve(Collocation([measured(hung_cube(30))], GUESS))
+    assert solution.status is Status.NOT_SIMULABLE
+    assert solution.message.endswith("it fails (t = 0.12 s, element 7).")
 
 
 def test_the_iteration_limit_is_a_status():

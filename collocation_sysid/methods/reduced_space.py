@@ -208,9 +208,13 @@ class _Search:
         while True:
             step = self._step(point, curvature)
             length = float(np.abs(step).max(initial=0.0))
-            if length <= tolerance and point.feasibility_m <= FEASIBLE * self.size_m:
+            # A step that the trust region cuts short says nothing about the distance to go.
+            whole = length < 0.99 * self.trust
+            short = whole and length <= tolerance
+            if short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
-            if last and length * min(1.0, length / previous) <= SAFETY * tolerance:
+            rate = min(1.0, length / previous)
+            if last and whole and length * rate <= SAFETY * tolerance:
                 final = point.moved(step)
                 if self._are_feasible(final, point.q + step):
                     self._record(point.q + step, final, point.predicted_loss(step))
@@ -226,9 +230,9 @@ class _Search:
                     curvature = updated(curvature, point, trial)
                 point, rejections, previous = self._accepted(trial), 0, length
                 continue
-            if length <= tolerance and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
+            if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
-            if length <= SMALLEST_TRUST:
+            if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
             self.trust = SHRINK * length
             rejections += 1
@@ -273,7 +277,7 @@ class _Search:
         length = float(np.abs(step).max(initial=0.0))
         if actual > 0.75 * predicted and length > 0.9 * self.trust:
             self.trust = min(2.0 * self.trust, 4.0)
-        elif actual < 0.25 * predicted:
+        elif actual < 0.25 * predicted - noise:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
 
