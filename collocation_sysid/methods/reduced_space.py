@@ -19,317 +19,22 @@ even a rung cannot be simulated as a whole, the rows that can be are solved firs
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
-from ..nlp.factorisation import Choice
 from ..nlp.segment import Segment
-from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver
-from ..results.solution import Iteration, Solution, Status, Timing
-from .horizon import Horizon, Point
+from ..results.solution import Solution, Status, Timing
 from .multipliers import constraint_multipliers
-from .secant import updated, with_curvature
+from .search import ReducedSpaceOptions, Search, Watch
 
 Array = NDArray[np.float64]
-Watch = Callable[[Iteration], None]
 
-
-@dataclass(frozen=True)
-class ReducedSpaceOptions:
-    """Options of the reduced-space method.
-
-    Attributes
-    ----------
-    tolerance : float
-        Largest last step of a parameter's logarithm.
-    max_iterations : int
-        Sweeps over all rungs of the ladder; a rejected trial counts.
-    trust : float
-        First trust region: longest step of a parameter's logarithm.
-    ladder : tuple of float
-        Shares of the recording solved one after another, ending with 1.
-    rung_decrease : float
-        All rungs but the last end when a step promises to lower the loss by less than this share.
-    rung_prior : float
-        On them a prior of this standard deviation of the logarithm holds each parameter near its
-        guess: a short horizon says nothing about some, and would let them run to their bounds.
-    factorisation : {"auto", "band", "sparse"}
-        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
-    """
-
-    tolerance: float = 1e-8
-    max_iterations: int = 200
-    trust: float = 1.0
-    ladder: tuple[float, ...] = (0.25, 0.5, 1.0)
-    rung_decrease: float = 0.05
-    rung_prior: float = 2.3
-    factorisation: Choice = "auto"
-
-
-# Fewest grid rows of a rung.
-MIN_ROWS = 8
-# A trial's infeasibility may be this share of its step's length, or this share of an edge of
-# the mesh: the strain it causes is then small enough for Newton's next step to remove it.
-CONTRACTION, SMALL_STRAIN = 0.5, 0.1
-# Share of the predicted decrease a trial must reach.
-DECREASE = 1e-3
-# Shorter than this over the body's size, feasibility is at rounding; shorter than the second,
-# it is where steps no longer change the parameters and it does not decrease any more.
-FEASIBLE, NEARLY_FEASIBLE = 1e-12, 1e-8
-SMALLEST_TRUST = 1e-10
-# The last step is taken without another sweep when its error, judged by the rate at which steps
-# shrink, is this share of the tolerance, and no equation is violated by more than this in the
-# scaling of the NLP.
-SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
-SHRINK = 0.25
-# Steps shorter than this tell about the curvature at the answer.
-LOCAL = 0.1
-# Doublings of the moduli where not even the first rows can be simulated at the guess.
-STIFFENINGS = 10
-MODULI = ("lambda_pa", "mu_pa", "young_pa")
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
-
-
-class _Search:
-    """The state of a solve: the best point, the trust region, budget, history and notes."""
-
-    def __init__(
-        self, collocation: Collocation, options: ReducedSpaceOptions, watch: Watch | None
-    ) -> None:
-        self.collocation = collocation
-        self.options = options
-        self.watch = watch
-        self.began = time.perf_counter()
-        self.stopwatch = Stopwatch()
-        self.sweeps = 0
-        self.trust = options.trust
-        self.history: list[Iteration] = []
-        self.notes: list[str] = []
-        self.indefinite = 0
-        self.lower, self.upper = collocation.parameters.bounds_q
-        self.q = collocation.parameters.guess_q
-        self.x: list[Array] | None = None
-        self.point: Point | None = None
-        nodes = [segment.body.nodes_m for segment in collocation.segments]
-        self.edge_m = min(segment.length_m for segment in collocation.segments)
-        self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
-
-    # The ladder -------------------------------------------------------------------------------
-
-    def climb(self) -> Status:
-        """Solve rung after rung.
-
-        Raises
-        ------
-        SimulationError
-            Where not even the rows that were reached help to reach more.
-        """
-        status = Status.CONVERGED
-        for share in self.options.ladder:
-            last = share == self.options.ladder[-1]
-            rung = self._horizon(self._rows(share), last)
-            self._reach(rung)
-            status = self._descend(rung, last)
-            if status is Status.ITERATION_LIMIT:
-                break
-        return status
-
-    def _rows(self, share: float) -> list[int]:
-        return [
-            min(segment.grid_rows, max(MIN_ROWS, round(share * segment.grid_rows)))
-            for segment in self.collocation.segments
-        ]
-
-    def _horizon(self, rows: list[int], last: bool) -> Horizon:
-        prior = None if last else self.options.rung_prior
-        return Horizon(self.collocation, rows, prior, self.stopwatch, self.options.factorisation)
-
-    def _reach(self, rung: Horizon) -> None:
-        """Extend the trajectories to a rung's length; where that fails, first solve what is."""
-        furthest = 0
-        while True:
-            known = self.x
-            reached, failure = rung.extend(self.q, known)
-            self.sweeps += 1
-            if failure is None:
-                self.x = reached
-                return
-            rows = [len(x) for x in reached]
-            fewest = min(MIN_ROWS, *rung.rows)
-            if known is None and min(rows) < fewest:
-                self._stiffen(failure)
-                continue
-            if sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
-                raise failure
-            furthest = sum(rows)
-            self.x = reached
-            self._descend(self._horizon(rows, last=False), last=False)
-
-    def _stiffen(self, failure: SimulationError) -> None:
-        """Double the moduli of the guess.
-
-        Raises
-        ------
-        SimulationError
-            The failure, where they cannot be raised further.
-        """
-        names = [item.name for item in self.collocation.parameters.free]
-        moduli = np.array([name in MODULI for name in names], dtype=bool)
-        stiffer = np.minimum(self.q + np.log(2) * moduli, self.upper)
-        started = self.collocation.parameters.guess_q
-        factor = float(np.exp(np.max(stiffer - started, initial=0.0)))
-        if np.allclose(stiffer, self.q) or factor > 1.01 * 2**STIFFENINGS:
-            raise failure
-        self.q = stiffer
-        note = (
-            f"the body cannot be simulated at the guess ({failure}); "
-            f"started from moduli {factor:.3g} times as stiff"
-        )
-        self.notes[:] = [note]
-
-    # One rung ---------------------------------------------------------------------------------
-
-    def _descend(self, rung: Horizon, last: bool) -> Status:
-        """Gauss–Newton steps on one rung until they promise no more."""
-        assert self.x is not None
-        tolerance = self.options.tolerance
-        self.trust = self.options.trust
-        point = self._accepted(rung.evaluate(self.q, self.x, self.point))
-        rejections, curvature = 0, np.zeros((len(point.q), len(point.q)))
-        previous = np.inf
-        while True:
-            step = self._step(point, curvature)
-            length = float(np.abs(step).max(initial=0.0))
-            # A step that the trust region cuts short says nothing about the distance to go.
-            whole = length < 0.99 * self.trust
-            short = whole and length <= tolerance
-            if short and point.feasibility_m <= FEASIBLE * self.size_m:
-                return Status.CONVERGED
-            rate = min(1.0, length / previous)
-            if last and whole and length * rate <= SAFETY * tolerance:
-                final = point.moved(step)
-                if self._are_feasible(final, point.q + step):
-                    self._record(point.q + step, final, point.predicted_loss(step))
-                    return Status.CONVERGED
-            promised = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
-            if not last and promised < self.options.rung_decrease:
-                return Status.CONVERGED
-            if self.sweeps >= self.options.max_iterations:
-                return Status.ITERATION_LIMIT
-            trial = self._try(rung, point, step)
-            if trial is not None and self._is_better(point, step, trial):
-                if last and length <= LOCAL:
-                    curvature = updated(curvature, point, trial)
-                point, rejections, previous = self._accepted(trial), 0, length
-                continue
-            if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
-                return Status.CONVERGED  # rounding keeps it from getting better
-            if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
-                return Status.STALLED
-            self.trust = SHRINK * length
-            rejections += 1
-            if rejections == 2 and point.feasibility_m > SMALL_STRAIN * self.edge_m:
-                point = self._restored(rung, point)
-
-    def _step(self, point: Point, curvature: Array) -> Array:
-        if len(point.q) == 0:
-            return np.zeros(0)
-        low = np.maximum(self.lower - point.q, -self.trust)
-        high = np.minimum(self.upper - point.q, self.trust)
-        # Rounding may leave q on its bound by a hair.
-        low, high = np.minimum(low, 0.0) - 1e-15, np.maximum(high, 0.0) + 1e-15
-        _, triangle = np.linalg.qr(np.column_stack([point.slope, point.residual]))
-        count = len(point.q)
-        slope, right = with_curvature(triangle[:count, :count], triangle[:count, -1], curvature)
-        answer = lsq_linear(slope, -right, (low, high), method="bvls")
-        return np.clip(answer.x, low, high)
-
-    def _try(self, rung: Horizon, point: Point, step: Array) -> Point | None:
-        self.sweeps += 1
-        q = np.clip(point.q + step, self.lower, self.upper)
-        try:
-            trial = rung.evaluate(q, point.moved(step))
-        except SimulationError:
-            return None
-        return trial if trial.finite else None
-
-    def _is_better(self, point: Point, step: Array, trial: Point) -> bool:
-        """Judge a trial, and widen or narrow the trust region after it."""
-        predicted = point.loss - point.predicted_loss(step)
-        actual = point.loss - trial.loss
-        moved_m = max(
-            float(np.abs(after - before).max())
-            for before, after in zip(point.x, trial.x, strict=True)
-        )
-        if trial.feasibility_m > max(CONTRACTION * moved_m, SMALL_STRAIN * self.edge_m):
-            return False
-        noise = 1e-12 * point.loss + 1e-20
-        if actual < DECREASE * predicted - noise:
-            return False
-        length = float(np.abs(step).max(initial=0.0))
-        if actual > 0.75 * predicted and length > 0.9 * self.trust:
-            self.trust = min(2.0 * self.trust, 4.0)
-        elif actual < 0.25 * predicted - noise:
-            self.trust = max(0.5 * length, SMALLEST_TRUST)
-        return True
-
-    def _restored(self, rung: Horizon, point: Point) -> Point:
-        """The point with a simulated trajectory, where that exists."""
-        self.sweeps += 1
-        x, failure = rung.extend(point.q)
-        if failure is not None:
-            return point
-        try:
-            restored = rung.evaluate(point.q, x)
-        except SimulationError:
-            return point
-        return self._accepted(restored) if restored.finite else point
-
-    def _are_feasible(self, x: list[Array], q: Array) -> bool:
-        """Whether trajectories satisfy the equations of motion well within the tolerance."""
-        theta = self.collocation.parameters.theta(q)
-        return all(
-            np.abs(segment.residual_n(x_k, theta)).max() <= FEASIBLE_FORCE * segment.force_n
-            for segment, x_k in zip(self.collocation.segments, x, strict=True)
-        )
-
-    def _accepted(self, point: Point) -> Point:
-        self.point = point
-        self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
-        self._record(point.q, point.x, point.loss, point)
-        return point
-
-    def _record(self, q: Array, x: list[Array], loss: float, point: Point | None = None) -> None:
-        """Make it the answer so far; markers are those after the feasibility step of a point."""
-        self.q, self.x = q, x
-        theta = self.collocation.parameters.theta(q)
-        squares, violation_n = [], 0.0
-        for k, segment in enumerate(self.collocation.segments):
-            tangent = point.tangents[k] if point else None
-            projected = x[k] + tangent.step if tangent else x[k]
-            squares.append(segment.observation.squared_distances_m2(projected))
-            here = tangent.violation_n if tangent else np.abs(segment.residual_n(x[k], theta)).max()
-            violation_n = max(violation_n, float(here))
-        distances = np.concatenate(squares)
-        line = Iteration(
-            number=self.sweeps,
-            loss=loss,
-            rms_m=float(np.sqrt(distances.mean())) if len(distances) else 0.0,
-            violation_n=violation_n,
-            theta=theta,
-            time_s=time.perf_counter() - self.began,
-        )
-        self.history.append(line)
-        if self.watch is not None:
-            self.watch(line)
 
 
 def solve(
@@ -352,7 +57,7 @@ def solve(
     Solution
         With the multipliers of the whole NLP. Also when it did not converge or was interrupted.
     """
-    search = _Search(collocation, options or ReducedSpaceOptions(), watch)
+    search = Search(collocation, options or ReducedSpaceOptions(), watch)
     why = ""
     try:
         status = search.climb()
@@ -391,7 +96,7 @@ def memory_mb(collocation: Collocation) -> float:
     return (8 * numbers + max(chunks)) / 1e6
 
 
-def _whole(collocation: Collocation, search: _Search) -> tuple[Array, Array]:
+def _whole(collocation: Collocation, search: Search) -> tuple[Array, Array]:
     """Variables and multipliers of the whole NLP."""
     x = search.x
     whole = [_filled(s, x[k] if x else None) for k, s in enumerate(collocation.segments)]
@@ -412,7 +117,7 @@ def _filled(segment: Segment, x: Array | None) -> Array:
     return rigid
 
 
-def _notes(collocation: Collocation, search: _Search, z: Array, status: Status) -> list[str]:
+def _notes(collocation: Collocation, search: Search, z: Array, status: Status) -> list[str]:
     notes = []
     if search.indefinite:
         steps = sum(segment.constraint_times for segment in collocation.segments)
