@@ -108,13 +108,22 @@ def solve(
         raise InputError(f"found {name!r}; expected one of {', '.join(METHODS)}", None, "--method")
     chosen = METHODS[name]
     known = {field.name for field in fields(chosen.options)}
-    given = {key: value for key, value in problem.file.solver.model_dump().items() if key in known}
+    in_file = problem.file.solver.model_dump(exclude_unset=True, exclude={"method"})
+    foreign = sorted(set(in_file) - known)
+    if foreign and method is None:
+        raise InputError(
+            f"method {name!r} has no such option; it has {', '.join(sorted(known))}. "
+            "Name the method it belongs to in solver.method",
+            problem.path,
+            f"solver.{foreign[0]}",
+        )
     unknown = sorted(set(options) - known)
     if unknown:
         raise InputError(f"no option {unknown[0]!r}; {name} has {', '.join(sorted(known))}")
+    given = {key: value for key, value in in_file.items() if key in known} | options
     try:
         collocation = build_collocation(problem)
-        solution = chosen.solve(collocation, chosen.options(**(given | options)), watch)
+        solution = chosen.solve(collocation, chosen.options(**given), watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:

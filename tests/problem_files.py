@@ -37,6 +37,9 @@ mu_pa       = { guess = 200.0, lower = 10.0, upper = 1e5 }
 gamma_r_s   = { guess = 0.02, lower = 1e-5, upper = 1.0 }
 gamma_m_1_s = { guess = 0.5, lower = 1e-3, upper = 100.0 }
 
+[solver]
+method = "interior-point"
+
 [rollout]
 integrator = "scheme"
 """

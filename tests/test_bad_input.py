@@ -100,7 +100,7 @@ PROBLEM_FILE = [
     bad("binary", "problem.toml", "not a text", edit=write("problem.toml", b"\xff\xfe\x00\x01")),
     bad("empty", "object", "missing", "2 more to mend", edit=write("problem.toml", "")),
     bad(
-        "syntax", "problem.toml: line 17", "closing quote", 'name = "swing',
+        "syntax", "problem.toml: line 20", "closing quote", 'name = "swing',
         edit=replace_text('name = "swing"', 'name = "swing'),
     ),
     bad(

@@ -432,6 +432,23 @@ def test_options_of_the_method_are_given_by_name(tiny):
         cs.solve(problem, "newton")
 
 
+def test_reduced_space_is_the_method_unless_another_is_named(tiny):
+    text = Path("problem.toml").read_text()
+    Path("problem.toml").write_text(text.replace('method = "interior-point"', ""))
+    named = cs.solve(cs.load_problem("problem.toml"), "interior-point")
+    default = cs.solve(cs.load_problem("problem.toml"))
+    assert default.method == "reduced-space"
+    np.testing.assert_allclose(default.theta, named.theta, rtol=1e-5)
+
+
+def test_an_option_of_another_method_is_refused_in_the_file_but_not_beside_a_named_method(tiny):
+    overrides = ["solver.method=reduced-space", "solver.linear_solver=mumps"]
+    problem = cs.load_problem("problem.toml", overrides)
+    with pytest.raises(cs.InputError, match=r"solver\.linear_solver.*'reduced-space' has no such"):
+        cs.solve(problem)
+    assert cs.solve(problem, "reduced-space").status.converged
+
+
 def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):
     read = cs.TetMesh.read(tiny_problem / "body.vtu")
     mesh = cs.TetMesh(read.points_m, read.tetrahedra)

@@ -271,7 +271,7 @@ def _ipopt_value(value: Any) -> Any:
 class SolverSection(Section):
     """The method and its options."""
 
-    method: MethodName = "interior-point"
+    method: MethodName = "reduced-space"
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
     warm_up: float = Field(
         default=0.1,

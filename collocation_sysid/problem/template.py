@@ -42,7 +42,7 @@ scheme = "midpoint"            # or "bdf2", "backward-euler"
 substeps = 1                   # grid steps between samples
 
 [solver]
-method = "interior-point"
+method = "reduced-space"       # or "interior-point", which needs no simulable guess
 
 # [rollout]                    # the forward simulation that checks the answer
 # timestep_s = 0.002
