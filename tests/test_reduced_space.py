@@ -21,10 +21,11 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.experiment import Experiment
-from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.horizon import Horizon, Point
 from collocation_sysid.methods.interior_point import InteriorPointOptions
 from collocation_sysid.methods.interior_point import solve as interior_point
 from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, memory_mb, solve
+from collocation_sysid.methods.secant import updated, with_curvature
 from collocation_sysid.methods.start import carried_rigidly
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
@@ -291,6 +292,33 @@ def test_a_misfit_far_above_the_noise_is_noted():
     solution = solve(Collocation([shifted], GUESS))
     assert "of their standard deviations" in solution.notes[-1]
     assert not solved_cube().notes
+
+
+# The curvature that Gauss–Newton leaves out
+
+
+def point_of(q: np.ndarray, rng_seed: int = 0) -> Point:
+    """Residuals (q - 1)² of every entry, scaled, and their slopes."""
+    weights = np.random.default_rng(rng_seed).uniform(1, 2, len(q))
+    return Point(q, [], [], weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1)))
+
+
+def test_the_learned_curvature_explains_the_last_step():
+    before, after = point_of(np.array([2.0, 3.0])), point_of(np.array([2.1, 3.2]))
+    b = updated(np.zeros((2, 2)), before, after)
+    missing = (after.slope - before.slope).T @ after.residual
+    np.testing.assert_allclose(b @ (after.q - before.q), missing)
+    np.testing.assert_allclose(b, b.T)
+
+
+def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
+    triangle, right = np.triu(rng.normal(size=(4, 4))) + 3 * np.eye(4), rng.normal(size=4)
+    b = rng.normal(size=(4, 4))
+    b += b.T
+    joined, joined_right = with_curvature(triangle, right, b)
+    np.testing.assert_allclose(joined.T @ joined, triangle.T @ triangle + b, atol=1e-12)
+    np.testing.assert_allclose(joined.T @ joined_right, triangle.T @ right, atol=1e-12)
+    assert with_curvature(triangle, right, -100 * np.eye(4))[0] is triangle
 
 
 # History and timing
