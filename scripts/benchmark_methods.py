@@ -67,6 +67,7 @@ class Row:
     status: str
     iterations: int
     simulation_s: float
+    build_s: float
     evaluations_s: float
     linear_algebra_s: float
     total_s: float
@@ -118,7 +119,9 @@ def measure(mesh: str, steps: int, method: str) -> Row:
     began = time.perf_counter()
     simulate(experiment, TRUTH, "midpoint")
     simulation_s = time.perf_counter() - began
+    began = time.perf_counter()
     collocation = Collocation([experiment], PARAMETERS)
+    build_s = time.perf_counter() - began
     experiment.body.linearise(experiment.body.nodes_m, 0 * experiment.body.nodes_m, TRUTH)
     chosen = METHODS[method]
     began = time.perf_counter()
@@ -135,6 +138,7 @@ def measure(mesh: str, steps: int, method: str) -> Row:
         status=solution.status.value,
         iterations=solution.iterations,
         simulation_s=simulation_s,
+        build_s=build_s + solution.timing.build,
         evaluations_s=solution.timing.evaluations,
         linear_algebra_s=solution.timing.linear_algebra,
         total_s=total_s,
@@ -154,7 +158,8 @@ def show(row: Row) -> None:
     print(
         f"{row.method:15s} {row.nodes:5d} nodes {row.steps:5d} steps  {row.status:10s} "
         f"{row.iterations:3d} iterations  total {row.total_s:8.2f} s "
-        f"(evaluations {row.evaluations_s:.2f}, linear algebra {row.linear_algebra_s:.2f})  "
+        f"(build {row.build_s:.2f}, evaluations {row.evaluations_s:.2f}, "
+        f"linear algebra {row.linear_algebra_s:.2f})  "
         f"simulation {row.simulation_s:.2f} s  {row.us_per_node_and_step:8.1f} µs/node/step  "
         f"{row.peak_mb:6.0f} MB  KKT {row.kkt_residual:.1e}  θ error {row.theta_error:.1e}",
         flush=True,
