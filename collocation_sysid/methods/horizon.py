@@ -16,6 +16,7 @@ from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver, Tangent
+from .robust import huberised
 
 Array = NDArray[np.float64]
 
@@ -83,6 +84,8 @@ class Horizon:
         Standard deviation of a prior that holds q near the guess.
     stopwatch : Stopwatch, optional
     factorisation : {"auto", "band", "sparse"}
+    huber : float, optional
+        Threshold of Huber's loss, in standard deviations; squared without it.
     """
 
     def __init__(
@@ -92,8 +95,10 @@ class Horizon:
         prior: float | None = None,
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
+        huber: float | None = None,
     ) -> None:
         self.collocation = collocation
+        self.huber = huber
         self.rows = list(rows)
         self.prior = prior
         self.stopwatch = stopwatch or Stopwatch()
@@ -120,6 +125,8 @@ class Horizon:
             tangent = solver.forward(x_k, theta, theta_q, first)
             observation = solver.segment.observation
             residual, slope = observation.linearised(x_k, tangent.step, tangent.by_q)
+            if self.huber is not None:
+                residual, slope = huberised(residual, slope, self.huber)
             tangents.append(tangent)
             residuals.append(residual)
             slopes.append(slope)

@@ -101,7 +101,13 @@ def _whole(collocation: Collocation, search: Search) -> tuple[Array, Array]:
     x = search.x
     whole = [_filled(s, x[k] if x else None) for k, s in enumerate(collocation.segments)]
     z = collocation.pack(search.q, whole)
-    if x and all(len(a) == s.grid_rows for a, s in zip(x, collocation.segments, strict=True)):
+    # With Huber's loss the multipliers of the squared one would mean nothing.
+    squared = search.options.huber is None
+    if (
+        squared
+        and x
+        and all(len(a) == s.grid_rows for a, s in zip(x, collocation.segments, strict=True))
+    ):
         try:
             return z, constraint_multipliers(collocation, z, search.stopwatch)
         except SimulationError:
@@ -119,6 +125,10 @@ def _filled(segment: Segment, x: Array | None) -> Array:
 
 def _notes(collocation: Collocation, search: Search, z: Array, status: Status) -> list[str]:
     notes = []
+    if search.options.huber is not None:
+        notes.append(
+            "fitted with Huber's loss: error bars and KKT residual are those of the squared loss"
+        )
     if search.indefinite:
         steps = sum(segment.constraint_times for segment in collocation.segments)
         notes.append(

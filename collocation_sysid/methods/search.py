@@ -5,21 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from ..errors import SimulationError
+from ..errors import InputError, SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.stopwatch import Stopwatch
 from ..results.solution import Iteration, Status
+from .curvature import exact_curvature
 from .horizon import Horizon, Point
 from .secant import updated, with_curvature
 
 Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
+
+
+Hessian = Literal["gauss-newton", "exact"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,12 @@ class ReducedSpaceOptions:
     rung_prior : float
         On them a prior of this standard deviation of the logarithm holds each parameter near its
         guess: a short horizon says nothing about some, and would let them run to their bounds.
+    hessian : {"gauss-newton", "exact"}
+        Near the answer, what Gauss–Newton leaves out is learned from the steps, or computed
+        exactly from the Lagrangian: a second sweep an iteration, for large residuals.
+    huber : float or None
+        Samples farther from their markers than this many standard deviations count linearly
+        instead of squared (Huber's loss, by reweighting); all squared by default.
     factorisation : {"auto", "band", "sparse"}
         Banded Cholesky, SuperLU, or whichever is estimated to cost less.
     """
@@ -51,6 +62,8 @@ class ReducedSpaceOptions:
     ladder: tuple[float, ...] = (0.25, 0.5, 1.0)
     rung_decrease: float = 0.05
     rung_prior: float = 2.3
+    hessian: Hessian = "gauss-newton"
+    huber: float | None = None
     factorisation: Choice = "auto"
 
 
@@ -83,6 +96,13 @@ class Search:
     def __init__(
         self, collocation: Collocation, options: ReducedSpaceOptions, watch: Watch | None
     ) -> None:
+        if options.hessian not in get_args(Hessian):
+            known = ", ".join(get_args(Hessian))
+            raise InputError(f"no hessian {options.hessian!r}; available: {known}", None, "solver")
+        if options.huber is not None and not options.huber > 0:
+            raise InputError(
+                f"huber = {options.huber:g}, expected a positive number", None, "solver"
+            )
         self.collocation = collocation
         self.options = options
         self.watch = watch
@@ -129,7 +149,10 @@ class Search:
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         prior = None if last else self.options.rung_prior
-        return Horizon(self.collocation, rows, prior, self.stopwatch, self.options.factorisation)
+        options = self.options
+        return Horizon(
+            self.collocation, rows, prior, self.stopwatch, options.factorisation, options.huber
+        )
 
     def _reach(self, rung: Horizon) -> None:
         """Extend the trajectories to a rung's length; where that fails, first solve what is."""
@@ -206,7 +229,7 @@ class Search:
             trial = self._try(rung, point, step)
             if trial is not None and self._is_better(point, step, trial):
                 if last and length <= LOCAL:
-                    curvature = updated(curvature, point, trial)
+                    curvature = self._curvature(curvature, point, trial)
                 point, rejections, previous = self._accepted(trial), 0, length
                 continue
             if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
@@ -217,6 +240,12 @@ class Search:
             rejections += 1
             if rejections == 2 and point.feasibility_m > SMALL_STRAIN * self.edge_m:
                 point = self._restored(rung, point)
+
+    def _curvature(self, curvature: Array, before: Point, after: Point) -> Array:
+        """What Gauss–Newton leaves out at `after`, the secant's or the exact."""
+        if self.options.hessian == "exact" and self.options.huber is None:
+            return exact_curvature(self.collocation, after, self.stopwatch)
+        return updated(curvature, before, after)
 
     def _step(self, point: Point, curvature: Array) -> Array:
         if len(point.q) == 0:

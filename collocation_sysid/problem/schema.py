@@ -282,6 +282,9 @@ class SolverSection(Section):
         default=1e-5, ge=0, description="Added to the Hessian at the positions."
     )
     linear_solver: Text = Field(default="mumps", description="IPOPT's linear solver.")
+    huber: Positive | None = Field(
+        default=None, description="Threshold of Huber's loss in sigmas, for reduced-space."
+    )
     factorisation: Literal["auto", "band", "sparse"] = Field(
         default="auto", description="How reduced-space factorises a timestep's equations."
     )
