@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from .methods.reduced_space import memory_mb
@@ -109,12 +108,7 @@ def _derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float
     def lagrangian_gradient(at: Array) -> Array:
         return collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
 
-    indptr, indices = collocation.hessian_structure
-    upper = sp.csc_array(
-        (collocation.hessian_values(point, 1.0, multipliers), indices, indptr),
-        shape=(len(z), len(z)),
-    )
-    hessian = upper + sp.triu(upper, 1).T
+    hessian = collocation.hessian(point, 1.0, multipliers)
     return (
         _deviation(
             collocation.constraint_values, collocation.jacobian(point) @ direction, point, direction

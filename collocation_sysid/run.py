@@ -359,10 +359,9 @@ def _fit(solution: Solution) -> dict[str, Any]:
     segments = solution.collocation.segments
     for segment, positions in zip(segments, solution.positions_m, strict=True):
         markers = segment.experiment.markers
-        predicted = markers.observe(positions[segment.observation.grid_rows])
-        distances = np.linalg.norm(predicted - markers.positions_m, axis=2)[markers.present]
+        squares = segment.observation.squared_distances_m2(positions)
         experiments[segment.experiment.name] = {
-            "rms_m": float(np.sqrt(np.mean(distances**2))),
+            "rms_m": float(np.sqrt(squares.mean())),
             "samples": markers.samples,
             "missing": int(markers.missing.sum()),
         }

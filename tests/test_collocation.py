@@ -13,7 +13,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.batched.combine import combine_with_numpy
 from collocation_sysid.nlp import block_band
-from collocation_sysid.nlp.collocation import Collocation, marker_distances_m
+from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
@@ -324,7 +324,7 @@ def test_the_loss_counts_present_samples_only():
     assert collocation.measurements == 3 * present.sum()
     expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurements
     assert collocation.objective(z) == pytest.approx(expected)
-    np.testing.assert_allclose(marker_distances_m(segment, x), np.sqrt(squares[present]))
+    np.testing.assert_allclose(segment.observation.squared_distances_m2(x), squares[present])
     assert collocation.rms_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
 
 

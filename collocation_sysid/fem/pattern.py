@@ -34,7 +34,7 @@ class SymmetricPattern:
     @classmethod
     def of_cells(cls, cells: Index, nodes: int) -> SymmetricPattern:
         """The pattern of a stiffness matrix on the mesh."""
-        dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(len(cells), -1)
+        dofs = dofs_of(cells)
         row = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
         column = np.tile(dofs, dofs.shape[1]).ravel()
         lower = row >= column
@@ -77,6 +77,11 @@ class SymmetricPattern:
         return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
 
 
+def dofs_of(nodes: Index) -> Index:
+    """Degrees of freedom 3i, 3i + 1, 3i + 2 of each node i of the last axis: (…, k) to (…, 3k)."""
+    return (3 * nodes[..., None] + np.arange(3)).reshape(*nodes.shape[:-1], -1)
+
+
 def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index, Index]:
     """Where an element's vector and lower-triangle entries go.
 
@@ -87,7 +92,7 @@ def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index
     lower : (E, 3·nodes·(3·nodes + 1)/2) ndarray
         Position in `pattern` of each local lower-triangle entry, column after column.
     """
-    dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(len(cells), -1)
+    dofs = dofs_of(cells)
     size = dofs.shape[1]
     local_columns, local_rows = np.triu_indices(size)
     return dofs, pattern.position(dofs[:, local_rows], dofs[:, local_columns])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..nlp.collocation import Collocation
@@ -30,15 +29,12 @@ def exact_curvature(
     projected = [x + tangent.step for x, tangent in zip(point.x, point.tangents, strict=True)]
     z = collocation.pack(point.q, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)
-    indptr, indices = collocation.hessian_structure
-    values = collocation.hessian_values(z, 0.0, multipliers)
-    upper = sp.csc_array((values, indices, indptr), shape=(len(z), len(z)))
     directions = np.column_stack(
         [
             collocation.pack(unit, [tangent.by_q[..., k] for tangent in point.tangents])
             for k, unit in enumerate(np.eye(len(point.q)))
         ]
     )
-    image = upper @ directions + sp.triu(upper, 1).T @ directions
-    reduced = directions.T @ image / (2 * collocation.loss_scale)
+    hessian = collocation.hessian(z, 0.0, multipliers)
+    reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
     return (reduced + reduced.T) / 2

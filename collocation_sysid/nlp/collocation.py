@@ -288,14 +288,18 @@ class Collocation:
         slope = self.gradient(z) + jacobian.T @ multipliers
         lower, upper = self.bounds()
         slope[lower == upper] = 0
-        near = 1e-6
-        slope[: self.nq][(z - lower)[: self.nq] < near] = np.minimum(
-            slope[: self.nq][(z - lower)[: self.nq] < near], 0
-        )
-        slope[: self.nq][(upper - z)[: self.nq] < near] = np.maximum(
-            slope[: self.nq][(upper - z)[: self.nq] < near], 0
-        )
+        near, of_q, by_q = 1e-6, slice(self.nq), slope[: self.nq]
+        at_lower, at_upper = (z - lower)[of_q] < near, (upper - z)[of_q] < near
+        by_q[at_lower] = np.minimum(by_q[at_lower], 0)
+        by_q[at_upper] = np.maximum(by_q[at_upper], 0)
         return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
+
+    def hessian(self, z: Array, loss_weight: float, multipliers: Array) -> sp.csc_array:
+        """∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse matrix."""
+        indptr, indices = self.hessian_structure
+        values = self.hessian_values(z, loss_weight, multipliers)
+        upper = sp.csc_array((values, indices, indptr), shape=(len(z), len(z)))
+        return sp.csc_array(upper + sp.triu(upper, 1).T)
 
     # Reading a point --------------------------------------------------------------------------
 
@@ -340,19 +344,10 @@ class Collocation:
         _, positions = self.unpack(z)
         squares = samples = 0.0
         for segment, x in zip(self.segments, positions, strict=True):
-            squares += float(np.sum(marker_distances_m(segment, x) ** 2))
+            squares += float(segment.observation.squared_distances_m2(x).sum())
             samples += segment.experiment.markers.samples
         return float(np.sqrt(squares / max(1.0, samples)))
 
     def theta(self, z: Array) -> Theta:
         """Physical parameters of z."""
         return self.parameters.theta(z[: self.nq])
-
-
-def marker_distances_m(segment: Segment, x: Array) -> Array:
-    """Distance of every present sample from its prediction, missing ones left out."""
-    markers = segment.experiment.markers
-    rows = x[segment.observation.grid_rows]
-    predicted = markers.observe(rows.reshape(len(rows), -1, 3))
-    distances = np.linalg.norm(predicted - markers.positions_m, axis=2)
-    return distances[markers.present]

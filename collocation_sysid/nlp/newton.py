@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
+from ..fem.pattern import dofs_of
 from .factorisation import Factor, Factoriser
 from .stopwatch import Stopwatch
 
@@ -71,8 +72,8 @@ class Solver:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         self.options = options or NewtonOptions()
-        self.free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
-        self.held = (3 * experiment.held_nodes[:, None] + np.arange(3)).ravel()
+        self.free = dofs_of(experiment.free_nodes)
+        self.held = dofs_of(experiment.held_nodes)
         self.factoriser = Factoriser.of(self.body.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 

@@ -35,7 +35,7 @@ class Observation:
         return 3 * self.markers.samples
 
     @cached_property
-    def _weights(self) -> Array:
+    def weights(self) -> Array:
         """(T, 3M) of 1/σ, zero where a sample is missing."""
         weights = self.markers.present / self.markers.sigma_m
         return np.repeat(weights, 3, axis=1)
@@ -48,7 +48,7 @@ class Observation:
     def residuals(self, x: Array) -> Array:
         """(T, 3M) of (h(x_t) − ŷ_t) / σ at grid positions x (N, 3n); zero where missing."""
         predicted = (self.markers.operator @ x[self.grid_rows].T).T
-        return (predicted - self._measured) * self._weights
+        return (predicted - self._measured) * self.weights
 
     def linearised(self, x: Array, step: Array, by_q: Array) -> tuple[Array, Array]:
         """Residuals after a step of the positions, and their derivative by q.
@@ -66,12 +66,12 @@ class Observation:
         """
         rows = self.grid_rows[self.grid_rows < len(x)]
         count, operator = len(rows), self.markers.operator
-        weights = self._weights[:count]
+        weights = self.weights[:count]
         predicted = (operator @ (x[rows] + step[rows]).T).T
         residual = (predicted - self._measured[:count]) * weights
         _, dofs, nq = by_q.shape
         columns = by_q[rows].transpose(1, 0, 2).reshape(dofs, count * nq)
-        slope = (operator @ columns).reshape(self._weights.shape[1], count, nq).transpose(1, 0, 2)
+        slope = (operator @ columns).reshape(self.weights.shape[1], count, nq).transpose(1, 0, 2)
         return residual.ravel(), (slope * weights[..., None]).reshape(residual.size, nq)
 
     def squared_distances_m2(self, x: Array) -> Array:
@@ -88,7 +88,7 @@ class Observation:
     def gradient(self, x: Array) -> Array:
         """∂L/∂x, (N, 3n)."""
         gradient = np.zeros_like(x)
-        weighted = 2 * self.residuals(x) * self._weights
+        weighted = 2 * self.residuals(x) * self.weights
         gradient[self.grid_rows] = (self.markers.operator.T @ weighted.T).T
         return gradient
 
@@ -108,4 +108,4 @@ class Observation:
         rows, positions, products = (np.concatenate(part) for part in zip(*per_row, strict=True))
         places, index = np.unique(positions, return_inverse=True)
         spread = sp.csr_array((products, (index, rows)), shape=(len(places), count))
-        return places, 2 * (spread @ (self._weights**2).T).T
+        return places, 2 * (spread @ (self.weights**2).T).T

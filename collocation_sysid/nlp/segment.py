@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..experiment.experiment import Experiment
+from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
 from .dynamics import Dynamics
 from .observation import Observation
@@ -63,8 +64,8 @@ class Segment:
         )
         self.explicit_grasps = explicit_grasps
         self.dofs = self.body.pattern.size
-        self.free_dofs = _dofs_of(experiment.free_nodes)
-        self.held_dofs = _dofs_of(experiment.held_nodes)
+        self.free_dofs = dofs_of(experiment.free_nodes)
+        self.held_dofs = dofs_of(experiment.held_nodes)
         self.held_positions = experiment.held_positions(grid).reshape(len(grid), -1)
         self.row_dofs = np.arange(self.dofs) if explicit_grasps else self.free_dofs
         self.rows_per_time = len(self.row_dofs)
@@ -322,10 +323,6 @@ class Segment:
                 value = value + a[row] * forces.by_position[0, diagonal]
                 value = value + b[row] * forces.by_velocity[0, diagonal]
         return float(np.abs(value[self.free_dofs]).mean())
-
-
-def _dofs_of(nodes: Index) -> Index:
-    return (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
 def _ahead(values: Array, steps: int) -> Array:

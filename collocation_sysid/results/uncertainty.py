@@ -178,8 +178,7 @@ def _information(collocation: Collocation, marker_z: Sequence[Array]) -> Array:
     nq = collocation.nq
     total = np.zeros((nq, nq))
     for segment, by_q in zip(collocation.segments, marker_z, strict=True):
-        markers = segment.experiment.markers
-        weights = np.repeat(markers.present / markers.sigma_m, 3, axis=1)
+        weights = segment.observation.weights
         rows = (by_q * weights[..., None]).reshape(weights.size, nq)
         total += rows.T @ rows
     return total

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.sparse as sp
 
+from ..pattern import dofs_of
 from .batch import Array, Batch
 
 
@@ -21,8 +22,7 @@ class CasadiEvaluator:
             f"{kernel.function.name()}_map", "serial", count * points, [self._theta_slot], []
         )
         self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
-        dofs = 3 * batch.cells[:, :, None] + np.arange(3)
-        self._dofs = np.repeat(dofs.reshape(count, -1), points, axis=0).T
+        self._dofs = np.repeat(dofs_of(batch.cells), points, axis=0).T
         destinations = np.repeat(batch.destinations, points, axis=0).ravel()
         self._sum = sp.csr_array(
             (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
