@@ -18,6 +18,7 @@ from .results.uncertainty import Estimate
 from .run import Rollout, Run
 
 SHOWN_ITERATIONS = 12
+SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 UNITS = {
     "lambda_pa": ("λ", "Pa"),
     "mu_pa": ("μ", "Pa"),
@@ -174,20 +175,128 @@ def _verdict(finished: Run) -> list[Text]:
 
 
 def check_table(findings: Findings) -> RenderableType:
-    """The findings of a check on one screen."""
-    table = Table("", "", show_header=False, box=None, pad_edge=False)
-    for name, value in findings.as_dict().items():
-        if name != "notes":
-            table.add_row(name.replace("_", " "), _value(value))
-    notes = [Text(f"note: {note}") for note in findings.notes]
+    """The findings of a check on one screen, warnings last."""
     good = findings.derivatives_agree
     verdict = "The problem is valid and the derivatives agree." if good else (
         "The derivatives do not agree with differences at the guess."
     )  # fmt: skip
-    return Group(table, *notes, Text(verdict, style="green" if good else "red"))
+    return Group(
+        _body_section(findings),
+        *_motion_section(findings),
+        _measurements_section(findings),
+        _solve_section(findings),
+        Text(""),
+        *_sentences("note", findings.notes, "default"),
+        *_sentences("warning", findings.warnings, "yellow"),
+        Text(verdict, style="green" if good else "red"),
+    )
 
 
-def _value(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+def _section(title: str, rows: dict[str, str]) -> RenderableType:
+    table = Table.grid(padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows.items():
+        table.add_row(Text(f"  {name}"), Text(value))
+    return Group(Text(title, style="bold"), table)
+
+
+def _sentences(kind: str, sentences: tuple[str, ...], style: str) -> list[RenderableType]:
+    table = Table.grid(padding=(0, 1, 0, 0))
+    for sentence in sentences:
+        table.add_row(Text(f"{kind}:", style=style), Text(sentence, style=style))
+    return [table] if sentences else []
+
+
+def _body_section(findings: Findings) -> RenderableType:
+    size = " × ".join(f"{1e3 * x:.4g}" for x in findings.size_m)
+    low, mean, high = (1e3 * x for x in findings.edges_m)
+    worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in findings.worst_elements)
+    guess = findings.guess
+    return _section(
+        "Body",
+        {
+            "object": f"{size} mm, {1e6 * findings.volume_m3:.4g} cm³, "
+            f"{1e3 * findings.mass_kg:.4g} g",
+            "mesh": f"{findings.nodes:,} nodes, {findings.elements:,} {findings.element}; edges "
+            f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
+            "quality": f"median {findings.median_element_quality:.2f}, worst in elements {worst}",
+            "guess": f"E {guess['young_pa']:.4g} Pa, ν {guess['poisson']:.3g}, "
+            f"γ_r {guess['gamma_r_s']:.3g} s, γ_m {guess['gamma_m_1_s']:.3g} 1/s",
+        },
+    )
+
+
+def _motion_section(findings: Findings) -> list[RenderableType]:
+    motion, *others = findings.motions
+    title = f"Modes of '{motion.experiment}' about its {motion.about} (they depend on the guess)"
+    heads = ("  Hz", "samples/period", "steps/period", "damping", "scheme adds", "period error")
+    table = Table(*heads, box=None, pad_edge=False)
+    for column in table.columns:
+        column.justify = "right"
+    for mode in motion.modes[:SHOWN_MODES]:
+        table.add_row(
+            f"{mode.frequency_hz:.3g}",
+            f"{mode.samples_per_period:.1f}",
+            f"{mode.steps_per_period:.1f}",
+            f"{mode.damping_ratio:.2g}",
+            f"{mode.numerical_damping_ratio:.2g}",
+            f"{mode.period_error:+.1%}",
+        )
+    firsts = [f"'{m.experiment}' {m.first.frequency_hz:.3g} Hz" for m in others if m.first]
+    more = [Text(f"  first modes elsewhere: {_listed(firsts)}")] if firsts else []
+    return [Text(title, style="bold"), table, *more]
+
+
+def _measurements_section(findings: Findings) -> RenderableType:
+    rows = {}
+    for recording in findings.recordings[:SHOWN_RECORDINGS]:
+        far, lost = recording.farthest, recording.least_seen
+        missing = (
+            f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"
+            if recording.missing
+            else "none missing"
+        )
+        kind = ", validation" if recording.validation else ""
+        rows[f"'{recording.experiment}'"] = (
+            f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz: {recording.frames} × "
+            f"{len(recording.markers)} markers, {missing}; farthest from the body "
+            f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm{kind}"
+        )
+    if len(findings.recordings) > SHOWN_RECORDINGS:
+        rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+    rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
+    return _section("Measurements", rows)
+
+
+def _solve_section(findings: Findings) -> RenderableType:
+    rows = {
+        "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
+        f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
+    }
+    for cost in findings.costs:
+        chosen = ", chosen" if cost.method == findings.method else ""
+        rows[cost.method] = f"about {_duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"
+    rows["derivatives"] = (
+        f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
+        f"{findings.hessian_error:.0e} of differences"
+    )
+    return _section("Solve", rows)
+
+
+def _duration(time_s: float | None) -> str:
+    if time_s is None:
+        return "an unknown time"
+    for unit, seconds in (("h", 3600), ("min", 60)):
+        if time_s >= 2 * seconds:
+            return f"{time_s / seconds:.2g} {unit}"
+    return f"{time_s:.1g} s" if time_s < 10 else f"{time_s:.0f} s"
+
+
+def _memory(memory_mb: float) -> str:
+    return f"{memory_mb / 1e3:.2g} GB" if memory_mb >= 1e3 else f"{memory_mb:.0f} MB"
+
+
+def _listed(items: list[str]) -> str:
+    shown = ", ".join(items[:SHOWN_RECORDINGS])
+    return shown if len(items) <= SHOWN_RECORDINGS else f"{shown}, …"

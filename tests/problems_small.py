@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Experiment, Grasp, Markers, PoseSequence, place_markers
+from collocation_sysid.experiment import (
+    Experiment,
+    Force,
+    Grasp,
+    Markers,
+    Nuisance,
+    PointMass,
+    PoseSequence,
+    place_markers,
+)
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.parameters import Parameter, Parameters
@@ -29,9 +39,13 @@ EDGE_M = 0.1
 
 
 @cache
-def box(size_m: tuple[float, ...] = (EDGE_M,) * 3, divisions: tuple[int, ...] = (2, 2, 2)) -> Body:
+def box(
+    size_m: tuple[float, ...] = (EDGE_M,) * 3,
+    divisions: tuple[int, ...] = (2, 2, 2),
+    element: str = "tet4",
+) -> Body:
     """A foam box with a corner at the origin; bodies are shared, their kernels compile once."""
-    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0)
+    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=element)
 
 
 def nodes_where(body: Body, axis: int, value_m: float) -> np.ndarray:
@@ -107,11 +121,48 @@ def cube_with_gaps(steps: int = 12) -> Experiment:
     return _experiment("cube with gaps", hung.body, hung.t_s, hung.grasps, unmeasured)
 
 
+def quadratic_bar(steps: int = 10) -> Experiment:
+    """A bar of quadratic elements held at one end, seen at nodes on edges and inside elements."""
+    body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), "tet10"), times(steps)
+    grasp = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
+    points = np.vstack([body.nodes_m[-4:], [[0.13, 0.01, 0.02], [0.14, 0.03, 0.04]]])
+    return _experiment("quadratic bar", body, t_s, (grasp,), point_markers(body, points, t_s))
+
+
+def bar_let_go(steps: int = 10) -> Experiment:
+    """A bar held at both ends; one hand lets go, later a mass joins there and a force pulls."""
+    bar = bar_in_two_hands(steps)
+    still, moving = bar.grasps
+    end, dt = moving.nodes, bar.timestep_s
+    return replace(
+        bar,
+        name="bar let go",
+        grasps=(still, replace(moving, until_s=2 * dt)),
+        masses=(PointMass(end, 0.004), PointMass(end[:2], 0.003, from_s=3 * dt)),
+        forces=(Force(end[-1:], [[0, 0, 0], [0, 0.02, 0.01]], [0.0, steps * dt]),),
+    )
+
+
+def cube_with_unknowns(steps: int = 10) -> Experiment:
+    """The hung cube with everything estimated that an experiment may not know of itself."""
+    unknown = Nuisance(
+        marker_offset_m=0.002,
+        time_shift_s=0.003,
+        pose_turn_rad=0.02,
+        pose_shift_m=0.002,
+        gravity_rad=0.03,
+    )
+    return replace(hung_cube(steps), name="cube with unknowns", nuisance=unknown)
+
+
 SMALL_EXPERIMENTS = {
     "hung-cube": hung_cube,
     "released-cube": released_cube,
     "bar-in-two-hands": bar_in_two_hands,
     "cube-with-gaps": cube_with_gaps,
+    "quadratic-bar": quadratic_bar,
+    "bar-let-go": bar_let_go,
+    "cube-with-unknowns": cube_with_unknowns,
 }
 
 

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from checks import assert_derivative, relative_error
-from problems_small import GUESS, TRUTH, bar_in_two_hands, cube_with_gaps, hung_cube, measured
+from problems_small import (
+    GUESS,
+    TRUTH,
+    bar_in_two_hands,
+    bar_let_go,
+    cube_with_gaps,
+    cube_with_unknowns,
+    hung_cube,
+    measured,
+)
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment
+from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.fem.batched.combine import combine_with_numpy
 from collocation_sysid.nlp import block_band
 from collocation_sysid.nlp.collocation import Collocation
@@ -63,7 +72,14 @@ def some_point(collocation: Collocation, seed: int = 1) -> np.ndarray:
         rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
     q = collocation.parameters.guess_q
-    return collocation.pack(q + 0.1 * rng.normal(size=q.shape), positions)
+    own = [0.5 * rng.normal(size=segment.local.size) for segment in collocation.segments]
+    return collocation.pack(q + 0.1 * rng.normal(size=q.shape), positions, own)
+
+
+def seen_with_gaps(experiment: Experiment) -> Experiment:
+    tracks = measured(experiment).markers.positions_m.copy()
+    tracks[np.random.default_rng(3).random(tracks.shape[:2]) < 0.3] = np.nan
+    return with_markers(experiment, tracks)
 
 
 def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
@@ -99,6 +115,11 @@ def assert_derivatives(collocation: Collocation, rng: np.random.Generator) -> No
         only_q = np.concatenate([np.ones(collocation.nq), np.zeros(len(z) - collocation.nq)])
         assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_q)
         assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_q)
+    if collocation.own:
+        only_own = np.concatenate([np.zeros(len(z) - collocation.own), np.ones(collocation.own)])
+        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_own)
+        if any(len(segment.local.moving) for segment in collocation.segments):
+            assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_own)
 
 
 # Derivatives
@@ -122,6 +143,39 @@ def test_derivatives_in_other_parametrisations(parameters: Parameters, rng):
 def test_derivatives_of_several_experiments(rng):
     experiments = [swung(), swung("undeformed", steps=7), bar_in_two_hands(3), cube_with_gaps(2)]
     assert_derivatives(Collocation(experiments, GUESS, "bdf2"), rng)
+
+
+@pytest.mark.parametrize("explicit_grasps", [False, True])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_derivatives_where_a_hand_lets_go_and_a_mass_joins(scheme: str, explicit_grasps: bool, rng):
+    experiment = measured(bar_let_go(6))
+    assert_derivatives(Collocation([experiment], GUESS, scheme, 1, explicit_grasps), rng)
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_derivatives_by_the_experiments_own_unknowns(substeps: int, rng):
+    experiments = [seen_with_gaps(cube_with_unknowns(6)), swung(), cube_with_unknowns(3)]
+    assert_derivatives(Collocation(experiments, GUESS, "midpoint", substeps), rng)
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [
+        Nuisance(marker_offset_m=0.002),
+        Nuisance(time_shift_s=0.002),
+        Nuisance(pose_turn_rad=0.02),
+        Nuisance(gravity_rad=0.02),
+    ],
+    ids=["offset", "time", "turn", "tilt"],
+)
+@pytest.mark.parametrize("parameters", [GUESS, ALL_FIXED])
+def test_derivatives_by_one_kind_of_unknown(unknown: Nuisance, parameters: Parameters, rng):
+    assert_derivatives(Collocation([replace(swung(), nuisance=unknown)], parameters), rng)
+
+
+@pytest.mark.parametrize("huber", [1e-3, 3.0, 1e3])
+def test_derivatives_of_hubers_loss(huber: float, rng):
+    assert_derivatives(Collocation([swung(), cube_with_unknowns(3)], GUESS, huber=huber), rng)
 
 
 def test_derivatives_of_a_body_nobody_holds(rng):
@@ -324,7 +378,9 @@ def test_the_loss_counts_present_samples_only():
     assert collocation.measurements == 3 * present.sum()
     expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurements
     assert collocation.objective(z) == pytest.approx(expected)
-    np.testing.assert_allclose(segment.observation.squared_distances_m2(x), squares[present])
+    np.testing.assert_allclose(
+        segment.observation.squared_distances_m2(x, np.zeros(0)), squares[present]
+    )
     assert collocation.rms_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
 
 

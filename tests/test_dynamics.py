@@ -16,7 +16,7 @@ from problems_small import (
     vertex_markers,
 )
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
+from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
@@ -63,7 +63,7 @@ def test_first_step_takes_its_inertia_from_the_start_velocity(backward_euler):
     collocation, x = backward_euler
     dynamics = collocation.segments[0].dynamics
     body, step = dynamics.body, dynamics.step_s
-    force = body.force(x[1], (x[1] - x[0]) / step, THETA)[0] + dynamics.external_force_n
+    force = body.force(x[1], (x[1] - x[0]) / step, THETA)[0] + dynamics.external_force_n[1]
     expected = force - body.dof_mass * (x[1] - x[0]) / step**2
     np.testing.assert_allclose(dynamics.residual(x, THETA)[1], expected, rtol=1e-12)
 
@@ -103,14 +103,14 @@ def test_residual_depends_on_nothing_older_than_two_steps_or_newer(backward_eule
 
 
 def test_constant_forces_add_to_gravity():
-    push = np.random.default_rng(0).normal(size=(27, 3))
+    push, nodes = np.array([1.0, -2.0, 0.5]), np.array([3, 7])
     plain, pushed = (
-        Dynamics.of(hung_cube(**changes), "midpoint")
-        for changes in ({}, {"external_force_n": push})
+        Dynamics.of(hung_cube(forces=forces), "midpoint") for forces in ((), (Force(nodes, push),))
     )
-    np.testing.assert_allclose(
-        pushed.external_force_n - plain.external_force_n, push.ravel(), atol=1e-15
-    )
+    expected = np.zeros((27, 3))
+    expected[nodes] = push / 2
+    difference = pushed.external_force_n - plain.external_force_n
+    np.testing.assert_allclose(difference, [expected.ravel()] * pushed.rows, atol=1e-15)
 
 
 # Conservation
@@ -162,7 +162,7 @@ def node_momenta(dynamics: Dynamics, x: np.ndarray, theta: Theta) -> np.ndarray:
     """(N − 1, n, 3) momenta at the nodes of the midpoint rule's grid from t = 1."""
     v = np.diff(x, axis=0) / dynamics.step_s
     middle = (x[1:] + x[:-1]) / 2
-    force = dynamics.body.force(middle, v, theta) + dynamics.external_force_n
+    force = dynamics.body.force(middle, v, theta) + dynamics.external_force_n[1:]
     momentum = dynamics.body.dof_mass * v + force * dynamics.step_s / 2
     return momentum.reshape(len(v), -1, 3)
 

@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import (
     Experiment,
+    Force,
     Grasp,
     Markers,
     MarkerTable,
     Placement,
+    PointMass,
     PoseSequence,
     align,
 )
@@ -109,7 +111,8 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ({"start": "given"}, "needs start_positions_m"),
         ({"start_positions_m": NODES}, "but start is 'equilibrium'"),
         ({"start": "given", "start_positions_m": NODES[1:]}, "start_positions_m has the shape"),
-        ({"external_force_n": np.full((5, 3), np.nan)}, r"external_force_n\[0, 0\] is nan"),
+        ({"forces": (Force([5], [0, 0, 1]),)}, "force is on node 5, but the body has 5"),
+        ({"masses": (PointMass([7], 0.1),)}, "mass is tied to node 7, but the body has 5"),
     ],
 )
 def test_inconsistent_experiments_are_refused(changes, message):

@@ -300,14 +300,14 @@ def test_a_misfit_far_above_the_noise_is_noted():
 def point_of(q: np.ndarray, rng_seed: int = 0) -> Point:
     """Residuals (q - 1)² of every entry, scaled, and their slopes."""
     weights = np.random.default_rng(rng_seed).uniform(1, 2, len(q))
-    return Point(q, [], [], weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1)))
+    return Point(q, [], [], weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1)), [])
 
 
 def test_the_learned_curvature_explains_the_last_step():
     before, after = point_of(np.array([2.0, 3.0])), point_of(np.array([2.1, 3.2]))
     b = updated(np.zeros((2, 2)), before, after)
     missing = (after.slope - before.slope).T @ after.residual
-    np.testing.assert_allclose(b @ (after.q - before.q), missing)
+    np.testing.assert_allclose(b @ (after.p - before.p), missing)
     np.testing.assert_allclose(b, b.T)
 
 

@@ -19,7 +19,7 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
+from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.nlp.dynamics import Dynamics, external_force
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.newton import NewtonOptions, Solver
@@ -70,7 +70,7 @@ def assert_stable_equilibrium(experiment: Experiment, theta: Theta, x: np.ndarra
     """No net force on free nodes, and a positive definite stiffness there."""
     body, solver = experiment.body, Solver(experiment)
     still = np.zeros_like(x)
-    load = external_force(experiment)
+    load = external_force(experiment, experiment.t_s[0])
     net = (body.force(x, still, theta)[0] + load)[solver.free]
     assert np.abs(net).max() < 1e-9 * np.abs(load).max()
     stiffness = -body.linearise(x, still, theta).by_position[0]
@@ -107,7 +107,7 @@ def test_without_load_the_body_rests_where_the_grasp_carries_it():
 
 def test_external_forces_deform_the_rest_state():
     weight = box().node_mass[:, None] * np.array(GRAVITY_M_S2)
-    carried = hung_cube(external_force_n=-weight)
+    carried = hung_cube(forces=tuple(Force([k], -w) for k, w in enumerate(weight)))
     np.testing.assert_allclose(rest_state(carried, THETA), carried.body.nodes_m.ravel(), atol=1e-12)
 
 

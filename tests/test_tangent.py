@@ -11,6 +11,7 @@ from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.setting import Setting
 from collocation_sysid.nlp.stopwatch import Stopwatch
 from collocation_sysid.nlp.tangent import BlockSolver, Tangent
 
@@ -29,18 +30,35 @@ def disturbed(
     positions = []
     for segment in collocation.segments:
         x = march(segment.experiment, segment.dynamics, as_theta(TRUTH))
-        change = size_m * rng.standard_normal((len(x), len(segment.free_dofs)))
-        x[segment.dynamics.first_row :, segment.free_dofs] += change[segment.dynamics.first_row :]
+        change = np.zeros_like(x)
+        change[:, segment.free_dofs] = rng.standard_normal((len(x), len(segment.free_dofs)))
+        change = segment.dynamics.without_taken(change)
+        x[segment.dynamics.first_row :] += size_m * change[segment.dynamics.first_row :]
         positions.append(x)
-    return collocation.pack(collocation.parameters.guess_q, positions), positions
+    return collocation.pack(*_around(collocation, positions)), positions
+
+
+def _around(collocation: Collocation, positions: list[np.ndarray]) -> tuple:
+    q, own = collocation.split(unknowns(collocation))
+    return q, positions, own
+
+
+def unknowns(collocation: Collocation) -> np.ndarray:
+    """All parameters p: the guess, and experiments' own unknowns that are not zero."""
+    own = 0.3 * np.random.default_rng(1).standard_normal(collocation.own)
+    return np.concatenate([collocation.parameters.guess_q, own])
+
+
+def only_setting(collocation: Collocation) -> Setting:
+    (setting,) = collocation.settings(unknowns(collocation))
+    return setting
 
 
 def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tangent]:
-    parameters = collocation.parameters
-    q = parameters.guess_q
+    settings = collocation.settings(unknowns(collocation))
     return [
-        BlockSolver(segment).forward(x, parameters.theta(q), parameters.theta_derivatives(q)[0])
-        for segment, x in zip(collocation.segments, positions, strict=True)
+        BlockSolver(segment).forward(x, setting)
+        for segment, x, setting in zip(collocation.segments, positions, settings, strict=True)
     ]
 
 
@@ -58,7 +76,7 @@ def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Col
     z, positions = disturbed(collocation)
     step = [tangent.step for tangent in forward(collocation, positions)]
     values = collocation.constraint_values(z)
-    change = collocation.jacobian(z) @ collocation.pack(np.zeros(4), step)
+    change = collocation.jacobian(z) @ collocation.pack(np.zeros(collocation.nq), step)
     assert np.abs(values).max() > 1e-4
     np.testing.assert_allclose(change, -values, atol=1e-9 * np.abs(values).max())
 
@@ -67,10 +85,12 @@ def test_sensitivities_keep_the_linearised_constraints(collocation: Collocation)
     z, positions = disturbed(collocation)
     jacobian = collocation.jacobian(z)
     (found,) = forward(collocation, positions)
-    for k, direction in enumerate(np.eye(4)):
-        change = jacobian @ collocation.pack(direction, [found.by_q[:, :, k]])
-        largest = np.abs(jacobian[:, [k]].toarray()).max()
-        assert np.abs(change).max() < 1e-9 * largest
+    (moving,) = (segment.moving for segment in collocation.segments)
+    for k, place in enumerate(moving):
+        q, own = collocation.split(np.eye(collocation.nq + collocation.own)[place])
+        change = jacobian @ collocation.pack(q, [found.by_p[:, :, k]], own)
+        forced = jacobian @ collocation.pack(q, [np.zeros_like(found.step)], own)
+        assert np.abs(change).max() < 1e-9 * np.abs(forced).max()
 
 
 def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation: Collocation):
@@ -82,23 +102,23 @@ def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation
     gradient = collocation.gradient(z)
     slope = gradient + collocation.jacobian(z).T @ multipliers
     lower, upper = collocation.bounds()
-    free = np.flatnonzero(lower < upper)[collocation.nq :]
+    first = collocation.nq
+    free = first + np.flatnonzero((lower < upper)[first : len(z) - collocation.own])
     assert np.abs(gradient[free]).max() > 0
     assert np.abs(slope[free]).max() < 1e-9 * np.abs(gradient[free]).max()
 
 
 def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     """gᵀ p = yᵀ c for y with c_xᵀ y = −g and p = −c_x⁻¹ c."""
-    z, (x,) = disturbed(collocation)
+    _, (x,) = disturbed(collocation)
     (segment,) = collocation.segments
-    theta = collocation.parameters.theta(z[:4])
+    setting = only_setting(collocation)
     gradient = rng.standard_normal(x.shape)
-    y = BlockSolver(segment).backward(x, theta, gradient)
+    y = BlockSolver(segment).backward(x, setting.theta, gradient)
     (found,) = forward(collocation, [x])
-    residual = segment.dynamics.residual(x, theta)
-    free = segment.free_dofs
+    residual, free = segment.residual_n(x, setting), segment.free_dofs
     left = np.sum(gradient[:, free] * found.step[:, free])
-    assert left == pytest.approx(np.sum(y[:, free] * residual[:, free]), rel=1e-9)
+    assert left == pytest.approx(np.sum(y[:, free] * residual), rel=1e-9)
 
 
 def test_what_is_given_does_not_move():
@@ -106,7 +126,7 @@ def test_what_is_given_does_not_move():
     _, positions = disturbed(collocation)
     (found,) = forward(collocation, positions)
     held = collocation.segments[0].held_dofs
-    for part in (found.step[0], found.by_q[0], found.step[:, held], found.by_q[:, held]):
+    for part in (found.step[0], found.by_p[0], found.step[:, held], found.by_p[:, held]):
         assert not part.any()
 
 
@@ -118,7 +138,7 @@ def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tangent, "CHUNK_BYTES", 1)
     (parts,) = forward(collocation, positions)
     np.testing.assert_allclose(parts.step, whole.step, rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(parts.by_q, whole.by_q, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(parts.by_p, whole.by_p, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(constraint_multipliers(collocation, z), multipliers, rtol=1e-9)
 
 
@@ -128,11 +148,9 @@ def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
     (segment,) = collocation.segments
-    q = GUESS.guess_q
-    solver = BlockSolver(segment, rows=5)
-    part = solver.forward(x[:5], GUESS.theta(q), GUESS.theta_derivatives(q)[0])
+    part = BlockSolver(segment, rows=5).forward(x[:5], only_setting(collocation))
     np.testing.assert_allclose(part.step, whole.step[:5], rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(part.by_q, whole.by_q[:5], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(part.by_p, whole.by_p[:5], rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize("done", [2, 3, 5])
@@ -142,12 +160,11 @@ def test_the_first_rows_can_be_continued(scheme: str, done: int):
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
     (segment,) = collocation.segments
-    q = GUESS.guess_q
-    theta, theta_q = GUESS.theta(q), GUESS.theta_derivatives(q)[0]
-    first = BlockSolver(segment, done).forward(x[:done], theta, theta_q)
-    continued = BlockSolver(segment).forward(x, theta, theta_q, first)
+    setting = only_setting(collocation)
+    first = BlockSolver(segment, done).forward(x[:done], setting)
+    continued = BlockSolver(segment).forward(x, setting, first)
     np.testing.assert_allclose(continued.step, whole.step, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(continued.by_q, whole.by_q, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-9, atol=1e-15)
     assert continued.violation_n == pytest.approx(whole.violation_n)
 
 
@@ -155,11 +172,8 @@ def test_rows_one_by_one_are_the_same_sensitivities():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    q = GUESS.guess_q
-    rows = BlockSolver(collocation.segments[0]).sensitivities(
-        x, GUESS.theta(q), GUESS.theta_derivatives(q)[0]
-    )
-    np.testing.assert_allclose(np.stack(list(rows)), whole.by_q, rtol=1e-9, atol=1e-15)
+    rows = BlockSolver(collocation.segments[0]).sensitivities(x, only_setting(collocation))
+    np.testing.assert_allclose(np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15)
 
 
 def test_indefinite_blocks_are_counted():
@@ -188,8 +202,8 @@ def test_states_that_are_not_finite_are_refused_with_their_time():
 def test_time_is_accounted_for():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
-    stopwatch, q = Stopwatch(), GUESS.guess_q
+    stopwatch = Stopwatch()
     solver = BlockSolver(collocation.segments[0], stopwatch=stopwatch)
-    solver.forward(x, GUESS.theta(q), GUESS.theta_derivatives(q)[0])
+    solver.forward(x, only_setting(collocation))
     assert stopwatch.evaluations > 0
     assert stopwatch.linear_algebra > 0

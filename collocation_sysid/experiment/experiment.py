@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from .arrays import FloatArray, IntArray, read_only_floats
 from .clock import STEP_TOLERANCE, sample_interval_s
 from .grasp import Grasp, held_nodes
+from .loads import Force, PointMass
 from .markers import Markers
+from .nuisance import Nuisance
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -38,7 +40,7 @@ class Experiment:
     t_s : (T,) array
         At least three evenly spaced times.
     grasps : tuple of Grasp
-        No node in two of them.
+        No node in two of them at a time.
     markers : Markers
         Tracks at the times `t_s`, at least one sample present.
     gravity_m_s2 : (3,) array
@@ -51,8 +53,12 @@ class Experiment:
         The state for "given"; at rest if the velocities are left out.
     validation : bool
         Predicted only, not fitted.
-    external_force_n : (n, 3) array, optional
-        Constant forces on the nodes besides gravity.
+    masses : tuple of PointMass
+        Tied to the body.
+    forces : tuple of Force
+        On the nodes besides gravity.
+    nuisance : Nuisance
+        What else is to be estimated about this recording alone.
 
     Raises
     ------
@@ -71,7 +77,9 @@ class Experiment:
     start_positions_m: FloatArray | None = None
     start_velocities_m_s: FloatArray | None = None
     validation: bool = False
-    external_force_n: FloatArray | None = None
+    masses: tuple[PointMass, ...] = ()
+    forces: tuple[Force, ...] = ()
+    nuisance: Nuisance = field(default_factory=Nuisance)
 
     def __post_init__(self) -> None:
         try:
@@ -94,33 +102,68 @@ class Experiment:
 
     @cached_property
     def held_nodes(self) -> IntArray:
-        """Grasped nodes, sorted."""
-        return held_nodes(self.grasps)
+        """Nodes that are grasped throughout, sorted."""
+        held, _ = self.grasped(self.t_s)
+        return np.flatnonzero(held.all(axis=0))
 
     @cached_property
     def free_nodes(self) -> IntArray:
-        """All other nodes, sorted."""
+        """All other nodes, sorted; grasps with a time window may hold some for a while."""
         return np.setdiff1d(np.arange(len(self.body.nodes_m)), self.held_nodes)
 
-    def held_positions(self, t_s: ArrayLike) -> FloatArray:
-        """Return where the grasps carry the held nodes at `t_s` (T,), as (T, held, 3) metres.
+    def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Return which nodes are held at the times `t_s` (T,), and where.
 
-        Nodes are in the order of `held_nodes`.
+        Returns
+        -------
+        held : (T, n) bool
+        positions_m : (T, n, 3)
+            NaN where a node is not held.
         """
-        positions = np.empty((np.size(t_s), len(self.held_nodes), 3))
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        n = len(self.body.nodes_m)
+        held = np.zeros((len(times), n), dtype=bool)
+        positions = np.full((len(times), n, 3), np.nan)
         for grasp in self.grasps:
-            rows = np.searchsorted(self.held_nodes, grasp.nodes)
-            positions[:, rows] = grasp.poses.carry(self.body.nodes_m[grasp.nodes], t_s)
-        return positions
+            here = np.flatnonzero(grasp.holds(times))
+            held[np.ix_(here, grasp.nodes)] = True
+            positions[np.ix_(here, grasp.nodes)] = grasp.carry(self.body.nodes_m, times[here])
+        return held, positions
+
+    def held_positions(self, t_s: ArrayLike) -> FloatArray:
+        """Return where `held_nodes` are carried at `t_s` (T,), as (T, held, 3) metres."""
+        return self.grasped(t_s)[1][:, self.held_nodes]
+
+    def node_mass_kg(self, t_s: ArrayLike) -> FloatArray:
+        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
+        n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
+        mass = np.broadcast_to(self.body.node_mass, (len(times), n))
+        for point in self.masses:
+            mass = mass + point.at_nodes(times, n)
+        return mass
+
+    def node_forces_n(self, t_s: ArrayLike) -> FloatArray:
+        """Return the forces besides gravity on the nodes at `t_s` (T,), (T, n, 3)."""
+        n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
+        total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
+        for force in self.forces:
+            total = total + force.at_nodes(times, n)
+        return total
 
     def rigid_positions(self, t_s: ArrayLike) -> FloatArray:
-        """Return all nodes (T, n, 3) as if the first grasp carried the undeformed body rigidly.
+        """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
 
-        Without a grasp the body stays where it is undeformed.
+        That is the first grasp that holds throughout, else the first. Without a grasp the body
+        stays where it is undeformed.
         """
         if not self.grasps:
             return np.repeat(self.body.nodes_m[None], np.size(t_s), axis=0)
-        return self.grasps[0].poses.carry(self.body.nodes_m, t_s)
+        throughout = [grasp for grasp in self.grasps if grasp.holds(self.t_s).all()]
+        poses = (throughout or self.grasps)[0].poses
+        times = np.asarray(t_s, dtype=np.float64)
+        if len(poses.t_s) > 1 and not throughout:
+            times = np.clip(times, poses.t_s[0], poses.t_s[-1])
+        return poses.carry(self.body.nodes_m, times)
 
     def _freeze(self) -> None:
         n = len(self.body.nodes_m)
@@ -128,12 +171,13 @@ class Experiment:
             "t_s": read_only_floats(self.t_s, (None,), "t_s"),
             "gravity_m_s2": read_only_floats(self.gravity_m_s2, (3,), "gravity_m_s2"),
         }
-        for field in ("start_positions_m", "start_velocities_m_s", "external_force_n"):
-            if getattr(self, field) is not None:
-                arrays[field] = read_only_floats(getattr(self, field), (n, 3), field)
-        for field, array in arrays.items():
-            object.__setattr__(self, field, array)
-        object.__setattr__(self, "grasps", tuple(self.grasps))
+        for name in ("start_positions_m", "start_velocities_m_s"):
+            if getattr(self, name) is not None:
+                arrays[name] = read_only_floats(getattr(self, name), (n, 3), name)
+        for name, array in arrays.items():
+            object.__setattr__(self, name, array)
+        for name in ("grasps", "masses", "forces"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
 
     def _check_time(self) -> None:
         if len(self.t_s) < 3:
@@ -152,12 +196,17 @@ class Experiment:
         if self.markers.samples == 0:
             raise InputError("no marker sample is present; check the marker file and window_s")
         for grasp in self.grasps:
-            grasp.poses.at(self.t_s)
+            grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)
-        if self.held_nodes.size and self.held_nodes[-1] >= n:
-            raise InputError(f"a grasp holds node {self.held_nodes[-1]}, but the body has {n}")
+        grasped = held_nodes(self.grasps)
+        if grasped.size and grasped[-1] >= n:
+            raise InputError(f"a grasp holds node {grasped[-1]}, but the body has {n}")
+        for what, loads in (("point mass is tied to", self.masses), ("force is on", self.forces)):
+            beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
+            if beyond:
+                raise InputError(f"a {what} node {beyond[0]}, but the body has {n}")
         if self.markers.placement.node_count != n:
             raise InputError(
                 f"the markers were placed on a body of {self.markers.placement.node_count} nodes, "
@@ -178,11 +227,12 @@ class Experiment:
                 object.__setattr__(self, "start_velocities_m_s", at_rest)
         elif given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
-        if self.start == "equilibrium" and not _fixes_a_body(self.body.nodes_m[self.held_nodes]):
+        held = np.flatnonzero(self.grasped(self.t_s[:1])[0][0])
+        if self.start == "equilibrium" and not _fixes_a_body(self.body.nodes_m[held]):
             raise InputError(
                 "start = 'equilibrium' needs at least 3 held nodes that do not lie on one line, "
                 "otherwise the body can turn freely and its rest state is not unique; "
-                f"{len(self.held_nodes)} nodes are held. Grasp more nodes, or start 'undeformed'"
+                f"{len(held)} nodes are held then. Grasp more nodes, or start 'undeformed'"
             )
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
@@ -150,38 +151,55 @@ class Grasp:
         Node numbers; kept sorted and without repeats.
     poses : PoseSequence
         Where they are held.
+    from_s, until_s : float
+        First and last time at which they are held; throughout by default.
     """
 
     nodes: IntArray
     poses: PoseSequence
+    from_s: float = -np.inf
+    until_s: float = np.inf
 
     def __post_init__(self) -> None:
+        if not self.from_s <= self.until_s:
+            raise InputError(
+                f"a grasp holds from {self.from_s:g} s until {self.until_s:g} s; "
+                "expected from_s <= until_s"
+            )
         nodes = np.unique(read_only_nodes(self.nodes, (None,), "nodes of the grasp"))
         if nodes.size == 0:
             raise InputError("a grasp must hold at least one node; its selection found none")
         nodes.setflags(write=False)
         object.__setattr__(self, "nodes", nodes)
 
+    def holds(self, t_s: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether the nodes are held at the times `t_s` (T,)."""
+        times = np.asarray(t_s, dtype=np.float64)
+        return (times >= self.from_s - _TIME_TOLERANCE_S) & (
+            times <= self.until_s + _TIME_TOLERANCE_S
+        )
+
+    def carry(self, nodes_m: FloatArray, t_s: ArrayLike) -> FloatArray:
+        """Return where the body's nodes (n, 3) that it holds are at `t_s` (T,), (T, h, 3)."""
+        return self.poses.carry(nodes_m[self.nodes], t_s)
+
 
 def held_nodes(grasps: Sequence[Grasp]) -> IntArray:
-    """Return all grasped nodes, sorted.
+    """Return all nodes that are grasped at some time, sorted.
 
     Raises
     ------
     InputError
-        If two grasps hold the same node.
+        If two grasps hold the same node at the same time.
     """
-    if not grasps:
-        return np.zeros(0, dtype=np.int64)
-    nodes, holders = np.unique(np.concatenate([g.nodes for g in grasps]), return_counts=True)
-    if (holders > 1).any():
-        shared = nodes[holders > 1][0]
-        both = [number for number, g in enumerate(grasps, start=1) if shared in g.nodes]
-        raise InputError(
-            f"node {shared} is held by the grasps {both[0]} and {both[1]}; "
-            "select nodes so that each is held once"
-        )
-    return nodes
+    for (i, first), (j, second) in combinations(enumerate(grasps, start=1), 2):
+        shared = np.intersect1d(first.nodes, second.nodes)
+        if shared.size and max(first.from_s, second.from_s) <= min(first.until_s, second.until_s):
+            raise InputError(
+                f"node {shared[0]} is held by the grasps {i} and {j} at the same time; "
+                "select nodes so that each is held once"
+            )
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(g.nodes for g in grasps)]))
 
 
 def first_pose_fault(

@@ -16,10 +16,10 @@ Array = NDArray[np.float64]
 def exact_curvature(
     collocation: Collocation, point: Point, stopwatch: Stopwatch | None = None
 ) -> Array:
-    """B (nq, nq) of the Hessian 2 (SᵀS + B) of ‖r‖² in q, at a point of the whole horizon.
+    """B (np, np) of the Hessian 2 (SᵀS + B) of the loss in p, at a point of the whole horizon.
 
-    With W = (I, Z) the multipliers' part Wᵀ ∇²(yᵀ g) W of the Lagrangian's reduced Hessian; one
-    sweep backward for the multipliers y.
+    From the reduced Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z); one sweep
+    backward for the multipliers y.
 
     Raises
     ------
@@ -27,14 +27,21 @@ def exact_curvature(
         Where a timestep's equations are singular.
     """
     projected = [x + tangent.step for x, tangent in zip(point.x, point.tangents, strict=True)]
-    z = collocation.pack(point.q, projected)
+    q, own = collocation.split(point.p)
+    z = collocation.pack(q, projected, own)
     multipliers = constraint_multipliers(collocation, z, stopwatch)
-    directions = np.column_stack(
-        [
-            collocation.pack(unit, [tangent.by_q[..., k] for tangent in point.tangents])
-            for k, unit in enumerate(np.eye(len(point.q)))
-        ]
-    )
-    hessian = collocation.hessian(z, 0.0, multipliers)
+    directions = np.column_stack([_direction(collocation, point, k) for k in range(len(point.p))])
+    hessian = collocation.hessian(z, 1.0, multipliers)
     reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
-    return (reduced + reduced.T) / 2
+    return (reduced + reduced.T) / 2 - point.slope.T @ point.slope
+
+
+def _direction(collocation: Collocation, point: Point, k: int) -> Array:
+    """Variables per unit of p_k along the equations of motion."""
+    unit = np.eye(len(point.p))[k]
+    moved = [
+        tangent.by_p @ unit[moving]
+        for tangent, moving in zip(point.tangents, point.moving, strict=True)
+    ]
+    q, own = collocation.split(unit)
+    return collocation.pack(q, moved, own)

@@ -19,6 +19,7 @@ from ..nlp.tangent import BlockSolver, Tangent
 from .robust import huberised
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
@@ -31,18 +32,20 @@ class Point:
 
     Attributes
     ----------
-    q : (nq,)
+    p : (np,) all parameters, see `Collocation.places`
     x : list of (rows, 3n), one per experiment
     tangents : list of Tangent
     residual : (M,) r + S_p, markers after the feasibility step, and residuals of the priors
-    slope : (M, nq) S and the slopes of the priors
+    slope : (M, np) S and the slopes of the priors
+    moving : list of positions in p that move each experiment's body
     """
 
-    q: Array
+    p: Array
     x: list[Array]
     tangents: list[Tangent]
     residual: Array
     slope: Array
+    moving: list[Index]
 
     @cached_property
     def loss(self) -> float:
@@ -60,14 +63,14 @@ class Point:
         return bool(np.isfinite(self.loss) and np.isfinite(self.feasibility_m))
 
     def moved(self, step: Array) -> list[Array]:
-        """Trajectories after the step (p + Z dq, dq)."""
+        """Trajectories after a step of the parameters."""
         return [
-            x + tangent.step + tangent.by_q @ step
-            for x, tangent in zip(self.x, self.tangents, strict=True)
+            x + tangent.step + tangent.by_p @ step[moving]
+            for x, tangent, moving in zip(self.x, self.tangents, self.moving, strict=True)
         ]
 
     def predicted_loss(self, step: Array) -> float:
-        """Loss after a step of q, of the linearised problem."""
+        """Loss after a step of the parameters, of the linearised problem."""
         linear = self.residual + self.slope @ step
         return float(linear @ linear)
 
@@ -84,8 +87,6 @@ class Horizon:
         Standard deviation of a prior that holds q near the guess.
     stopwatch : Stopwatch, optional
     factorisation : {"auto", "band", "sparse"}
-    huber : float, optional
-        Threshold of Huber's loss, in standard deviations; squared without it.
     """
 
     def __init__(
@@ -95,10 +96,8 @@ class Horizon:
         prior: float | None = None,
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
-        huber: float | None = None,
     ) -> None:
         self.collocation = collocation
-        self.huber = huber
         self.rows = list(rows)
         self.prior = prior
         self.stopwatch = stopwatch or Stopwatch()
@@ -108,47 +107,65 @@ class Horizon:
                 for segment, count in zip(collocation.segments, rows, strict=True)
             ]
 
-    def evaluate(self, q: Array, x: list[Array], known: Point | None = None) -> Point:
-        """One sweep; a point of the first rows, at the same q and positions, is continued.
+    def evaluate(self, p: Array, x: list[Array], known: Point | None = None) -> Point:
+        """One sweep; a point of the first rows, at the same p and positions, is continued.
 
         Raises
         ------
         SimulationError
             Where it is singular or not finite.
         """
-        parameters = self.collocation.parameters
-        theta = parameters.theta(q)
-        theta_q, _ = parameters.theta_derivatives(q)
+        collocation = self.collocation
+        nq, (q, own) = collocation.nq, collocation.split(p)
         tangents, residuals, slopes = [], [], []
-        for k, (solver, x_k) in enumerate(zip(self.solvers, x, strict=True)):
-            first = known.tangents[k] if known else None
-            tangent = solver.forward(x_k, theta, theta_q, first)
+        parts = zip(self.solvers, collocation.settings(p), x, own, collocation.places, strict=True)
+        for k, (solver, setting, x_k, phi, places) in enumerate(parts):
+            tangent = solver.forward(x_k, setting, known.tangents[k] if known else None)
             observation = solver.segment.observation
-            residual, slope = observation.linearised(x_k, tangent.step, tangent.by_q)
-            if self.huber is not None:
-                residual, slope = huberised(residual, slope, self.huber)
+            residual, here = observation.linearised(
+                x_k + tangent.step,
+                phi,
+                observation.at_samples(tangent.by_p),
+                solver.segment.moving,
+                nq,
+            )
+            slope = np.zeros((residual.size, len(p)))
+            slope[:, places] = here.reshape(residual.size, len(places))
+            residual = residual.ravel()
+            if collocation.huber is not None:
+                residual, slope = huberised(residual, slope, collocation.huber)
             tangents.append(tangent)
             residuals.append(residual)
             slopes.append(slope)
-        prior, prior_slopes = parameters.prior(q)
         if self.prior is not None:
-            residuals.append((q - parameters.guess_q) / self.prior)
-            slopes.append(np.eye(len(q)) / self.prior)
-        residual = np.concatenate([*residuals, prior])
-        return Point(q, x, tangents, residual, np.concatenate([*slopes, np.diag(prior_slopes)]))
+            residuals.append((q - collocation.parameters.guess_q) / self.prior)
+            slopes.append(np.eye(nq, len(p)) / self.prior)
+        prior, prior_slopes = collocation.prior(p)
+        return Point(
+            p,
+            x,
+            tangents,
+            np.concatenate([*residuals, prior]),
+            np.concatenate([*slopes, np.diag(prior_slopes)]),
+            [
+                places[segment.moving]
+                for segment, places in zip(collocation.segments, collocation.places, strict=True)
+            ],
+        )
 
     def extend(
-        self, q: Array, x: list[Array] | None = None
+        self, p: Array, x: list[Array] | None = None
     ) -> tuple[list[Array], SimulationError | None]:
-        """Trajectories at q as far as they go, continuing those given; and why they stopped."""
-        theta = self.collocation.parameters.theta(q)
+        """Trajectories at p as far as they go, continuing those given; and why they stopped."""
+        _, own = self.collocation.split(p)
         extended, first_failure = [], None
-        for k, solver in enumerate(self.solvers):
+        settings = self.collocation.settings(p)
+        for k, (solver, setting, phi) in enumerate(zip(self.solvers, settings, own, strict=True)):
             known = x[k] if x is not None and len(x[k]) else None
             rows, failure = march_on(
-                solver.segment.experiment,
-                solver.dynamics,
-                theta,
+                solver.segment.corrected(phi),
+                setting.dynamics.first_rows(solver.dynamics.rows),
+                setting.theta,
                 known,
                 MARCHED,
                 stopwatch=self.stopwatch,

@@ -27,13 +27,14 @@ def constraint_multipliers(
     q, positions = collocation.unpack(z)
     theta = collocation.parameters.theta(q)
     parts = []
-    for segment, x in zip(collocation.segments, positions, strict=True):
-        gradient = collocation.loss_scale * segment.observation.gradient(x)
+    own = collocation.unpack_own(z)
+    for segment, x, phi in zip(collocation.segments, positions, own, strict=True):
+        gradient = collocation.loss_scale * segment.observation.gradient(x, phi)[0]
         y = BlockSolver(segment, stopwatch=stopwatch).backward(x, theta, gradient)
         y *= segment.force_n
         parts.append(y[segment.dynamics.first_row :, segment.row_dofs].ravel())
     multipliers = np.concatenate(parts)
-    if collocation.segments[0].explicit_grasps:
+    if any(s.explicit_grasps or s.dynamics.taken is not None for s in collocation.segments):
         _add_grasps(collocation, z, multipliers)
     return multipliers
 
@@ -45,7 +46,12 @@ def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
     start = 0
     for segment, rest in zip(collocation.segments, left, strict=True):
         stop = start + segment.constraints
+        grasped = np.zeros((segment.grid_rows, segment.dofs), dtype=bool)
+        grasped[:, segment.held_dofs] = segment.explicit_grasps
+        if segment.dynamics.taken is not None:
+            grasped |= segment.dynamics.taken
+        first = segment.dynamics.first_row
+        grasped, rest = grasped[first:, segment.row_dofs], rest[first:, segment.row_dofs]
         rows = multipliers[start:stop].reshape(segment.constraint_times, -1)
-        held = rest[segment.dynamics.first_row :, segment.held_dofs] / segment.length_m
-        rows[:, segment.held_dofs] = -held
+        rows[grasped] = -rest[grasped] / segment.length_m
         start = stop

@@ -100,14 +100,9 @@ def _whole(collocation: Collocation, search: Search) -> tuple[Array, Array]:
     """Variables and multipliers of the whole NLP."""
     x = search.x
     whole = [_filled(s, x[k] if x else None) for k, s in enumerate(collocation.segments)]
-    z = collocation.pack(search.q, whole)
-    # With Huber's loss the multipliers of the squared one would mean nothing.
-    squared = search.options.huber is None
-    if (
-        squared
-        and x
-        and all(len(a) == s.grid_rows for a, s in zip(x, collocation.segments, strict=True))
-    ):
+    q, own = collocation.split(search.p)
+    z = collocation.pack(q, whole, own)
+    if x and all(len(a) == s.grid_rows for a, s in zip(x, collocation.segments, strict=True)):
         try:
             return z, constraint_multipliers(collocation, z, search.stopwatch)
         except SimulationError:
@@ -125,10 +120,6 @@ def _filled(segment: Segment, x: Array | None) -> Array:
 
 def _notes(collocation: Collocation, search: Search, z: Array, status: Status) -> list[str]:
     notes = []
-    if search.options.huber is not None:
-        notes.append(
-            "fitted with Huber's loss: error bars and KKT residual are those of the squared loss"
-        )
     if search.indefinite:
         steps = sum(segment.constraint_times for segment in collocation.segments)
         notes.append(
@@ -136,10 +127,13 @@ def _notes(collocation: Collocation, search: Search, z: Array, status: Status) -
             "at the answer: the body is near buckling, or damped more than its motion allows"
         )
     if status in (Status.CONVERGED, Status.STALLED):
-        squares = sum(
-            segment.observation.loss(x)
-            for segment, x in zip(collocation.segments, collocation.unpack(z)[1], strict=True)
+        parts = zip(
+            collocation.segments,
+            collocation.unpack(z)[1],
+            collocation.unpack_own(z),
+            strict=True,
         )
+        squares = sum(segment.observation.loss(x, phi) for segment, x, phi in parts)
         misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
         if misfit > MISFIT:
             notes.append(

@@ -49,9 +49,6 @@ class ReducedSpaceOptions:
     hessian : {"gauss-newton", "exact"}
         Near the answer, what Gauss–Newton leaves out is learned from the steps, or computed
         exactly from the Lagrangian: a second sweep an iteration, for large residuals.
-    huber : float or None
-        Samples farther from their markers than this many standard deviations count linearly
-        instead of squared (Huber's loss, by reweighting); all squared by default.
     factorisation : {"auto", "band", "sparse"}
         Banded Cholesky, SuperLU, or whichever is estimated to cost less.
     """
@@ -63,7 +60,6 @@ class ReducedSpaceOptions:
     rung_decrease: float = 0.05
     rung_prior: float = 2.3
     hessian: Hessian = "gauss-newton"
-    huber: float | None = None
     factorisation: Choice = "auto"
 
 
@@ -99,10 +95,6 @@ class Search:
         if options.hessian not in get_args(Hessian):
             known = ", ".join(get_args(Hessian))
             raise InputError(f"no hessian {options.hessian!r}; available: {known}", None, "solver")
-        if options.huber is not None and not options.huber > 0:
-            raise InputError(
-                f"huber = {options.huber:g}, expected a positive number", None, "solver"
-            )
         self.collocation = collocation
         self.options = options
         self.watch = watch
@@ -113,8 +105,12 @@ class Search:
         self.history: list[Iteration] = []
         self.notes: list[str] = []
         self.indefinite = 0
-        self.lower, self.upper = collocation.parameters.bounds_q
-        self.q = collocation.parameters.guess_q
+        self.lower, self.upper = collocation.bounds_p
+        self.p = np.concatenate([collocation.parameters.guess_q, np.zeros(collocation.own)])
+        # What a trust region of one allows each parameter.
+        self.reach = np.concatenate(
+            [np.ones(collocation.nq), *(s.local.reach for s in collocation.segments)]
+        )
         self.x: list[Array] | None = None
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
@@ -149,17 +145,14 @@ class Search:
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         prior = None if last else self.options.rung_prior
-        options = self.options
-        return Horizon(
-            self.collocation, rows, prior, self.stopwatch, options.factorisation, options.huber
-        )
+        return Horizon(self.collocation, rows, prior, self.stopwatch, self.options.factorisation)
 
     def _reach(self, rung: Horizon) -> None:
         """Extend the trajectories to a rung's length; where that fails, first solve what is."""
         furthest = 0
         while True:
             known = self.x
-            reached, failure = rung.extend(self.q, known)
+            reached, failure = rung.extend(self.p, known)
             self.sweeps += 1
             if failure is None:
                 self.x = reached
@@ -185,12 +178,13 @@ class Search:
         """
         names = [item.name for item in self.collocation.parameters.free]
         moduli = np.array([name in MODULI for name in names], dtype=bool)
-        stiffer = np.minimum(self.q + np.log(2) * moduli, self.upper)
+        q, upper = self.p[: len(names)], self.upper[: len(names)]
+        stiffer = np.minimum(q + np.log(2) * moduli, upper)
         started = self.collocation.parameters.guess_q
         factor = float(np.exp(np.max(stiffer - started, initial=0.0)))
-        if np.allclose(stiffer, self.q) or factor > 1.01 * 2**STIFFENINGS:
+        if np.allclose(stiffer, q) or factor > 1.01 * 2**STIFFENINGS:
             raise failure
-        self.q = stiffer
+        self.p = np.concatenate([stiffer, self.p[len(names) :]])
         note = (
             f"the body cannot be simulated at the guess ({failure}); "
             f"started from moduli {factor:.3g} times as stiff"
@@ -204,12 +198,12 @@ class Search:
         assert self.x is not None
         tolerance = self.options.tolerance
         self.trust = self.options.trust
-        point = self._accepted(rung.evaluate(self.q, self.x, self.point))
-        rejections, curvature = 0, np.zeros((len(point.q), len(point.q)))
+        point = self._accepted(rung.evaluate(self.p, self.x, self.point))
+        rejections, curvature = 0, np.zeros((len(point.p), len(point.p)))
         previous = np.inf
         while True:
             step = self._step(point, curvature)
-            length = float(np.abs(step).max(initial=0.0))
+            length = self._length(step)
             # A step that the trust region cuts short says nothing about the distance to go.
             whole = length < 0.99 * self.trust
             short = whole and length <= tolerance
@@ -218,8 +212,8 @@ class Search:
             rate = min(1.0, length / previous)
             if last and whole and length * rate <= SAFETY * tolerance:
                 final = point.moved(step)
-                if self._are_feasible(final, point.q + step):
-                    self._record(point.q + step, final, point.predicted_loss(step))
+                if self._are_feasible(final, point.p + step):
+                    self._record(point.p + step, final, point.predicted_loss(step))
                     return Status.CONVERGED
             promised = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not last and promised < self.options.rung_decrease:
@@ -243,28 +237,32 @@ class Search:
 
     def _curvature(self, curvature: Array, before: Point, after: Point) -> Array:
         """What Gauss–Newton leaves out at `after`, the secant's or the exact."""
-        if self.options.hessian == "exact" and self.options.huber is None:
+        if self.options.hessian == "exact":
             return exact_curvature(self.collocation, after, self.stopwatch)
         return updated(curvature, before, after)
 
+    def _length(self, step: Array) -> float:
+        """Largest step of a parameter, in what a trust region of one allows it."""
+        return float(np.abs(step / self.reach).max(initial=0.0))
+
     def _step(self, point: Point, curvature: Array) -> Array:
-        if len(point.q) == 0:
+        count = len(point.p)
+        if count == 0:
             return np.zeros(0)
-        low = np.maximum(self.lower - point.q, -self.trust)
-        high = np.minimum(self.upper - point.q, self.trust)
-        # Rounding may leave q on its bound by a hair.
+        low = np.maximum(self.lower - point.p, -self.trust * self.reach)
+        high = np.minimum(self.upper - point.p, self.trust * self.reach)
+        # Rounding may leave a parameter on its bound by a hair.
         low, high = np.minimum(low, 0.0) - 1e-15, np.maximum(high, 0.0) + 1e-15
         _, triangle = np.linalg.qr(np.column_stack([point.slope, point.residual]))
-        count = len(point.q)
         slope, right = with_curvature(triangle[:count, :count], triangle[:count, -1], curvature)
         answer = lsq_linear(slope, -right, (low, high), method="bvls")
         return np.clip(answer.x, low, high)
 
     def _try(self, rung: Horizon, point: Point, step: Array) -> Point | None:
         self.sweeps += 1
-        q = np.clip(point.q + step, self.lower, self.upper)
+        p = np.clip(point.p + step, self.lower, self.upper)
         try:
-            trial = rung.evaluate(q, point.moved(step))
+            trial = rung.evaluate(p, point.moved(step))
         except SimulationError:
             return None
         return trial if trial.finite else None
@@ -282,7 +280,7 @@ class Search:
         noise = 1e-12 * point.loss + 1e-20
         if actual < DECREASE * predicted - noise:
             return False
-        length = float(np.abs(step).max(initial=0.0))
+        length = self._length(step)
         if actual > 0.75 * predicted and length > 0.9 * self.trust:
             self.trust = min(2.0 * self.trust, 4.0)
         elif actual < 0.25 * predicted - noise:
@@ -292,47 +290,51 @@ class Search:
     def _restored(self, rung: Horizon, point: Point) -> Point:
         """The point with a simulated trajectory, where that exists."""
         self.sweeps += 1
-        x, failure = rung.extend(point.q)
+        x, failure = rung.extend(point.p)
         if failure is not None:
             return point
         try:
-            restored = rung.evaluate(point.q, x)
+            restored = rung.evaluate(point.p, x)
         except SimulationError:
             return point
         return self._accepted(restored) if restored.finite else point
 
-    def _are_feasible(self, x: list[Array], q: Array) -> bool:
+    def _are_feasible(self, x: list[Array], p: Array) -> bool:
         """Whether trajectories satisfy the equations of motion well within the tolerance."""
-        theta = self.collocation.parameters.theta(q)
+        parts = zip(self.collocation.segments, x, self.collocation.settings(p), strict=True)
         return all(
-            np.abs(segment.residual_n(x_k, theta)).max() <= FEASIBLE_FORCE * segment.force_n
-            for segment, x_k in zip(self.collocation.segments, x, strict=True)
+            np.abs(segment.residual_n(x_k, setting)).max() <= FEASIBLE_FORCE * segment.force_n
+            for segment, x_k, setting in parts
         )
 
     def _accepted(self, point: Point) -> Point:
         self.point = point
         self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
-        self._record(point.q, point.x, point.loss, point)
+        self._record(point.p, point.x, point.loss, point)
         return point
 
-    def _record(self, q: Array, x: list[Array], loss: float, point: Point | None = None) -> None:
+    def _record(self, p: Array, x: list[Array], loss: float, point: Point | None = None) -> None:
         """Make it the answer so far; markers are those after the feasibility step of a point."""
-        self.q, self.x = q, x
-        theta = self.collocation.parameters.theta(q)
+        self.p, self.x = p, x
+        q, own = self.collocation.split(p)
+        settings = self.collocation.settings(p)
         squares, violation_n = [], 0.0
         for k, segment in enumerate(self.collocation.segments):
             tangent = point.tangents[k] if point else None
             projected = x[k] + tangent.step if tangent else x[k]
-            squares.append(segment.observation.squared_distances_m2(projected))
-            here = tangent.violation_n if tangent else np.abs(segment.residual_n(x[k], theta)).max()
-            violation_n = max(violation_n, float(here))
+            squares.append(segment.observation.squared_distances_m2(projected, own[k]))
+            if tangent:
+                violation_n = max(violation_n, tangent.violation_n)
+            else:
+                residual = segment.residual_n(x[k], settings[k])
+                violation_n = max(violation_n, float(np.abs(residual).max()))
         distances = np.concatenate(squares)
         line = Iteration(
             number=self.sweeps,
             loss=loss,
             rms_m=float(np.sqrt(distances.mean())) if len(distances) else 0.0,
             violation_n=violation_n,
-            theta=theta,
+            theta=self.collocation.parameters.theta(q),
             time_s=time.perf_counter() - self.began,
         )
         self.history.append(line)

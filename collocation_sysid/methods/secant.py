@@ -20,8 +20,8 @@ LARGEST_SHARE = 0.9
 
 
 def updated(b: Array, before: Point, after: Point) -> Array:
-    """B (nq, nq) after a step between two points."""
-    step = after.q - before.q
+    """B (np, np) after a step between two points."""
+    step = after.p - before.p
     change = after.slope.T @ after.residual - before.slope.T @ before.residual
     wanted = (after.slope - before.slope).T @ after.residual  # B · step
     along = float(change @ step)
@@ -40,9 +40,9 @@ def with_curvature(triangle: Array, right: Array, b: Array) -> tuple[Array, Arra
 
     Parameters
     ----------
-    triangle : (nq, nq) R, upper triangular
-    right : (nq,) c
-    b : (nq, nq)
+    triangle : (np, np) R, upper triangular
+    right : (np,) c
+    b : (np, np)
     """
     if not b.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
         return triangle, right

@@ -51,4 +51,6 @@ def carried_rigidly(segment: Segment, theta: Theta) -> Array:
         carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
         x = carried.reshape(len(t_s), -1)
     x[:, segment.held_dofs] = segment.held_positions
+    if segment.dynamics.taken is not None:
+        x[segment.dynamics.taken] = segment.taken_positions
     return x

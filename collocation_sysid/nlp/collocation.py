@@ -1,7 +1,7 @@
 """The collocation NLP: all node positions at all timesteps beside the parameters.
 
-    minimise   L(q, x) = Σ ‖(ŷ − h(x)) / σ‖² + priors(q)
-    subject to c_{e,t,i}(x, θ(q)) = 0 for free dofs, and x_{e,t,i} = u_t x̄_i for grasped ones.
+    minimise   L(q, x, φ) = Σ ρ(‖(ŷ − y(x, φ)) / σ‖) + priors(q) + Σ φ²
+    subject to c_{e,t,i}(x, θ(q), φ) = 0 for free dofs, x_{e,t,i} = u_t x̄_i for grasped ones.
 
 Variables z, in this order:
 
@@ -9,6 +9,7 @@ Variables z, in this order:
 q                  ln of each estimated parameter, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
+φ_e                the own unknowns of experiment e, see `nlp.local`; experiment by experiment
 =================  =========================================================================
 
 Constraints g, in this order:
@@ -17,8 +18,8 @@ Constraints g, in this order:
 c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start in
                    equilibrium) or 1, free dofs i ascending; f_e is the mean of
                    |∂c_t/∂x_t| ℓ_e at the guess
-(x − u x̄) / ℓ_e    only with explicit grasps: then every dof has a row, and the grasped
-                   ones have this
+(x − u x̄) / ℓ_e    for dofs grasped for a while only, in place of c at those times; and with
+                   explicit grasps for all grasped ones, so that every dof has a row
 =================  =========================================================================
 """
 
@@ -36,6 +37,7 @@ from ..errors import InputError
 from ..experiment.experiment import Experiment
 from .parameters import Parameters, Theta
 from .segment import Segment
+from .setting import Setting
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -71,6 +73,8 @@ class Collocation:
         Grid steps between samples.
     explicit_grasps : bool, default False
         Grasped nodes as constraint rows instead of bounds.
+    huber : float, optional
+        Huber's loss beyond this many standard deviations, see `Observation`.
 
     Raises
     ------
@@ -85,23 +89,29 @@ class Collocation:
         scheme: str = "midpoint",
         substeps: int = 1,
         explicit_grasps: bool = False,
+        huber: float | None = None,
     ) -> None:
         fitted = [experiment for experiment in experiments if not experiment.validation]
         if not fitted:
             raise InputError("every experiment is for validation: there is nothing to fit")
         if substeps < 1:
             raise InputError(f"substeps = {substeps}, expected at least 1")
+        if huber is not None and not huber > 0:
+            raise InputError(f"huber = {huber:g}, expected a positive number", None, "solver")
         self.parameters = parameters
+        self.huber = huber
         self.scheme = scheme
         self.substeps = substeps
         self.nq = len(parameters.free)
         theta = parameters.theta(parameters.guess_q)
         self.segments = [
-            Segment(experiment, scheme, substeps, theta, self.nq, explicit_grasps)
+            Segment(experiment, scheme, substeps, theta, self.nq, explicit_grasps, huber)
             for experiment in fitted
         ]
         sizes = [segment.variables for segment in self.segments]
         self._x_starts = self.nq + np.concatenate([[0], np.cumsum(sizes)])
+        own = [segment.local.size for segment in self.segments]
+        self._phi_starts = self._x_starts[-1] + np.concatenate([[0], np.cumsum(own)])
         rows = [segment.constraints for segment in self.segments]
         self._row_starts = np.concatenate([[0], np.cumsum(rows)])
         self.loss_scale = 1.0 / max(1, self.measurements)
@@ -111,7 +121,12 @@ class Collocation:
     @property
     def variables(self) -> int:
         """Length of z."""
-        return int(self._x_starts[-1])
+        return int(self._phi_starts[-1])
+
+    @property
+    def own(self) -> int:
+        """Number of the experiments' own unknowns φ, all together."""
+        return int(self._phi_starts[-1] - self._phi_starts[0])
 
     @property
     def constraints(self) -> int:
@@ -123,21 +138,79 @@ class Collocation:
         """Scalar measurements that are present."""
         return sum(segment.observation.count for segment in self.segments)
 
-    def pack(self, q: Array, positions: Sequence[Array]) -> Array:
-        """Variables z from q (nq,) and positions (N, 3n) [m] of each experiment."""
+    def pack(
+        self, q: Array, positions: Sequence[Array], own: Sequence[Array] | None = None
+    ) -> Array:
+        """Variables z from q (nq,), and each experiment's positions (N, 3n) [m] and φ (or zero)."""
         scaled = [
             np.ravel(x) / segment.length_m
             for x, segment in zip(positions, self.segments, strict=True)
         ]
-        return np.concatenate([q, *scaled])
+        return np.concatenate([q, *scaled, *(own or [np.zeros(self.own)])])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Inverse of `pack`."""
+        """Parameters q and positions, as `pack` takes them."""
         positions = [
             z[a:b].reshape(segment.grid_rows, segment.dofs) * segment.length_m
             for segment, a, b in self._spans()
         ]
         return z[: self.nq], positions
+
+    def unpack_own(self, z: Array) -> list[Array]:
+        """φ of each experiment."""
+        return [z[a:b] for a, b in self._phi_spans()]
+
+    @cached_property
+    def places(self) -> list[Index]:
+        """Positions of each experiment's (q, φ_e) in p = (q, φ_1, φ_2, …)."""
+        shared, first = np.arange(self.nq), self.nq - self._phi_starts[0]
+        return [np.concatenate([shared, np.arange(a, b) + first]) for a, b in self._phi_spans()]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each entry of p is: the parameters' names, then the experiments' own unknowns."""
+        own = [name for segment in self.segments for name in segment.local.names]
+        return (*(item.name for item in self.parameters.free), *own)
+
+    def parameters_of(self, z: Array) -> Array:
+        """All estimated parameters p = (q, φ_1, φ_2, …)."""
+        return np.concatenate([z[: self.nq], z[self._phi_starts[0] :]])
+
+    def split(self, p: Array) -> tuple[Array, list[Array]]:
+        """Parameters q and the φ of each experiment from p."""
+        return p[: self.nq], [p[places[self.nq :]] for places in self.places]
+
+    def settings(self, p: Array) -> list[Setting]:
+        """Physical parameters of each experiment at p."""
+        q, own = self.split(p)
+        return [
+            segment.setting(self.parameters, q, phi)
+            for segment, phi in zip(self.segments, own, strict=True)
+        ]
+
+    def prior(self, p: Array) -> tuple[Array, Array]:
+        """Residuals of the priors at p, and their slopes; φ counts in its deviations."""
+        residuals, slopes = self.parameters.prior(p[: self.nq])
+        return (
+            np.concatenate([residuals, p[self.nq :]]),
+            np.concatenate([slopes, np.ones(self.own)]),
+        )
+
+    @property
+    def bounds_p(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of p."""
+        lower, upper = self.parameters.bounds_q
+        limits = np.concatenate([np.zeros(0), *(s.local.limits for s in self.segments)])
+        return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
+
+    def _phi_spans(self) -> list[tuple[int, int]]:
+        return list(zip(self._phi_starts[:-1], self._phi_starts[1:], strict=True))
+
+    def _parts(self, z: Array) -> list[tuple[Segment, Array, Array, Setting]]:
+        """Segments with their positions, φ, and setting."""
+        _, positions = self.unpack(z)
+        settings = self.settings(self.parameters_of(z))
+        return list(zip(self.segments, positions, self.unpack_own(z), settings, strict=True))
 
     def _spans(self) -> list[tuple[Segment, int, int]]:
         return list(zip(self.segments, self._x_starts[:-1], self._x_starts[1:], strict=True))
@@ -149,40 +222,40 @@ class Collocation:
         """Lower and upper bounds of z; equal for what is given."""
         lower, upper = self.parameters.bounds_q
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        return self.pack(lower, lows), self.pack(upper, highs)
+        limits = [segment.local.limits for segment in self.segments]
+        return (
+            self.pack(lower, lows, [-limit for limit in limits]),
+            self.pack(upper, highs, limits),
+        )
 
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
         """L divided by the number of measurements."""
         q, positions = self.unpack(z)
-        loss = sum(
-            segment.observation.loss(x) for segment, x in zip(self.segments, positions, strict=True)
-        )
         residuals, _ = self.parameters.prior(q)
-        return self.loss_scale * (loss + float(residuals @ residuals))
+        loss = float(residuals @ residuals)
+        for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
+            loss += segment.observation.loss(x, phi) + float(phi @ phi)
+        return self.loss_scale * loss
 
     def gradient(self, z: Array) -> Array:
         """∂objective/∂z."""
         q, positions = self.unpack(z)
         residuals, slopes = self.parameters.prior(q)
-        parts = [
-            np.ravel(segment.observation.gradient(x)) * segment.length_m
-            for segment, x in zip(self.segments, positions, strict=True)
-        ]
-        return self.loss_scale * np.concatenate([2 * residuals * slopes, *parts])
+        by_x, by_phi = [], []
+        for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
+            of_x, of_phi = segment.observation.gradient(x, phi)
+            by_x.append(of_x.ravel() * segment.length_m)
+            by_phi.append(of_phi + 2 * phi)
+        return self.loss_scale * np.concatenate([2 * residuals * slopes, *by_x, *by_phi])
 
     # Constraints ------------------------------------------------------------------------------
 
     def constraint_values(self, z: Array) -> Array:
         """g, scaled."""
-        q, positions = self.unpack(z)
-        theta = self.parameters.theta(q)
         return np.concatenate(
-            [
-                segment.constraint_values(x, theta)
-                for segment, x in zip(self.segments, positions, strict=True)
-            ]
+            [segment.constraint_values(x, setting) for segment, x, _, setting in self._parts(z)]
         )
 
     @cached_property
@@ -195,6 +268,11 @@ class Collocation:
             indptr.append(used + segment.jacobian.indptr[1:])
             indices.append(first_row + segment.jacobian.indices)
             used += segment.jacobian.nnz
+        for segment, (a, b) in zip(self.segments, self._row_spans(), strict=True):
+            moves = np.isin(np.arange(segment.local.size), segment.local.moving)
+            indptr.append(used + np.cumsum(moves * (b - a)))
+            indices.append(np.tile(np.arange(a, b), int(moves.sum())))
+            used = int(indptr[-1][-1]) if len(moves) else used
         return np.concatenate(indptr), np.concatenate(indices)
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
@@ -203,18 +281,17 @@ class Collocation:
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """G and the values of ∂g/∂z, from one evaluation of the elements."""
-        q, positions = self.unpack(z)
-        theta = self.parameters.theta(q)
-        theta_q, _ = self.parameters.theta_derivatives(q)
         values = np.empty(len(self.jacobian_structure[1])) if out is None else out
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
-        rows = np.empty(self.constraints)
+        rows, by_phi = np.empty(self.constraints), []
         used = columns.size
-        for segment, x, (a, b) in zip(self.segments, positions, self._row_spans(), strict=True):
+        for (segment, x, _, setting), (a, b) in zip(self._parts(z), self._row_spans(), strict=True):
             here = values[used : used + segment.jacobian.nnz]
-            rows[a:b], by_q = segment.constraints_and_jacobian(x, theta, theta_q, here)
-            columns[:, a:b] = by_q.T
+            rows[a:b], by_p = segment.constraints_and_jacobian(x, setting, here)
+            columns[:, a:b] = by_p[:, : self.nq].T
+            by_phi.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
+        values[used:] = np.concatenate(by_phi)
         return rows, values
 
     def jacobian(self, z: Array) -> sp.csc_array:
@@ -233,11 +310,17 @@ class Collocation:
         indices = [np.concatenate([np.arange(k) for k in counts])]
         used = int(indptr[0][-1])
         for segment, start, _ in self._spans():
-            band = segment.hessian
-            indptr.append(used + band.indptr[1:])
-            shift = np.where(band.indices < self.nq, 0, start - self.nq)
-            indices.append(band.indices + shift)
-            used += band.nnz
+            layout = segment.hessian_layout
+            indptr.append(used + layout.x_indptr[1:])
+            shift = np.where(layout.x_indices < self.nq, 0, start - self.nq)
+            indices.append(layout.x_indices + shift)
+            used += layout.x_entries
+        for (segment, start, _), (first, _) in zip(self._spans(), self._phi_spans(), strict=True):
+            layout = segment.hessian_layout
+            indptr.append(used + layout.phi_indptr[1:])
+            of_x = layout.phi_indices < segment.variables
+            indices.append(layout.phi_indices + np.where(of_x, start, first - segment.variables))
+            used += len(layout.phi_indices)
         return np.concatenate(indptr), np.concatenate(indices)
 
     @cached_property
@@ -246,31 +329,32 @@ class Collocation:
         used = self.nq * (self.nq + 1) // 2
         of_x = []
         for segment in self.segments:
-            of_x.append(used + segment.hessian_diagonal)
-            used += segment.hessian.nnz
+            of_x.append(used + segment.hessian_layout.diagonal)
+            used += segment.hessian_layout.x_entries
         return np.cumsum(np.arange(1, self.nq + 1)) - 1, np.concatenate(of_x)
 
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
     ) -> Array:
         """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
-        q, positions = self.unpack(z)
-        theta = self.parameters.theta(q)
-        theta_q, theta_qq = self.parameters.theta_derivatives(q)
+        q = z[: self.nq]
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
         used = self.nq * (self.nq + 1) // 2
-        theta_theta, first = np.zeros((4, 4)), np.zeros(4)
-        for segment, x, (a, b) in zip(self.segments, positions, self._row_spans(), strict=True):
-            here = values[used : used + segment.hessian.nnz]
-            second_here, first_here = segment.hessian_values(
-                x, theta, theta_q, multipliers[a:b], loss_weight * self.loss_scale, here
-            )
-            theta_theta += second_here
-            first += first_here
-            used += segment.hessian.nnz
+        own = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
+        by_q = np.zeros((self.nq, self.nq))
+        weight = loss_weight * self.loss_scale
+        for (segment, x, phi, setting), (a, b) in zip(
+            self._parts(z), self._row_spans(), strict=True
+        ):
+            of_x = segment.hessian_layout.x_entries
+            of_phi = segment.hessian_layout.entries - of_x
+            here = np.empty(of_x + of_phi) if of_phi else values[used : used + of_x]
+            by_q += segment.hessian_values(x, phi, setting, multipliers[a:b], weight, here)
+            if of_phi:
+                values[used : used + of_x], values[own : own + of_phi] = here[:of_x], here[of_x:]
+            used, own = used + of_x, own + of_phi
         _, slopes = self.parameters.prior(q)
-        by_q = theta_q.T @ theta_theta @ theta_q + np.einsum("k,kab->ab", first, theta_qq)
-        by_q += np.diag(2 * loss_weight * self.loss_scale * slopes**2)
+        by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
         order = np.lexsort((rows, columns))
         values[: len(rows)] = by_q[rows[order], columns[order]]
@@ -288,10 +372,11 @@ class Collocation:
         slope = self.gradient(z) + jacobian.T @ multipliers
         lower, upper = self.bounds()
         slope[lower == upper] = 0
-        near, of_q, by_q = 1e-6, slice(self.nq), slope[: self.nq]
-        at_lower, at_upper = (z - lower)[of_q] < near, (upper - z)[of_q] < near
-        by_q[at_lower] = np.minimum(by_q[at_lower], 0)
-        by_q[at_upper] = np.maximum(by_q[at_upper], 0)
+        near = 1e-6
+        for part in (slice(self.nq), slice(self._phi_starts[0], None)):
+            at_lower, at_upper = (z - lower)[part] < near, (upper - z)[part] < near
+            slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
+            slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
         return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
 
     def hessian(self, z: Array, loss_weight: float, multipliers: Array) -> sp.csc_array:
@@ -305,19 +390,15 @@ class Collocation:
 
     def violations_n(self, z: Array) -> list[Array]:
         """(N, free dofs) residual of the equations of motion of each experiment [N]."""
-        q, positions = self.unpack(z)
-        theta = self.parameters.theta(q)
-        return [s.residual_n(x, theta) for s, x in zip(self.segments, positions, strict=True)]
+        return [segment.residual_n(x, setting) for segment, x, _, setting in self._parts(z)]
 
     def largest_force_n(self, z: Array) -> float:
         """Largest internal or external force on a free dof [N], the yardstick of violations."""
-        q, positions = self.unpack(z)
-        theta = self.parameters.theta(q)
         largest = 0.0
-        for segment, x in zip(self.segments, positions, strict=True):
-            dynamics = segment.dynamics
-            internal = dynamics.body.force(*dynamics.evaluation_states(x), theta)
-            for force in (internal, dynamics.external_force_n[None]):
+        for segment, x, _, setting in self._parts(z):
+            dynamics = setting.dynamics
+            internal = dynamics.body.force(*dynamics.evaluation_states(x), setting.theta)
+            for force in (internal, dynamics.external_force_n):
                 largest = max(largest, float(np.abs(force[:, segment.free_dofs]).max()))
         return largest
 
@@ -343,8 +424,8 @@ class Collocation:
         """Root mean square distance of markers from their measurements."""
         _, positions = self.unpack(z)
         squares = samples = 0.0
-        for segment, x in zip(self.segments, positions, strict=True):
-            squares += float(segment.observation.squared_distances_m2(x).sum())
+        for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
+            squares += float(segment.observation.squared_distances_m2(x, phi).sum())
             samples += segment.experiment.markers.samples
         return float(np.sqrt(squares / max(1.0, samples)))
 

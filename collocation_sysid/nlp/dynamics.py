@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,13 @@ class Dynamics:
     tables : Tables
     t_s : (N,) grid times
     first_row : int
-    external_force_n : (3n,) gravity and other constant forces
+    mass_kg : (N, 3n) of every dof in each row, point masses included
+    weighed_kg : (N, 3n) the same at each row's evaluation, where gravity acts
+    external_force_n : (N, 3n) gravity and other forces at each row's evaluation
+    taken : (N, 3n) bool, or None where no grasp ends or begins
+        Held dofs that are free at other times: while one is held, the grasp takes what force
+        there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
+        first step, from the velocity it has.
     start_velocity_m_s : (3n,)
     """
 
@@ -59,25 +65,55 @@ class Dynamics:
     tables: Tables
     t_s: Array
     first_row: int
+    mass_kg: Array
+    weighed_kg: Array
     external_force_n: Array
+    taken: NDArray[np.bool_] | None
     start_velocity_m_s: Array
 
     @classmethod
     def of(cls, experiment: Experiment, scheme_name: str, substeps: int = 1) -> Dynamics:
         """Discretise an experiment with `substeps` steps between samples."""
-        body = experiment.body
         rows = (len(experiment.t_s) - 1) * substeps + 1
         t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
         first_row = 0 if experiment.start == "equilibrium" else 1
         scheme = scheme_named(scheme_name, experiment.start_rule)
+        tables = Tables.of(scheme, rows, first_row)
         velocity = experiment.start_velocities_m_s
+        dofs = experiment.body.pattern.size
+        lag_s = tables.p @ np.arange(tables.p.shape[1]) * (t_s[1] - t_s[0])
+        evaluated_s = t_s - lag_s
+        weighed = _per_dof(experiment.node_mass_kg(evaluated_s))
+        forces = experiment.node_forces_n(evaluated_s).reshape(rows, dofs)
+        weight = weighed * np.tile(experiment.gravity_m_s2, dofs // 3)
         return cls(
-            body,
-            Tables.of(scheme, rows, first_row),
-            t_s,
-            first_row,
-            external_force(experiment),
-            np.zeros(body.pattern.size) if velocity is None else np.ravel(velocity).astype(float),
+            body=experiment.body,
+            tables=tables,
+            t_s=t_s,
+            first_row=first_row,
+            mass_kg=_per_dof(experiment.node_mass_kg(t_s)),
+            weighed_kg=weighed,
+            external_force_n=_compact(weight + forces),
+            taken=_taken(experiment, t_s),
+            start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
+        )
+
+    def under_gravity(self, change_m_s2: Array) -> Dynamics:
+        """The same with a constant (3,) added to gravity."""
+        pull = self.weighed_kg * np.tile(change_m_s2, self.body.pattern.size // 3)
+        return replace(self, external_force_n=_compact(self.external_force_n + pull))
+
+    def first_rows(self, rows: int) -> Dynamics:
+        """The same on the first grid times only."""
+        t = self.tables
+        return replace(
+            self,
+            tables=Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
+            t_s=self.t_s[:rows],
+            mass_kg=self.mass_kg[:rows],
+            weighed_kg=self.weighed_kg[:rows],
+            external_force_n=self.external_force_n[:rows],
+            taken=None if self.taken is None else self.taken[:rows],
         )
 
     @property
@@ -128,14 +164,20 @@ class Dynamics:
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """The same from the internal forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
-        total[self.first_row :] = force + self.external_force_n
-        return self.combine(self.tables.w, total) - self.inertia(x)
+        total[self.first_row :] = force + self.external_force_n[self.first_row :]
+        return self.combine(self.tables.w, self.without_taken(total)) - self.inertia(x)
+
+    def without_taken(self, rows: Array) -> Array:
+        """Forces (N, 3n, …) with those that a passing grasp takes set to zero, in place."""
+        if self.taken is not None:
+            rows[self.taken] = 0
+        return rows
 
     def inertia(self, x: Array) -> Array:
         """Mass times acceleration of every row, (N, 3n) [N]."""
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
-        return acceleration * self.body.dof_mass
+        return acceleration * self.mass_kg
 
     def linearise(self, x: Array, theta: Theta, out: Array | None = None) -> Linearisation:
         """Forces and derivatives at the evaluation states of x (N, 3n)."""
@@ -164,10 +206,23 @@ class Dynamics:
         return -self.tables.s[:, lag] / self.step_s**2
 
 
-def external_force(experiment: Experiment) -> Array:
-    """Gravity and constant external forces of an experiment, (3n,) [N]."""
-    body = experiment.body
-    force = body.node_mass[:, None] * np.asarray(experiment.gravity_m_s2)
-    if experiment.external_force_n is not None:
-        force = force + experiment.external_force_n
-    return force.ravel()
+def _per_dof(of_nodes: Array) -> Array:
+    """(T, n) values of nodes as (T, 3n) values of their dofs."""
+    return _compact(np.repeat(of_nodes, 3, axis=1))
+
+
+def _compact(rows: Array) -> Array:
+    """The same rows; where all are equal they take the memory of one."""
+    return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
+
+
+def external_force(experiment: Experiment, time_s: float) -> Array:
+    """Gravity and other forces of an experiment at a time, (3n,) [N]."""
+    weight = experiment.node_mass_kg(time_s)[0, :, None] * experiment.gravity_m_s2
+    return (weight + experiment.node_forces_n(time_s)[0]).ravel()
+
+
+def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_] | None:
+    held, _ = experiment.grasped(t_s)
+    held[:, experiment.held_nodes] = False
+    return np.repeat(held, 3, axis=1) if held.any() else None

@@ -11,7 +11,7 @@ from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from .dynamics import Dynamics
 from .lapack import one_blas_thread
-from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
+from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .parameters import Theta
 from .rest import start_state
 from .stopwatch import Stopwatch
@@ -64,13 +64,13 @@ def march_on(
     failure : SimulationError or None
         Why it stopped.
     """
-    solver = Solver(experiment, options, stopwatch)
-    held = experiment.held_positions(dynamics.t_s).reshape(dynamics.rows, -1)
+    solvers = Solvers(experiment, options, stopwatch)
+    held, held_positions = experiment.grasped(dynamics.t_s)
     x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
     if known is None:
         try:
-            x[0], v0 = start_state(experiment, theta, solver)
+            x[0], v0 = start_state(experiment, theta, solvers.holding(held[0]))
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
@@ -81,16 +81,21 @@ def march_on(
     first, seen = dynamics.first_row, done - dynamics.first_row
     if seen > 0:
         internal = dynamics.body.force(xi[:seen], nu[:seen], theta)
-        forces[first:done] = internal + dynamics.external_force_n
+        forces[first:done] = internal + dynamics.external_force_n[first:done]
+    dynamics.without_taken(forces)
     for t in range(done, dynamics.rows):
         row = _Row(dynamics, theta, x, forces, t)
+        solver = solvers.holding(held[t])
         guess = _predicted(x[:t], dynamics.step_s * v0)
+        goal = held_positions[t].ravel()[solver.held]
         try:
-            x[t] = _solve_row(solver, row, guess, x[t - 1], held[t])
+            x[t] = _solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
             return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
         forces[t] = row.force(x[t])
+        if dynamics.taken is not None:
+            forces[t, dynamics.taken[t]] = 0
         if progress:
             progress(t / (dynamics.rows - 1))
     return x, None
@@ -108,7 +113,8 @@ class _Row:
 
     def __init__(self, dynamics: Dynamics, theta: Theta, x: Array, forces: Array, t: int) -> None:
         self.dynamics, self.theta = dynamics, theta
-        table, step, mass = dynamics.tables, dynamics.step_s, dynamics.body.dof_mass
+        table, step = dynamics.tables, dynamics.step_s
+        self.mass, self.load = dynamics.mass_kg[t], dynamics.external_force_n[t]
         past = range(1, min(dynamics.reach, t) + 1)
         zero = np.zeros(x.shape[1])
         self.p, self.q = table.p[t, 0], table.q[t, 0] / step
@@ -116,29 +122,28 @@ class _Row:
         self.xi = sum((table.p[t, i] * x[t - i] for i in past), zero)
         self.nu = sum((table.q[t, i] * x[t - i] for i in past), zero) / step
         self.known = sum((table.w[t, j] * forces[t - j] for j in past), zero)
-        self.known -= mass * sum((table.s[t, i] * x[t - i] for i in past), zero) / step**2
-        self.known -= mass * table.r[t] * dynamics.start_velocity_m_s / step
+        self.known -= self.mass * sum((table.s[t, i] * x[t - i] for i in past), zero) / step**2
+        self.known -= self.mass * table.r[t] * dynamics.start_velocity_m_s / step
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        force = self.dynamics.body.force(*self._states(x), self.theta)[0]
-        return force + self.dynamics.external_force_n
+        return self.dynamics.body.force(*self._states(x), self.theta)[0] + self.load
 
     def _states(self, x: Array) -> tuple[Array, Array]:
         return (self.xi + self.p * x)[None], (self.nu + self.q * x)[None]
 
     def residual(self, x: Array) -> Array:
         """c_t."""
-        return self.w * self.force(x) + self.known - self.s * self.dynamics.body.dof_mass * x
+        return self.w * self.force(x) + self.known - self.s * self.mass * x
 
     def linearise(self, x: Array) -> tuple[Array, Array]:
         """c_t and the lower triangle of −∂c_t/∂x_t."""
         body = self.dynamics.body
         at = body.linearise(*self._states(x), self.theta)
         matrix = -self.w * (self.p * at.by_position[0] + self.q * at.by_velocity[0])
-        matrix[body.pattern.diagonal] += self.s * body.dof_mass
-        force = at.force[0] + self.dynamics.external_force_n
-        return self.w * force + self.known - self.s * body.dof_mass * x, matrix
+        matrix[body.pattern.diagonal] += self.s * self.mass
+        force = at.force[0] + self.load
+        return self.w * force + self.known - self.s * self.mass * x, matrix
 
 
 def _solve_row(solver: Solver, row: _Row, guess: Array, previous: Array, held: Array) -> Array:

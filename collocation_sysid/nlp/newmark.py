@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
-from .newton import NewtonFailure, NewtonOptions, Solver, simulation_error
+from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .parameters import Theta
 from .rest import start_state
 
@@ -20,7 +20,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
-class _NewmarkState:
+class _State:
     """Positions, velocities and accelerations at one time, each (3n,)."""
 
     t_s: float
@@ -38,95 +38,125 @@ def newmark(
     progress: Progress | None,
 ) -> tuple[Array, Array]:
     """Positions and velocities (T, 3n) at the samples."""
-    solver = Solver(experiment, options)
+    stepper = _Stepper(experiment, theta, options)
     times = experiment.t_s
-    x, v = (np.zeros((len(times), solver.body.pattern.size)) for _ in range(2))
-    x[0], v[0] = start_state(experiment, theta, solver)
-    load = external_force(experiment)
-    force = solver.body.force(x[:1], v[:1], theta)[0] + load
-    acceleration = force / solver.body.dof_mass
-    acceleration[solver.held] = 0.0
-    state = _NewmarkState(float(times[0]), x[0], v[0], acceleration)
+    x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
+    state = stepper.start()
+    x[0], v[0] = state.x, state.v
     step = experiment.timestep_s / steps_per_sample
     for k in range(1, len(times)):
         for j in range(1, steps_per_sample + 1):
-            goal = float(times[k - 1] + j * step)
-            state = _advance_to(experiment, solver, theta, load, state, goal)
+            state = stepper.advance(state, float(times[k - 1] + j * step))
         x[k], v[k] = state.x, state.v
         if progress:
             progress(k / (len(times) - 1))
     return x, v
 
 
-def _advance_to(
-    experiment: Experiment,
-    solver: Solver,
-    theta: Theta,
-    load: Array,
-    state: _NewmarkState,
-    goal_s: float,
-) -> _NewmarkState:
-    """Advance to `goal_s`, in halves where Newton fails."""
-    smallest = (goal_s - state.t_s) * 0.5**solver.options.halvings
-    step = goal_s - state.t_s
-    while goal_s - state.t_s > 0.5 * smallest:
-        try:
-            end = goal_s if step >= goal_s - state.t_s else state.t_s + step
-            state = _step(experiment, solver, theta, load, state, end)
-        except NewtonFailure as failure:
-            step /= 2
-            if step < smallest:
-                raise simulation_error(solver, failure, state.t_s, "a Newmark step") from failure
-    return state
+class _Stepper:
+    """Newmark steps of one experiment."""
 
+    def __init__(self, experiment: Experiment, theta: Theta, options: NewtonOptions | None) -> None:
+        self.experiment, self.theta = experiment, theta
+        self.body = experiment.body
+        self.options = options or NewtonOptions()
+        self.solvers = Solvers(experiment, options)
 
-def _step(
-    experiment: Experiment,
-    solver: Solver,
-    theta: Theta,
-    load: Array,
-    state: _NewmarkState,
-    end_s: float,
-) -> _NewmarkState:
-    """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
-    body, h = solver.body, end_s - state.t_s
-    x_held, v_held, a_held = _held_motion(experiment, end_s, h)
-    slope = 2.0 / h
-    known_v = -slope * state.x - state.v
-    known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
+    def start(self) -> _State:
+        """The experiment's start."""
+        time_s = float(self.experiment.t_s[0])
+        solver = self._solver(time_s)
+        x, v = start_state(self.experiment, self.theta, solver)
+        return self._balanced(_State(time_s, x, v, np.zeros_like(x)), time_s, solver.free)
 
-    def kinematics(x: Array) -> tuple[Array, Array]:
-        v, a = slope * x + known_v, slope**2 * x + known_a
-        # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-        v[solver.held], a[solver.held] = v_held, a_held
-        return v, a
+    def advance(self, state: _State, goal_s: float) -> _State:
+        """Advance to `goal_s`, in halves where Newton fails."""
+        step = goal_s - state.t_s
+        smallest = step * 0.5**self.options.halvings
+        state = self._after_a_change(state, goal_s)
+        while goal_s - state.t_s > 0.5 * smallest:
+            solver = self._solver(goal_s)
+            try:
+                end_s = goal_s if step >= goal_s - state.t_s else state.t_s + step
+                state = self._step(solver, state, end_s, goal_s)
+            except NewtonFailure as failure:
+                step /= 2
+                if step < smallest:
+                    raise simulation_error(
+                        solver, failure, state.t_s, "a Newmark step"
+                    ) from failure
+        return state
 
-    def residual(x: Array) -> Array:
-        v, a = kinematics(x)
-        return body.force(x, v, theta)[0] + load - body.dof_mass * a
+    def _solver(self, time_s: float) -> Solver:
+        return self.solvers.holding(self.experiment.grasped(time_s)[0][0])
 
-    def linearise(x: Array) -> tuple[Array, Array]:
-        v, a = kinematics(x)
-        at = body.linearise(x, v, theta)
-        matrix = -(at.by_position[0] + slope * at.by_velocity[0])
-        matrix[body.pattern.diagonal] += slope**2 * body.dof_mass
-        return at.force[0] + load - body.dof_mass * a, matrix
+    def _mass(self, time_s: float) -> Array:
+        return np.repeat(self.experiment.node_mass_kg(time_s)[0], 3)
 
-    guess = state.x + h * state.v + 0.5 * h * h * state.a
-    guess[solver.held] = x_held
-    if not solver.is_upright(guess):
-        guess = state.x.copy()
+    def _after_a_change(self, state: _State, goal_s: float) -> _State:
+        """The state with the accelerations after nodes are let go or a mass has joined."""
+        before, after = self._solver(state.t_s), self._solver(goal_s)
+        joined = self._mass(goal_s) != self._mass(state.t_s)
+        if before is after and not joined.any():
+            return state
+        jumps = np.union1d(np.setdiff1d(after.free, before.free), np.flatnonzero(joined))
+        return self._balanced(state, goal_s, np.intersect1d(jumps, after.free))
+
+    def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
+        """The state with accelerations of some dofs from the forces on them."""
+        force = self.body.force(state.x, state.v, self.theta)[0]
+        force += external_force(self.experiment, load_s)
+        acceleration = state.a.copy()
+        acceleration[dofs] = (force / self._mass(load_s))[dofs]
+        return replace(state, a=acceleration)
+
+    def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
+        """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
+        body, theta, h = self.body, self.theta, end_s - state.t_s
+        load, mass = external_force(self.experiment, load_s), self._mass(load_s)
+        x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
+        slope = 2.0 / h
+        known_v = -slope * state.x - state.v
+        known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
+
+        def kinematics(x: Array) -> tuple[Array, Array]:
+            v, a = slope * x + known_v, slope**2 * x + known_a
+            # Finite differences of a grasp's motion ring under this rule; its own motion does not.
+            v[solver.held], a[solver.held] = v_held, a_held
+            return v, a
+
+        def residual(x: Array) -> Array:
+            v, a = kinematics(x)
+            return body.force(x, v, theta)[0] + load - mass * a
+
+        def linearise(x: Array) -> tuple[Array, Array]:
+            v, a = kinematics(x)
+            at = body.linearise(x, v, theta)
+            matrix = -(at.by_position[0] + slope * at.by_velocity[0])
+            matrix[body.pattern.diagonal] += slope**2 * mass
+            return at.force[0] + load - mass * a, matrix
+
+        guess = state.x + h * state.v + 0.5 * h * h * state.a
         guess[solver.held] = x_held
-    x = solver.newton(guess, residual, linearise)
-    return _NewmarkState(end_s, x, *kinematics(x))
+        if not solver.is_upright(guess):
+            guess = state.x.copy()
+            guess[solver.held] = x_held
+        x = solver.newton(guess, residual, linearise)
+        return _State(end_s, x, *kinematics(x))
 
-
-def _held_motion(experiment: Experiment, time_s: float, h: float) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration of the held dofs, by central differences."""
-    times = np.clip([time_s - h, time_s, time_s + h], experiment.t_s[0], experiment.t_s[-1])
-    before, now, after = experiment.held_positions(times).reshape(3, -1)
-    span = times[2] - times[0]
-    velocity = (after - before) / span
-    if times[2] - times[1] < 0.5 * h:
-        return now, velocity, np.zeros_like(now)
-    return now, velocity, (after - 2 * now + before) / h**2
+    def _held_motion(
+        self, solver: Solver, time_s: float, h: float, holding_s: float
+    ) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration of the held dofs, by central differences."""
+        experiment = self.experiment
+        times = np.clip([time_s - h, time_s, time_s + h], experiment.t_s[0], experiment.t_s[-1])
+        carried = np.zeros((3, *experiment.body.nodes_m.shape))
+        for grasp in experiment.grasps:
+            if grasp.holds(holding_s):
+                carried[:, grasp.nodes] = grasp.carry(experiment.body.nodes_m, times)
+        before, now, after = carried.reshape(3, -1)[:, solver.held]
+        span = times[2] - times[0]
+        velocity = (after - before) / span
+        if times[2] - times[1] < 0.5 * h:
+            return now, velocity, np.zeros_like(now)
+        return now, velocity, (after - 2 * now + before) / h**2

@@ -58,9 +58,11 @@ class Solver:
     Parameters
     ----------
     experiment : Experiment
-        Its body and which nodes are held.
+        Its body and grasps.
     options : NewtonOptions
     stopwatch : Stopwatch, optional
+    held : (n,) bool, optional
+        Which nodes are held; those at the experiment's first time by default.
     """
 
     def __init__(
@@ -68,12 +70,15 @@ class Solver:
         experiment: Experiment,
         options: NewtonOptions | None = None,
         stopwatch: Stopwatch | None = None,
+        held: NDArray[np.bool_] | None = None,
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         self.options = options or NewtonOptions()
-        self.free = dofs_of(experiment.free_nodes)
-        self.held = dofs_of(experiment.held_nodes)
+        at_start = experiment.grasped(experiment.t_s[:1])[0][0]
+        holding = at_start if held is None else held
+        self.free = dofs_of(np.flatnonzero(~holding))
+        self.held = dofs_of(np.flatnonzero(holding))
         self.factoriser = Factoriser.of(self.body.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 
@@ -165,6 +170,26 @@ class Solver:
     def worst_element(self, x: Array) -> int:
         """The element with the smallest det F."""
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
+
+
+class Solvers:
+    """The solvers of an experiment, one for each set of nodes that is held at some time."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        options: NewtonOptions | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        self._arguments = (experiment, options, stopwatch)
+        self._known: dict[bytes, Solver] = {}
+
+    def holding(self, held: NDArray[np.bool_]) -> Solver:
+        """The solver with these nodes (n,) held."""
+        key = held.tobytes()
+        if key not in self._known:
+            self._known[key] = Solver(*self._arguments, held)
+        return self._known[key]
 
 
 def simulation_error(

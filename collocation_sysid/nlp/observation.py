@@ -1,33 +1,51 @@
-"""The loss of one experiment: squared marker residuals in units of their standard deviation."""
+"""The loss of one experiment: marker residuals in units of their standard deviation.
+
+A marker reads, from node positions x and the experiment's own unknowns φ (`nlp.local`),
+
+    y = R(a) (Σ_i ℓ_i(τ) h(x_i) − c) + c + d + b,
+
+with ℓ the Lagrange weights of up to five neighbouring samples at the shifted time, and the plain
+h(x_t) without φ. One sample's residual and loss are CasADi expressions in its few inputs
+u = (h(x_i), φ of its marker), mapped over all samples; linear operators lead from (x, φ) to u.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..experiment.markers import Markers
-from ..fem.pattern import SymmetricPattern
+from .local import Local, rotation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+# Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
+NEIGHBOURS = 5
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """L(x) = Σ ‖(ŷ_t − h(x_t)) / σ‖² over present samples of the tracks.
+    """L(x, φ) = Σ ρ(‖(ŷ_t − y(x, φ)) / σ‖) over present samples of the tracks.
 
     Attributes
     ----------
     markers : Markers
     grid_rows : (T,) row of the collocation grid at each sample
+    local : Local
+    huber : float or None
+        Huber's loss: ρ(d) = d² up to this many standard deviations, linear beyond; d² without it.
     """
 
     markers: Markers
     grid_rows: Index
+    local: Local
+    huber: float | None = None
 
     @property
     def count(self) -> int:
@@ -40,72 +58,281 @@ class Observation:
         weights = self.markers.present / self.markers.sigma_m
         return np.repeat(weights, 3, axis=1)
 
+    # One sample -------------------------------------------------------------------------------
+
     @cached_property
-    def _measured(self) -> Array:
-        tracks = self.markers.positions_m
-        return np.nan_to_num(tracks).reshape(len(tracks), -1)
+    def _neighbours(self) -> int:
+        shifted = len(self.local.places("time")) > 0
+        return min(NEIGHBOURS, len(self.grid_rows)) if shifted else 1
 
-    def residuals(self, x: Array) -> Array:
-        """(T, 3M) of (h(x_t) − ŷ_t) / σ at grid positions x (N, 3n); zero where missing."""
-        predicted = (self.markers.operator @ x[self.grid_rows].T).T
-        return (predicted - self._measured) * self.weights
+    @cached_property
+    def _window(self) -> Index:
+        """(T, neighbours) samples that each one is interpolated from."""
+        samples = np.arange(len(self.grid_rows))
+        first = np.clip(samples - self._neighbours // 2, 0, len(samples) - self._neighbours)
+        return first[:, None] + np.arange(self._neighbours)
 
-    def linearised(self, x: Array, step: Array, by_q: Array) -> tuple[Array, Array]:
-        """Residuals after a step of the positions, and their derivative by q.
+    @cached_property
+    def _own(self) -> Index:
+        """(M, f) positions in φ of what each marker's reading depends on."""
+        common = self.local.places("time", "turn", "shift")
+        offsets = self.local.places("offset").reshape(-1, 3)
+        if not len(offsets):
+            offsets = np.zeros((len(self.markers.names), 0), dtype=np.int64)
+        return np.hstack([offsets, np.tile(common, (len(offsets), 1))])
 
-        Only samples within the rows given count.
+    @cached_property
+    def _sample(self) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """Reading with slope by u, and loss with gradient and Hessian, of one sample."""
+        nodes = ca.SX.sym("h", 3 * self._neighbours)
+        own = ca.SX.sym("phi", self._own.shape[1])
+        data = ca.SX.sym("data", 3 + 1 + 1 + 3)  # ŷ, 1/σ, place in the window, c
+        measured, weight, place, pivot = ca.vertsplit(data, [0, 3, 4, 5, 8])
+        u = ca.vertcat(nodes, own)
+        residual = weight * (self._reading(nodes, own, place, pivot) - measured)
+        square = ca.sumsqr(residual)
+        loss = square
+        if self.huber is not None:
+            limit = self.huber**2
+            beyond = 2 * self.huber * ca.sqrt(ca.fmax(square, limit)) - limit
+            loss = ca.if_else(square > limit, beyond, square)
+        hessian, gradient = ca.hessian(loss, u)
+        return (
+            ca.Function("value", [u, data], [residual]),
+            ca.Function("slope", [u, data], [residual, ca.densify(ca.jacobian(residual, u))]),
+            ca.Function("loss", [u, data], [loss, gradient, ca.densify(hessian)], {"cse": True}),
+        )
+
+    def _reading(self, nodes: ca.SX, own: ca.SX, place: ca.SX, pivot: ca.SX) -> ca.SX:
+        """Y of one sample."""
+        scale = self.local.scales[self._own[0]]
+        kinds = [self.local.kinds[i] for i in self._own[0]]
+
+        def values(kind: str) -> ca.SX:
+            chosen = [i for i, name in enumerate(kinds) if name == kind]
+            return own[chosen] * scale[chosen]
+
+        at = ca.reshape(nodes, 3, self._neighbours)
+        reading = at[:, 0]
+        if "time" in kinds:
+            step_s = float(self.markers.t_s[1] - self.markers.t_s[0])
+            reading = at @ lagrange_weights(place + values("time") / step_s, self._neighbours)
+        if "turn" in kinds:
+            reading = rotation(values("turn")) @ (reading - pivot) + pivot
+        if "shift" in kinds:
+            reading += values("shift")
+        if "offset" in kinds:
+            reading += values("offset")
+        return reading
+
+    @cached_property
+    def _data(self) -> Array:
+        """(8, T, M) measured position, 1/σ, place in the window, and pivot of every sample."""
+        tracks = np.nan_to_num(self.markers.positions_m)
+        samples, count = tracks.shape[:2]
+        place = np.arange(samples) - self._window[:, 0]
+        pivot = np.nanmean(self.markers.positions_m[self.markers.present.any(axis=1)][0], axis=0)
+        return np.stack(
+            [
+                *np.moveaxis(tracks, 2, 0),
+                self.weights[:, ::3],
+                np.broadcast_to(place[:, None], (samples, count)),
+                *np.broadcast_to(pivot[:, None, None], (3, samples, count)),
+            ]
+        )
+
+    def _inputs(self, x: Array, phi: Array, samples: int) -> Array:
+        """(3 neighbours + f, samples, M): u of the first samples."""
+        rows = self.grid_rows[: self._window[samples - 1, -1] + 1]
+        at = self.markers.observe(x[rows].reshape(len(rows), -1, 3))  # (·, M, 3)
+        around = np.moveaxis(at[self._window[:samples]], (1, 3), (0, 1))
+        own = np.broadcast_to(phi[self._own].T[:, None], (self._own.shape[1], *around.shape[2:]))
+        return np.concatenate([around.reshape(-1, *around.shape[2:]), own])
+
+    def _mapped(self, function: int, u: Array, data: Array | None = None) -> list[Array]:
+        """Outputs of a function of `_sample` for the first samples, (…, samples, M) each."""
+        samples, count = u.shape[1:]
+        data = self._data[:, :samples] if data is None else data
+        chosen = self._sample[function]
+        outputs = chosen.map(samples * count)(u.reshape(len(u), -1), data.reshape(len(data), -1))
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        shaped = []
+        for k, output in enumerate(outputs):
+            rows, columns = chosen.size_out(k)
+            full = output.full().reshape(rows, samples * count, columns).transpose(0, 2, 1)
+            shaped.append(full.reshape(rows, columns, samples, count))
+        return shaped
+
+    # All samples ------------------------------------------------------------------------------
+
+    def residuals(self, x: Array, phi: Array) -> Array:
+        """(T, 3M) of (y − ŷ) / σ at grid positions x (N, 3n); zero where missing."""
+        (values,) = self._mapped(0, self._inputs(x, phi, len(self.grid_rows)))
+        return np.moveaxis(values[:, 0], 0, 2).reshape(values.shape[2], -1)
+
+    def at_samples(self, by_p: Array) -> Array:
+        """Derivatives of h(x) at the samples, (R, 3M, m), from those of the first rows of x."""
+        rows = self.grid_rows[self.grid_rows < len(by_p)]
+        _, dofs, moving = by_p.shape
+        columns = by_p[rows].transpose(1, 0, 2).reshape(dofs, len(rows) * moving)
+        at = self.markers.operator @ columns
+        return at.reshape(len(at), len(rows), moving).transpose(1, 0, 2)
+
+    def linearised(
+        self, x: Array, phi: Array, at_samples: Array, columns: Index, shared: int
+    ) -> tuple[Array, Array]:
+        """Residuals, and their slopes by the parameters (q, φ) of the experiment.
+
+        Only samples that are read from the rows given count.
 
         Parameters
         ----------
-        x, step : (rows, 3n), the first grid rows
-        by_q : (rows, 3n, nq)
+        x : (rows, 3n), the first grid rows
+        phi : (k,)
+        at_samples : (R, 3M, len(columns)) derivatives of h(x) by those of (q, φ) that move the body
+        columns : positions of those in (q, φ)
+        shared : number of q
 
         Returns
         -------
-        residual : (t · 3M,) ndarray, slope : (t · 3M, nq) ndarray
+        residual : (t, M, 3) ndarray, slope : (t, M, 3, shared + k) ndarray
         """
-        rows = self.grid_rows[self.grid_rows < len(x)]
-        count, operator = len(rows), self.markers.operator
-        weights = self.weights[:count]
-        predicted = (operator @ (x[rows] + step[rows]).T).T
-        residual = (predicted - self._measured[:count]) * weights
-        _, dofs, nq = by_q.shape
-        columns = by_q[rows].transpose(1, 0, 2).reshape(dofs, count * nq)
-        slope = (operator @ columns).reshape(self.weights.shape[1], count, nq).transpose(1, 0, 2)
-        return residual.ravel(), (slope * weights[..., None]).reshape(residual.size, nq)
+        samples = self._readable(x)
+        count, size = len(self.markers.names), shared + self.local.size
+        if samples == 0:
+            return np.zeros((0, count, 3)), np.zeros((0, count, 3, size))
+        values, by_u = self._mapped(1, self._inputs(x, phi, samples))
+        nodes = 3 * self._neighbours
+        by_nodes = by_u[:, :nodes].reshape(3, self._neighbours, 3, samples, count)
+        around = at_samples.reshape(len(at_samples), count, 3, at_samples.shape[2])
+        around = around[self._window[:samples]]
+        slope = np.zeros((samples, count, 3, size))
+        slope[..., columns] = np.einsum("riatm,timak->tmrk", by_nodes, around, optimize=True)
+        by_own = np.moveaxis(by_u[:, nodes:], (0, 1), (2, 3))  # (t, M, 3, f)
+        for m, own in enumerate(self._own):
+            slope[:, m, :, shared + own] += np.moveaxis(by_own[:, m], 2, 0)
+        return np.moveaxis(values[:, 0], 0, 2), slope
 
-    def squared_distances_m2(self, x: Array) -> Array:
-        """Squared distances of present samples within the first grid rows x (rows, 3n)."""
-        rows = self.grid_rows[self.grid_rows < len(x)]
-        predicted = self.markers.observe(x[rows].reshape(len(rows), -1, 3))
-        squares = np.sum((predicted - self.markers.positions_m[: len(rows)]) ** 2, axis=2)
-        return squares[self.markers.present[: len(rows)]]
+    def predicted(self, x: Array, phi: Array) -> Array:
+        """Readings y (t, M, 3) [m] at the first grid positions x (rows, 3n), as far as they go."""
+        samples = self._readable(x)
+        u = self._inputs(x, phi, samples)
+        data = self._data[:, :samples].copy()
+        data[:3], data[3] = 0.0, 1.0
+        (values,) = self._mapped(0, u, data)
+        return np.moveaxis(values[:, 0], 0, 2)
 
-    def loss(self, x: Array) -> float:
-        """L(x)."""
-        return float(np.sum(self.residuals(x) ** 2))
+    def squared_distances_m2(self, x: Array, phi: Array) -> Array:
+        """Squared distances between readings of the first grid positions and present samples."""
+        samples = self._readable(x)
+        if samples == 0:
+            return np.zeros(0)
+        tracks, present = self.markers.positions_m[:samples], self.markers.present[:samples]
+        return np.sum((self.predicted(x, phi) - tracks) ** 2, axis=2)[present]
 
-    def gradient(self, x: Array) -> Array:
-        """∂L/∂x, (N, 3n)."""
-        gradient = np.zeros_like(x)
-        weighted = 2 * self.residuals(x) * self.weights
-        gradient[self.grid_rows] = (self.markers.operator.T @ weighted.T).T
-        return gradient
+    def _readable(self, x: Array) -> int:
+        """Samples that the first grid positions suffice to read."""
+        rows = np.count_nonzero(self.grid_rows < len(x))
+        return int(np.count_nonzero(self._window[:, -1] < rows))
 
-    def hessian(self, pattern: SymmetricPattern) -> tuple[Index, Array]:
-        """∂²L/∂x_t², constant, as lower-triangle positions (k,) and values (T, k)."""
-        operator = sp.coo_array(self.markers.operator)
-        row_of, dof_of = (np.asarray(index, dtype=np.int64) for index in operator.coords)
-        count = 3 * len(self.markers.names)
-        per_row = []
-        for row in range(count):
-            here = row_of == row
-            dofs, values = dof_of[here], operator.data[here]
-            a, b = np.triu_indices(len(dofs))
-            per_row.append(
-                (np.full(len(a), row), pattern.position(dofs[a], dofs[b]), values[a] * values[b])
-            )
-        rows, positions, products = (np.concatenate(part) for part in zip(*per_row, strict=True))
-        places, index = np.unique(positions, return_inverse=True)
-        spread = sp.csr_array((products, (index, rows)), shape=(len(places), count))
-        return places, 2 * (spread @ (self.weights**2).T).T
+    def loss(self, x: Array, phi: Array) -> float:
+        """L(x, φ)."""
+        return float(self._mapped(2, self._inputs(x, phi, len(self.grid_rows)))[0].sum())
+
+    def gradient(self, x: Array, phi: Array) -> tuple[Array, Array]:
+        """∂L/∂x (N, 3n) and ∂L/∂φ (k,)."""
+        slope = self._mapped(2, self._inputs(x, phi, len(self.grid_rows)))[1][:, 0]
+        nodes, own = np.split(slope, [3 * self._neighbours])
+        nodes = nodes.reshape(self._neighbours, 3, *nodes.shape[1:]).transpose(0, 2, 3, 1)
+        at = np.zeros((len(self.grid_rows), len(self.markers.names), 3))
+        for i in range(self._neighbours):
+            np.add.at(at, self._window[:, i], nodes[i])
+        by_x, by_phi = np.zeros_like(x), np.zeros(self.local.size)
+        by_x[self.grid_rows] = (self.markers.operator.T @ at.reshape(len(at), -1).T).T
+        np.add.at(by_phi, self._own, own.sum(axis=1).T)
+        return by_x, by_phi
+
+    # Second derivatives -----------------------------------------------------------------------
+
+    @cached_property
+    def _operator(self) -> sp.csr_array:
+        """U from (x, φ) stacked: rows by sample, marker, and entry of u; x by row and dof."""
+        dofs = 3 * self.markers.placement.node_count
+        columns = (self.grid_rows[-1] + 1) * dofs
+        markers, entries = len(self.markers.names), 3 * self._neighbours + self._own.shape[1]
+        reading = sp.coo_array(self.markers.operator)
+        marker, axis = np.divmod(np.asarray(reading.coords[0]), 3)
+        parts = []
+        for i in range(self._neighbours):
+            sample = np.repeat(np.arange(len(self.grid_rows)), len(marker))
+            row = (sample * markers + np.tile(marker, len(self.grid_rows))) * entries
+            row += np.tile(3 * i + axis, len(self.grid_rows))
+            first = np.repeat(self.grid_rows[self._window[:, i]] * dofs, len(marker))
+            column = first + np.tile(reading.coords[1], len(self.grid_rows))
+            parts.append((row, column, np.tile(reading.data, len(self.grid_rows))))
+        samples = np.arange(len(self.grid_rows) * markers).reshape(-1, markers, 1)
+        own = samples * entries + 3 * self._neighbours + np.arange(self._own.shape[1])
+        column = np.broadcast_to(columns + self._own, own.shape)
+        parts.append((own.ravel(), column.ravel(), np.ones(own.size)))
+        row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+        shape = (samples.size * entries, columns + self.local.size)
+        return sp.csr_array((value, (row, column)), shape=shape)
+
+    def _hessian(self, operator: sp.csr_array, by_u: Array) -> sp.coo_array:
+        """Upper triangle from the samples' own (samples, M, u, u)."""
+        entries = by_u.shape[-1]
+        blocks = by_u.reshape(-1, entries, entries)
+        indices = np.arange(len(blocks))
+        middle = sp.bsr_array((blocks, indices, np.arange(len(blocks) + 1)))
+        return sp.coo_array(sp.triu(operator.T @ (middle.tocsr() @ operator), format="coo"))
+
+    @cached_property
+    def hessian_structure(self) -> tuple[Index, Index]:
+        """Rows and columns of the entries of ∂²L/∂(x, φ)², upper triangle, sorted by column."""
+        markers, entries = len(self.markers.names), 3 * self._neighbours + self._own.shape[1]
+        ones = np.ones((len(self.grid_rows), markers, entries, entries))
+        # Positive numbers cannot cancel, so that no entry is lost.
+        found = self._hessian(abs(self._operator), ones)
+        order = np.lexsort(found.coords)
+        rows, columns = (np.asarray(index, dtype=np.int64)[order] for index in found.coords)
+        return rows, columns
+
+    def hessian(self, x: Array, phi: Array) -> Array:
+        """Values of the entries of `hessian_structure`."""
+        if self.local.size == 0 and self.huber is None:
+            return self._constant_hessian
+        return self._hessian_values(x, phi)
+
+    @cached_property
+    def _constant_hessian(self) -> Array:
+        dofs = 3 * self.markers.placement.node_count
+        return self._hessian_values(np.zeros((self.grid_rows[-1] + 1, dofs)), np.zeros(0))
+
+    def _hessian_values(self, x: Array, phi: Array) -> Array:
+        by_u = self._mapped(2, self._inputs(x, phi, len(self.grid_rows)))[2]
+        found = self._hessian(self._operator, np.moveaxis(by_u, (0, 1), (2, 3)))
+        rows, columns = self.hessian_structure
+        size = columns[-1] + 1
+        row, column = (np.asarray(index, dtype=np.int64) for index in found.coords)
+        values = np.zeros(len(rows))
+        values[np.searchsorted(columns * size + rows, column * size + row)] = found.data
+        return values
+
+
+def lagrange_weights(place: ca.SX, count: int) -> ca.SX:
+    """Weights of samples 0 … count − 1 at a place between them."""
+    return ca.vertcat(
+        *(
+            ca.SX(1.0)
+            if count == 1
+            else _product([(place - j) / (i - j) for j in range(count) if j != i])
+            for i in range(count)
+        )
+    )
+
+
+def _product(factors: list[ca.SX]) -> ca.SX:
+    result = factors[0]
+    for factor in factors[1:]:
+        result = result * factor
+    return result

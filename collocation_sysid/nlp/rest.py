@@ -35,11 +35,11 @@ def rest_state(
     solver = solver or Solver(experiment)
     t_s = np.atleast_1d(experiment.t_s[0] if time_s is None else time_s)
     body = experiment.body
-    load = external_force(experiment)
+    load = external_force(experiment, float(t_s[0]))
     elastic = Theta(theta.lambda_pa, theta.mu_pa, 0.0, 0.0)
     still = np.zeros((1, body.pattern.size))
     x = experiment.rigid_positions(t_s).ravel() if start is None else start.copy()
-    x[solver.held] = experiment.held_positions(t_s).ravel()
+    x[solver.held] = experiment.grasped(t_s)[1].ravel()[solver.held]
 
     def solve(x: Array, share: float) -> Array:
         def residual(state: Array) -> Array:

@@ -7,6 +7,7 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -16,8 +17,12 @@ from ..experiment.experiment import Experiment
 from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
 from .dynamics import Dynamics
+from .hessian_layout import HessianLayout
+from .local import Local
 from .observation import Observation
-from .parameters import Theta
+from .parameters import Parameters, Theta
+from .passing import PassingGrasps
+from .setting import Setting
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -36,10 +41,15 @@ class Segment:
     nq : int
         Number of estimated parameters.
     explicit_grasps : bool
-        Grasped nodes get rows of their own instead of bounds.
+        Grasped nodes get rows of their own instead of bounds. Those that are held only for a
+        while always do.
+    huber : float, optional
+        See `Observation`.
 
     Attributes
     ----------
+    local : Local
+        The experiment's own unknowns φ.
     rows_per_time : int
         Constraint rows of a grid time: free dofs, or all dofs with explicit grasps.
     row_dofs : (rows_per_time,) the dof of each row
@@ -53,20 +63,25 @@ class Segment:
         theta: Theta,
         nq: int,
         explicit_grasps: bool = False,
+        huber: float | None = None,
     ) -> None:
         self.experiment = experiment
         self.nq = nq
         self.body = experiment.body
         self.dynamics = Dynamics.of(experiment, scheme, substeps)
         grid = self.dynamics.t_s
-        self.observation = Observation(
-            experiment.markers, np.arange(len(experiment.t_s)) * substeps
-        )
+        self.local = Local.of(experiment)
+        samples = np.arange(len(experiment.t_s)) * substeps
+        self.observation = Observation(experiment.markers, samples, self.local, huber)
         self.explicit_grasps = explicit_grasps
         self.dofs = self.body.pattern.size
         self.free_dofs = dofs_of(experiment.free_nodes)
         self.held_dofs = dofs_of(experiment.held_nodes)
-        self.held_positions = experiment.held_positions(grid).reshape(len(grid), -1)
+        grasped = experiment.grasped(grid)[1].reshape(len(grid), -1)
+        self.held_positions = grasped[:, self.held_dofs]
+        # Positions of dofs held for a while, at the rows (t, dof) of `Dynamics.taken`.
+        taken = self.dynamics.taken
+        self.taken_positions = grasped[taken] if taken is not None else np.zeros(0)
         self.row_dofs = np.arange(self.dofs) if explicit_grasps else self.free_dofs
         self.rows_per_time = len(self.row_dofs)
         self.length_m = float(
@@ -114,21 +129,52 @@ class Segment:
             lower[0] = upper[0] = start
         return lower, upper
 
+    # Parameters -------------------------------------------------------------------------------
+
+    @cached_property
+    def moving(self) -> Index:
+        """Positions in (q, φ) of the parameters that change the motion."""
+        return np.concatenate([np.arange(self.nq), self.nq + self.local.moving])
+
+    def setting(self, parameters: Parameters, q: Array, phi: Array) -> Setting:
+        """The physical parameters at (q, φ)."""
+        theta_q, theta_qq = parameters.theta_derivatives(q)
+        dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
+        gravity_phi_phi = np.zeros((3, 0, 0))
+        moving = self.local.moving
+        if len(moving):
+            gravity, first, second = self.local.gravity(phi)
+            dynamics = dynamics.under_gravity(gravity - self.local.gravity_m_s2)
+            gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
+        return Setting(
+            parameters.theta(q), theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi
+        )
+
+    def corrected(self, phi: Array) -> Experiment:
+        """The experiment in the body's frame: gravity turned by φ."""
+        if not len(self.local.moving):
+            return self.experiment
+        return replace(self.experiment, gravity_m_s2=self.local.gravity(phi)[0])
+
     # Values ---------------------------------------------------------------------------------
 
-    def constraint_values(self, x: Array, theta: Theta) -> Array:
+    def constraint_values(self, x: Array, setting: Setting) -> Array:
         """(constraints,) scaled rows at x (N, 3n) in metres."""
-        return self._rows(x, self.dynamics.residual(x, theta))
+        return self._rows(x, setting.dynamics.residual(x, setting.theta))
 
-    def _rows(self, x: Array, residual_n: Array) -> Array:
-        rows = residual_n / self.force_n
+    def _rows(self, x: Array, residual: Array) -> Array:
+        rows = residual / self.force_n
         if self.explicit_grasps:
             rows[:, self.held_dofs] = (x[:, self.held_dofs] - self.held_positions) / self.length_m
+        taken = self.dynamics.taken
+        if taken is not None:
+            rows[taken] = (x[taken] - self.taken_positions) / self.length_m
         return rows[self.dynamics.first_row :, self.row_dofs].ravel()
 
-    def residual_n(self, x: Array, theta: Theta) -> Array:
+    def residual_n(self, x: Array, setting: Setting) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
-        return self.dynamics.residual(x, theta)[:, self.free_dofs]
+        residual = setting.dynamics.residual(x, setting.theta)
+        return self.dynamics.without_taken(residual)[:, self.free_dofs]
 
     @cached_property
     def jacobian(self) -> BlockBand:
@@ -163,7 +209,7 @@ class Segment:
         """Positions and values of the inertia, and positions of the unit grasp entries."""
         first = self.dynamics.first_row
         row_place = np.searchsorted(self.row_dofs, self.free_dofs)
-        mass = self.body.dof_mass[self.free_dofs] * self.length_m / self.force_n
+        mass = self.dynamics.mass_kg[:, self.free_dofs] * self.length_m / self.force_n
         positions, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
         for lag in range(self.dynamics.reach + 1):
             coefficient = self.dynamics.inertia_coefficient(lag)
@@ -171,41 +217,55 @@ class Segment:
             rows = rows[coefficient[rows] != 0]
             places = self.jacobian.positions(rows - lag, lag, row_place, self.free_dofs)
             positions.append(places.ravel())
-            values.append(np.outer(coefficient[rows], mass).ravel())
-        grasps = np.zeros(0, dtype=np.int64)
+            values.append((coefficient[rows, None] * mass[rows]).ravel())
+        grasps = [np.zeros(0, dtype=np.int64)]
         if self.explicit_grasps:
             rows = np.arange(first, self.grid_rows)
-            grasps = self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel()
-        return np.concatenate(positions), np.concatenate(values), grasps
+            grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
+        return np.concatenate(positions), np.concatenate(values), np.concatenate(grasps)
+
+    @cached_property
+    def _passing(self) -> PassingGrasps:
+        return PassingGrasps.of(
+            self.dynamics,
+            self.jacobian,
+            self._row_starts(),
+            self.body.pattern,
+            self.row_dofs,
+            self.length_m / self.force_n,
+        )
 
     def constraints_and_jacobian(
-        self, x: Array, theta: Theta, theta_q: Array, values: Array
+        self, x: Array, setting: Setting, values: Array
     ) -> tuple[Array, Array]:
         """Write ∂c/∂x into `values` (jacobian.nnz,).
 
         Parameters
         ----------
         x : (N, 3n) metres
-        theta_q : (4, nq) ∂θ/∂q
+        setting : Setting
 
         Returns
         -------
         rows : (constraints,) c
-        by_q : (constraints, nq) ∂c/∂q
+        by_p : (constraints, len(moving)) ∂c/∂(q, φ), where it is not zero
         """
-        dynamics = self.dynamics
-        forces = dynamics.linearise(x, theta, self.linearisation_rows)
+        dynamics = setting.dynamics
+        forces = dynamics.linearise(x, setting.theta, self.linearisation_rows)
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
         positions, inertia, grasps = self._jacobian_constants
         values[positions] += inertia
+        self._passing.correct(values, forces.by_position, forces.by_velocity)
         values[grasps] = 1.0
-        by_theta = np.zeros((self.grid_rows, self.dofs, theta_q.shape[1]))
-        by_theta[dynamics.first_row :] = forces.by_theta @ (theta_q / self.force_n)
-        by_theta = dynamics.combine(dynamics.tables.w, by_theta)
-        by_theta[:, self.held_dofs] = 0
-        by_q = by_theta[dynamics.first_row :, self.row_dofs]
+        by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
+        weighed = dynamics.weighed_kg[dynamics.first_row :]
+        by_p[dynamics.first_row :] = setting.force_slopes(forces.by_theta, weighed)
+        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p)) / self.force_n
+        dynamics.without_taken(by_p)
+        by_p[:, self.held_dofs] = 0
+        by_p = by_p[dynamics.first_row :, self.row_dofs]
         rows = self._rows(x, dynamics.assemble_residual(x, forces.force))
-        return rows, by_q.reshape(self.constraints, theta_q.shape[1])
+        return rows, by_p.reshape(self.constraints, len(self.moving))
 
     @cached_property
     def linearisation_rows(self) -> Array:
@@ -248,62 +308,81 @@ class Segment:
     def hessian_values(
         self,
         x: Array,
-        theta: Theta,
-        theta_q: Array,
+        phi: Array,
+        setting: Setting,
         multipliers: Array,
         loss_weight: float,
         values: Array,
     ) -> tuple[Array, Array]:
-        """Write the columns of x of ∇²(loss_weight · L + multipliers · c) into `values`.
+        """Write the columns of x, then of φ, of ∇²(loss_weight · L + multipliers · c).
+
+        Parameters
+        ----------
+        values : (hessian_layout.entries,) out
 
         Returns
         -------
-        theta_theta : (4, 4) ∂²(multipliers · c)/∂θ²
-        theta_gradient : (4,) ∂(multipliers · c)/∂θ
+        by_q : (nq, nq) second derivatives by q
         """
-        dynamics, band = self.dynamics, self.hessian
+        dynamics, band = setting.dynamics, self.hessian
         first = dynamics.first_row
         row_weights = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
         row_weights[first:, self.row_dofs] = by_time / self.force_n
         row_weights[:, self.held_dofs] = 0
-        weights = dynamics.combine_transposed(dynamics.tables.w, row_weights)[first:]
+        dynamics.without_taken(row_weights)
+        weights = dynamics.combine_transposed(dynamics.tables.w, row_weights)
+        weights = dynamics.without_taken(weights)[first:]
         curvature = self.body.curvature(
-            *dynamics.evaluation_states(x), weights, theta, self._curvature_rows
+            *dynamics.evaluation_states(x), weights, setting.theta, self._curvature_rows
         )
+        layout = self.hessian_layout
+        of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)
         band.fill(
-            values,
-            curvature.position_position,
-            curvature.position_velocity,
-            self.body.threads,
+            of_band, curvature.position_position, curvature.position_velocity, self.body.threads
         )
-        places, loss = self._loss_positions
-        values[places] += loss_weight * self.length_m**2 * loss
         mixed = np.zeros((2, self.grid_rows, self.dofs, self.nq))
-        mixed[0, first:] = curvature.position_theta @ theta_q
-        mixed[1, first:] = curvature.velocity_theta @ (theta_q / dynamics.step_s)
+        mixed[0, first:] = curvature.position_theta @ setting.theta_q
+        mixed[1, first:] = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
         by_theta = dynamics.combine_transposed(dynamics.tables.p, mixed[0])
         by_theta += dynamics.combine_transposed(dynamics.tables.q, mixed[1])
-        values[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
-        return curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
+        of_band[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
+        if layout.band is not None:
+            values[: layout.x_entries] = 0
+            values[layout.band] = of_band
+        values[layout.x_entries :] = 0
+        values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
+        pull = (weights * dynamics.weighed_kg[first:]).sum(axis=0).reshape(-1, 3).sum(axis=0)
+        by_phi = np.zeros((self.local.size, self.local.size))
+        by_phi[np.ix_(self.local.moving, self.local.moving)] = np.einsum(
+            "i,ijk->jk", pull, setting.gravity_phi_phi
+        )
+        by_phi += 2 * loss_weight * np.eye(self.local.size)  # the prior
+        values[layout.phi] += by_phi[np.triu_indices(self.local.size)]
+        theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
+        by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
+        return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
 
     @cached_property
     def _curvature_rows(self) -> Array:
         return np.zeros((self.constraint_times, self.body.curvature_width))
 
     @cached_property
-    def hessian_diagonal(self) -> Index:
-        """Positions of the diagonal entries of x in the values of `hessian`."""
+    def hessian_layout(self) -> HessianLayout:
+        """Structure of the columns that `hessian_values` writes."""
         dofs = np.arange(self.dofs)
-        return self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
-
-    @cached_property
-    def _loss_positions(self) -> tuple[Index, Array]:
-        """Positions of the loss's Hessian in the values, and its values in metres⁻²."""
-        pattern = self.body.pattern
-        lower, values = self.observation.hessian(pattern)
-        rows, columns = pattern.columns[lower], pattern.rows[lower]  # the upper triangle
-        return self.hessian.positions(self.observation.grid_rows, 0, rows, columns), values
+        diagonal = self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
+        rows, columns = self.observation.hessian_structure
+        return HessianLayout.of(
+            self.hessian,
+            diagonal,
+            self.variables,
+            self.nq,
+            rows,
+            columns,
+            self.local.size,
+            self.length_m,
+        )
 
     # Structure --------------------------------------------------------------------------------
 
@@ -317,7 +396,7 @@ class Segment:
         forces = self.body.linearise(at_rest, np.zeros_like(at_rest), theta)
         row = self.grid_rows - 1
         diagonal = self.body.pattern.diagonal
-        value = self.dynamics.inertia_coefficient(0)[row] * self.body.dof_mass
+        value = self.dynamics.inertia_coefficient(0)[row] * self.dynamics.mass_kg[row]
         for j, a, b in self.dynamics.block_terms(0):
             if j == 0:
                 value = value + a[row] * forces.by_position[0, diagonal]

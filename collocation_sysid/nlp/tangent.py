@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from .dynamics import Dynamics, Tables
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .parameters import Theta
 from .segment import Segment
+from .setting import Setting
 from .stopwatch import Stopwatch
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ class Tangent:
     Attributes
     ----------
     step : (N, 3n) p = −c_x⁻¹ c [m]
-    by_q : (N, 3n, nq) Z = −c_x⁻¹ c_q [m]
+    by_p : (N, 3n, m) Z = −c_x⁻¹ c_p [m]
     violation_n : float
         Largest |c|.
     indefinite : int
@@ -56,7 +56,7 @@ class Tangent:
     """
 
     step: Array
-    by_q: Array
+    by_p: Array
     violation_n: float
     indefinite: int
     memory: Memory
@@ -64,7 +64,7 @@ class Tangent:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What the next row depends on, most recent row first; (free, 1 + nq) each.
+    """What the next row depends on, most recent row first; (free, 1 + m) each.
 
     Attributes
     ----------
@@ -111,10 +111,12 @@ class BlockSolver:
         factorisation: Choice = "auto",
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
-        self.dynamics = _first_rows(segment.dynamics, rows or segment.grid_rows)
+        self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
         self.segment = segment
         self.body = segment.body
         self.free = segment.free_dofs
+        taken = self.dynamics.taken
+        self._taken = None if taken is None or not taken.any() else taken[:, self.free]
         self.factoriser = Factoriser.of(self.body.pattern, self.free, factorisation)
         full_rows, full_columns, source = self.body.pattern.full
         place = np.full(self.body.pattern.size, -1)
@@ -130,10 +132,8 @@ class BlockSolver:
         )
 
     @one_blas_thread()
-    def forward(
-        self, x: Array, theta: Theta, theta_q: Array, known: Tangent | None = None
-    ) -> Tangent:
-        """P and Z at x (N, 3n); θ_q is ∂θ/∂q (4, nq).
+    def forward(self, x: Array, setting: Setting, known: Tangent | None = None) -> Tangent:
+        """P and Z at x (N, 3n).
 
         Parameters
         ----------
@@ -145,57 +145,62 @@ class BlockSolver:
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        count = 1 + theta_q.shape[1]
+        count = 1 + len(self.segment.moving)
         columns = np.zeros((*x.shape, count))
-        march = _Forward(self, (len(self.free), count), known.memory if known else None)
+        march = _Forward(self, setting, (len(self.free), count), known.memory if known else None)
         violation, indefinite, done = 0.0, 0, 0
         if known is not None:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
-            columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_q
+            columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
         inertia = self.dynamics.inertia(x)
-        for step in self._steps(x, theta, first=done):
+        for step in self._steps(x, setting.theta, first=done):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
             residual = march.residual(step, inertia[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
-            force[:, 1:] = step.by_theta[self.free] @ theta_q
+            force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force)
         return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite, march.memory)
 
-    def sensitivities(self, x: Array, theta: Theta, theta_q: Array) -> Iterator[Array]:
-        """Z_t (3n, nq), row by row; nothing but the last few rows is kept.
+    def sensitivities(self, x: Array, setting: Setting) -> Iterator[Array]:
+        """Z_t (3n, m), row by row; nothing but the last few rows is kept.
 
         Raises
         ------
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        shape = (x.shape[1], theta_q.shape[1])
-        march = _Forward(self, (len(self.free), shape[1]))
+        shape = (x.shape[1], len(self.segment.moving))
+        march = _Forward(self, setting, (len(self.free), shape[1]))
         yield from np.zeros((self.dynamics.first_row, *shape))
-        for step in self._steps(x, theta):
+        for step in self._steps(x, setting.theta):
             row = np.zeros(shape)
-            force = step.by_theta[self.free] @ theta_q
-            row[self.free] = march.advance(step, np.zeros(march.shape), force)
+            row[self.free] = march.advance(step, np.zeros(march.shape), march.force_slopes(step))
             yield row
 
     @one_blas_thread()
     def backward(self, x: Array, theta: Theta, gradient: Array) -> Array:
-        """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m]."""
+        """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].
+
+        Dofs that a passing grasp holds have zeros.
+        """
         dynamics, reach = self.dynamics, self.dynamics.reach
         tables, step_s = dynamics.tables, dynamics.step_s
-        mass = self.body.dof_mass[self.free]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
         for step in self._steps(x, theta, backward=True):
             t = step.t
             lags = range(min(reach, t) + 1)
+            mass = dynamics.mass_kg[t, self.free]
             later = [j for j in range(1, reach + 1) if t + j < dynamics.rows]
-            known = sum(
-                (tables.w[t + j, j] * y[t + j] for j in later if tables.w[t + j, j]),
-                np.zeros(len(self.free)),
+            known = self.without_taken(
+                t,
+                sum(
+                    (tables.w[t + j, j] * y[t + j] for j in later if tables.w[t + j, j]),
+                    np.zeros(len(self.free)),
+                ),
             )
             p, q, w = tables.p[t], tables.q[t] / step_s, tables.w[t, 0]
             by_position, by_velocity = None, None
@@ -204,7 +209,7 @@ class BlockSolver:
                 by_velocity = self.apply(step.by_velocity, known)
                 pulled[t] -= p[0] * by_position + q[0] * by_velocity
             # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left, and the factor is of its negative.
-            y[t] = -step.factor.solve(pulled[t])
+            y[t] = -step.factor.solve(self.without_taken(t, pulled[t]))
             force_weight = known + w * y[t]
             by_position = self.apply(step.by_position, force_weight)
             by_velocity = self.apply(step.by_velocity, force_weight)
@@ -215,6 +220,12 @@ class BlockSolver:
         full = np.zeros_like(x)
         full[:, self.free] = y
         return full
+
+    def without_taken(self, t: int, rows: Array) -> Array:
+        """Rows (free, …) with zeros at what a passing grasp holds at t, in place."""
+        if self._taken is not None:
+            rows[self._taken[t]] = 0
+        return rows
 
     @property
     def chunk(self) -> int:
@@ -265,12 +276,17 @@ class BlockSolver:
         p = tables.w[rows, 0] * tables.p[rows, 0]
         q = tables.w[rows, 0] * tables.q[rows, 0] / step_s
         s = tables.s[rows, 0] / step_s**2
-        diagonal, mass = self.body.pattern.diagonal, self.body.dof_mass
+        pattern, mass = self.body.pattern, self.dynamics.mass_kg[rows]
+        taken = None if self.dynamics.taken is None else self.dynamics.taken[rows]
 
         def matrix(k: int) -> Array:
             values = -p[k] * at.by_position[k]
             values -= q[k] * at.by_velocity[k]
-            values[diagonal] += s[k] * mass
+            values[pattern.diagonal] += s[k] * mass[k]
+            if taken is not None and taken[k].any():
+                size = np.abs(values[pattern.diagonal]).mean()
+                values[taken[k][pattern.rows] | taken[k][pattern.columns]] = 0
+                values[pattern.diagonal[taken[k]]] = size
             return values
 
         try:
@@ -287,13 +303,17 @@ class _Forward:
     """Substitution row by row; remembers the last few rows."""
 
     def __init__(
-        self, solver: BlockSolver, shape: tuple[int, int], memory: Memory | None = None
+        self,
+        solver: BlockSolver,
+        setting: Setting,
+        shape: tuple[int, int],
+        memory: Memory | None = None,
     ) -> None:
         self.solver = solver
+        self.setting = setting
         self.shape = shape
         self.tables = solver.dynamics.tables
         self.step_s = solver.dynamics.step_s
-        self.mass = solver.body.dof_mass[solver.free, None]
         reach = solver.dynamics.reach
         nothing = (np.zeros(shape),) * reach
         memory = memory or Memory(nothing, nothing, (np.zeros(len(solver.free)),) * reach)
@@ -310,24 +330,33 @@ class _Forward:
 
     def residual(self, step: _Step, inertia: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
-        free, w = self.solver.free, self.tables.w[step.t]
-        force = step.force[free] + self.solver.dynamics.external_force_n[free]
-        total = w[0] * force - inertia[free]
+        solver, w = self.solver, self.tables.w[step.t]
+        force = (step.force + self.setting.dynamics.external_force_n[step.t])[solver.free]
+        solver.without_taken(step.t, force)
+        total = w[0] * force - inertia[solver.free]
         if self.weighs_past:
             total += weighted(w[1:], self.past_forces, force.shape)
             self.past_forces.appendleft(force)
-        return total
+        return solver.without_taken(step.t, total)
+
+    def force_slopes(self, step: _Step) -> Array:
+        """∂F/∂p on the free dofs."""
+        weighed = self.setting.dynamics.weighed_kg[step.t]
+        return self.setting.force_slopes(step.by_theta, weighed)[self.solver.free]
 
     def advance(self, step: _Step, right: Array, force: Array) -> Array:
         """Y_t from R_t and F_R, each (free, columns)."""
-        tables, t = self.tables, step.t
+        tables, t, solver = self.tables, step.t, self.solver
         w, s = tables.w[t], tables.s[t] / self.step_s**2
+        mass = solver.dynamics.mass_kg[t, solver.free, None]
         right += weighted(w[1:], self.past_increments, self.shape)
-        right -= self.mass * weighted(s[1:], self.past, self.shape)
+        right -= mass * weighted(s[1:], self.past, self.shape)
         force += self._of_past(step, tables.p[t, 1:], tables.q[t, 1:] / self.step_s)
+        solver.without_taken(t, right)
+        solver.without_taken(t, force)
         solution = step.factor.solve(right + w[0] * force)
         if self.weighs_past:
-            self.past_increments.appendleft((s[0] * self.mass * solution - right) / w[0])
+            self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
         self.past.appendleft(solution)
         return solution
 
@@ -353,10 +382,3 @@ def weighted(weights: Array, past: deque[Array], shape: tuple[int, ...]) -> Arra
         if weight:
             total += weight * item
     return total
-
-
-def _first_rows(dynamics: Dynamics, rows: int) -> Dynamics:
-    """The same dynamics on the first grid times only."""
-    t = dynamics.tables
-    tables = Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows])
-    return replace(dynamics, tables=tables, t_s=dynamics.t_s[:rows])

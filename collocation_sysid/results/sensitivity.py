@@ -1,6 +1,7 @@
-"""How the trajectory follows the parameters: Z = dx/dq with the equations of motion kept.
+"""How the trajectory follows the parameters: Z = dx/dp with the equations of motion kept.
 
-From the linearised constraints c_x Z + c_q = 0, solved forward in time by `nlp.tangent`.
+From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.tangent`; p are the
+shared parameters q and those of an experiment's own that move its body, see `Segment.moving`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """dx/dq of each experiment, (N, 3n, nq) in metres per unit of q.
+    """dx/dp of each experiment, (N, 3n, m) in metres per unit of p.
 
     Held dofs have zeros, and so has x_0 unless it is found in equilibrium.
 
@@ -31,9 +32,10 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 
 
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """d(markers)/dq of each experiment at its samples, (T, 3M, nq); column 3 m + axis.
+    """d(markers)/dp of each experiment at its samples, (T, 3M, m); column 3 m + axis.
 
-    Needs no more memory than the result.
+    Of the plain markers, h(x), by the parameters that move the body. Needs no more memory than the
+    result.
 
     Raises
     ------
@@ -49,8 +51,7 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 
 
 def _by_experiment(collocation: Collocation, z: Array) -> Iterator[tuple[Segment, Iterator[Array]]]:
-    q, positions = collocation.unpack(z)
-    theta = collocation.parameters.theta(q)
-    theta_q, _ = collocation.parameters.theta_derivatives(q)
-    for segment, x in zip(collocation.segments, positions, strict=True):
-        yield segment, BlockSolver(segment).sensitivities(x, theta, theta_q)
+    _, positions = collocation.unpack(z)
+    settings = collocation.settings(collocation.parameters_of(z))
+    for segment, x, setting in zip(collocation.segments, positions, settings, strict=True):
+        yield segment, BlockSolver(segment).sensitivities(x, setting)

@@ -1,0 +1,124 @@
+"""What a solve will cost with each method: about so much memory and time."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SimulationError
+from ..methods.reduced_space import memory_mb
+from ..nlp.collocation import Collocation
+from ..nlp.factorisation import Choice
+from ..nlp.tangent import BlockSolver
+
+Array = NDArray[np.float64]
+
+# Rows timed, and sweeps that the reduced space mostly takes.
+ROWS, SWEEPS = 12, 10
+# IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps on one core: the work of an
+# iteration grows with the nonzeros and with the unknowns of a timestep to this power.
+ITERATIONS = 10
+SECONDS, POWER = 4.5e-10, 1.4
+BYTES = 280.0
+# A method is recommended to those who would wait this long, if it takes this share of the time.
+LONG_S, MUCH_QUICKER = 60.0, 0.1
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a method takes, roughly.
+
+    Attributes
+    ----------
+    method : str
+    memory_mb : float
+    time_s : float or None
+        None where it cannot be told: the equations at the guess cannot be solved.
+    """
+
+    method: str
+    memory_mb: float
+    time_s: float | None
+
+
+def costs(
+    collocation: Collocation, z: Array, nonzeros: int, factorisation: Choice
+) -> tuple[Cost, ...]:
+    """Costs by method.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) the start
+    nonzeros : int
+        Of the Jacobian and the Hessian together.
+    factorisation : {"auto", "band", "sparse"}
+    """
+    width = max(len(segment.free_dofs) for segment in collocation.segments)
+    return (
+        Cost(
+            "reduced-space",
+            memory_mb(collocation),
+            _sweeps_s(collocation, z, factorisation),
+        ),
+        Cost(
+            "interior-point",
+            BYTES * nonzeros / 1e6,
+            ITERATIONS * SECONDS * nonzeros * width**POWER,
+        ),
+    )
+
+
+def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
+    """Whether another method is far quicker."""
+    quickest = min(others, key=lambda cost: cost.time_s or np.inf)
+    if chosen.time_s is None or quickest.time_s is None:
+        return []
+    if chosen.time_s < LONG_S or quickest.time_s > MUCH_QUICKER * chosen.time_s:
+        return []
+    return [
+        f'solver.method = "{quickest.method}" finds the same optimum much sooner than '
+        f"{chosen.method}"
+    ]
+
+
+def cost_warnings(chosen: Cost, others: Sequence[Cost]) -> list[str]:
+    """Whether the chosen method will run out of memory."""
+    available = _machine_memory_mb()
+    if available is None or chosen.memory_mb < available:
+        return []
+    fitting = [cost for cost in others if cost.memory_mb < available]
+    remedy = f'set solver.method = "{fitting[0].method}"' if fitting else "shorten window_s"
+    return [
+        f"{chosen.method} will take about {chosen.memory_mb / 1e3:.2g} GB, more than this "
+        f"machine's {available / 1e3:.2g} GB: {remedy}"
+    ]
+
+
+def _sweeps_s(collocation: Collocation, z: Array, factorisation: Choice) -> float | None:
+    """Seconds of all sweeps, from one over the first rows of each experiment."""
+    _, positions = collocation.unpack(z)
+    settings = collocation.settings(collocation.parameters_of(z))
+    total = 0.0
+    for segment, x, setting in zip(collocation.segments, positions, settings, strict=True):
+        rows = min(ROWS, segment.grid_rows)
+        solver = BlockSolver(segment, rows, factorisation=factorisation)
+        began = time.perf_counter()
+        try:
+            solver.forward(x[:rows], setting)
+        except SimulationError:
+            return None
+        total += segment.grid_rows / rows * (time.perf_counter() - began)
+    return SWEEPS * total
+
+
+def _machine_memory_mb() -> float | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
+    except (AttributeError, OSError, ValueError):  # not on every system
+        return None

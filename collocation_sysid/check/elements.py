@@ -1,0 +1,133 @@
+"""What the elements do to the answer: flat ones, locking near ν = 0.5, locking in bending."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fem.body import Body
+from ..fem.mesh import TetMesh
+from ..nlp.parameters import Theta
+
+Array = NDArray[np.float64]
+
+# Mean-ratio quality below which an element's shape functions are poor.
+FLAT = 0.1
+# Linear tetrahedra cannot keep their volume and bend: too stiff above this Poisson's ratio.
+LOCKING_POISSON = 0.4
+# A body this many times as long as thick bends, and linear elements need this many across it.
+SLENDER, CELLS_ACROSS = 2.5, 4.0
+LINEAR = "tet4"
+REMEDY = 'set object.element = "tet10"'
+
+_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+
+
+@dataclass(frozen=True)
+class ElementShape:
+    """How far an element is from the regular tetrahedron.
+
+    Attributes
+    ----------
+    element : int
+        Its number, counted from 0.
+    quality : float
+        Mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is.
+    aspect_ratio : float
+        Longest edge over smallest height: 1.22 for the regular tetrahedron.
+    longest_edge_m : float
+    """
+
+    element: int
+    quality: float
+    aspect_ratio: float
+    longest_edge_m: float
+
+
+@dataclass(frozen=True)
+class Slenderness:
+    """How slender a body is, and how many elements share its thickness.
+
+    Attributes
+    ----------
+    length_m, thickness_m : float
+    cells_across : float
+        Thickness over the size of a cell of six tetrahedra.
+    """
+
+    length_m: float
+    thickness_m: float
+    cells_across: float
+
+
+def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
+    """The elements of lowest quality, worst first."""
+    corners = mesh.points_m[mesh.tetrahedra]
+    lengths = np.stack([np.linalg.norm(corners[:, b] - corners[:, a], axis=1) for a, b in _EDGES])
+    areas = [_areas(corners[:, face]) for face in _FACES]
+    heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
+    quality = 12 * (3 * mesh.volumes_m3) ** (2 / 3) / (lengths**2).sum(axis=0)
+    longest = lengths.max(axis=0)
+    return tuple(
+        ElementShape(int(e), float(quality[e]), float(longest[e] / heights[e]), float(longest[e]))
+        for e in np.argsort(quality, kind="stable")[:count]
+    )
+
+
+def slenderness(mesh: TetMesh) -> Slenderness:
+    """Length and thickness of a body, and elements across."""
+    # Edges of the box with the same second moments, however it is turned.
+    edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
+    # A bent or hollow body is thinner than its extents: six times volume over surface is a cube's
+    # edge, and more than the thickness of beams and plates.
+    area = float(_areas(mesh.points_m[mesh.surface]).sum())
+    thickness = min(float(edges[0]), 6 * mesh.volume_m3 / area)
+    cell = float(np.cbrt(6 * np.median(mesh.volumes_m3)))
+    return Slenderness(float(edges[-1]), thickness, thickness / cell)
+
+
+def element_warnings(
+    body: Body, theta: Theta, shape: Slenderness, worst: ElementShape
+) -> list[str]:
+    """What the elements will do to the answer, one sentence each."""
+    warnings = []
+    if worst.quality < FLAT:
+        warnings.append(
+            f"element {worst.element} is nearly flat (mean-ratio quality {worst.quality:.2g}, "
+            f"aspect ratio {worst.aspect_ratio:.0f}), which makes the body stiffer and Newton's "
+            "steps short: improve the mesh there"
+        )
+    if body.element.name != LINEAR:
+        return warnings
+    if theta.poisson > LOCKING_POISSON:
+        warnings.append(
+            f"Poisson's ratio is {theta.poisson:.3g} at the guess and linear tetrahedra lock above "
+            f"{LOCKING_POISSON:g}, so that the stiffness found will be too low: {REMEDY}"
+        )
+    if shape.length_m > SLENDER * shape.thickness_m and shape.cells_across < CELLS_ACROSS:
+        warnings.append(
+            f"only about {shape.cells_across:.1f} linear elements lie across the body's "
+            f"{1e3 * shape.thickness_m:.3g} mm, too stiff in bending, so that the stiffness found "
+            f"will be too low: {REMEDY}, or refine the mesh to {CELLS_ACROSS:.0f} or more"
+        )
+    return warnings
+
+
+def _covariance(mesh: TetMesh) -> Array:
+    """Mean of (x − x̄)(x − x̄)ᵀ over the volume, (3, 3) [m²]."""
+    shares = mesh.volumes_m3 / mesh.volume_m3
+    corners = mesh.points_m[mesh.tetrahedra]
+    corners = corners - shares @ corners.mean(axis=1)
+    # Over a tetrahedron the mean of x xᵀ is (Σ xᵢ xᵢᵀ + Σ xᵢ Σ xᵢᵀ) / 20.
+    sums = corners.sum(axis=1)
+    squares = np.einsum("e,eci,ecj->ij", shares, corners, corners)
+    return (squares + np.einsum("e,ei,ej->ij", shares, sums, sums)) / 20
+
+
+def _areas(triangles: Array) -> Array:
+    """Areas of triangles (k, 3, 3)."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.linalg.norm(normals, axis=1) / 2

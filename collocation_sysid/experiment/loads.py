@@ -1,0 +1,97 @@
+"""What acts on a body besides its own weight: point masses tied to it, and forces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from .arrays import FloatArray, IntArray, read_only_floats, read_only_nodes
+from .clock import first_time_fault
+
+# A window opens and closes at its times, also where they are rounded to just off a grid time.
+TIME_TOLERANCE_S = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PointMass:
+    """A rigid mass tied to nodes, in equal parts: it adds inertia and weight, and no damping.
+
+    Parameters
+    ----------
+    nodes : (k,) int array
+    mass_kg : float
+        Of all nodes together.
+    from_s : float
+        When it joins the body; it then moves at the body's velocity. Always, by default.
+    """
+
+    nodes: IntArray
+    mass_kg: float
+    from_s: float = -np.inf
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", _some_nodes(self.nodes, "the point mass"))
+        if not (np.isfinite(self.mass_kg) and self.mass_kg > 0):
+            raise InputError(f"mass_kg of a point mass is {self.mass_kg:g}; expected more than 0")
+
+    def at_nodes(self, t_s: ArrayLike, node_count: int) -> FloatArray:
+        """Mass that each node carries at the times `t_s` (T,), (T, n) [kg]."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=float))
+        mass = np.zeros((len(times), node_count))
+        there = times >= self.from_s - TIME_TOLERANCE_S
+        mass[np.ix_(there, self.nodes)] = self.mass_kg / len(self.nodes)
+        return mass
+
+
+@dataclass(frozen=True, eq=False)
+class Force:
+    """A force on nodes, in equal parts: constant, or linear between the rows of a table.
+
+    Parameters
+    ----------
+    nodes : (k,) int array
+    force_n : (m, 3) array
+        Total force [N], in the frame of the measurements.
+    t_s : (m,) array, optional
+        Times of the rows; the force is zero outside them. A single row without a time is constant.
+    """
+
+    nodes: IntArray
+    force_n: FloatArray
+    t_s: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", _some_nodes(self.nodes, "the force"))
+        rows = read_only_floats(np.atleast_2d(self.force_n), (None, 3), "force_n")
+        object.__setattr__(self, "force_n", rows)
+        if self.t_s is None:
+            if len(rows) != 1:
+                raise InputError(f"{len(rows)} rows of force_n without times; expected t_s")
+            return
+        t_s = read_only_floats(self.t_s, (len(rows),), "t_s of the force")
+        if fault := first_time_fault(t_s):
+            raise InputError(fault[1], where=f"row {fault[0] + 1}")
+        object.__setattr__(self, "t_s", t_s)
+
+    def at_nodes(self, t_s: ArrayLike, node_count: int) -> FloatArray:
+        """Force on each node at the times `t_s` (T,), (T, n, 3) [N]."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=float))
+        total = np.repeat(self.force_n[:1], len(times), axis=0)
+        if self.t_s is not None:
+            total = np.column_stack(
+                [np.interp(times, self.t_s, f, left=0.0, right=0.0) for f in self.force_n.T]
+            )
+        force = np.zeros((len(times), node_count, 3))
+        force[:, self.nodes] = total[:, None] / len(self.nodes)
+        return force
+
+
+def _some_nodes(nodes: ArrayLike, what: str) -> IntArray:
+    chosen = np.unique(read_only_nodes(nodes, (None,), f"nodes of {what}"))
+    if chosen.size == 0:
+        raise InputError(f"{what} needs at least one node; its selection found none")
+    chosen.setflags(write=False)
+    return chosen

@@ -1,0 +1,145 @@
+"""Small oscillations of a body about a state: natural frequencies, shapes and their damping.
+
+Free dofs obey M ẍ + C ẋ + K x = 0 with the stiffness K at that state, the lumped mass M and
+Rayleigh's C = γ_r K + γ_m M, so that each mode K φ = ω² M φ oscillates for itself with the
+damping ratio ζ = γ_r ω / 2 + γ_m / 2ω.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from ..fem.body import Body
+from .factorisation import Factor, Factoriser
+from .parameters import Theta
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# ω² below this share of the largest K_ii / M_ii is zero up to rounding.
+RIGID = 1e-12
+# Lanczos iterations need some room beside the modes they find; fewer dofs are solved densely.
+DENSE = 150
+# Where a body can move rigidly, K is singular: it is shifted by this share of K_ii / M_ii.
+SHIFT = 1e-10
+RIGID_MOTIONS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """The lowest modes that oscillate, by frequency.
+
+    Attributes
+    ----------
+    frequencies_hz : (k,) undamped natural frequencies ω / 2π
+    shapes : (k, n, 3) displacements, φᵀ M φ = 1 kg (unit m); held nodes rest
+    not_oscillating : int
+        Modes left out because nothing drives them back: six rigid ones of a body nobody holds,
+        and those in which a state is unstable.
+    """
+
+    frequencies_hz: Array
+    shapes: Array
+    not_oscillating: int = 0
+
+    @property
+    def angular_frequencies_rad_s(self) -> Array:
+        """(k,) ω."""
+        return 2 * np.pi * self.frequencies_hz
+
+    def damping_ratios(self, theta: Theta) -> Array:
+        """(k,) ζ = γ_r ω / 2 + γ_m / 2ω; 1 and above does not oscillate."""
+        omega = self.angular_frequencies_rad_s
+        return theta.gamma_r_s * omega / 2 + theta.gamma_m_1_s / (2 * omega)
+
+
+def natural_modes(
+    body: Body,
+    x: ArrayLike,
+    free_dofs: Index,
+    theta: Theta,
+    count: int = 6,
+    dof_mass: Array | None = None,
+) -> Modes:
+    """The lowest modes of a body about a state.
+
+    Parameters
+    ----------
+    body : Body
+    x : (n, 3) or (3n,) array
+        The state; it should be an equilibrium.
+    free_dofs : (k,) sorted dofs that are not held
+    theta : Theta
+        Only the elastic parameters count.
+    count : int
+        Modes wanted; there may be fewer.
+    dof_mass : (3n,) array, optional
+        Mass of every dof [kg]; the body's own by default.
+
+    Returns
+    -------
+    Modes
+    """
+    mass = (body.dof_mass if dof_mass is None else dof_mass)[free_dofs]
+    state = np.asarray(x, dtype=float).reshape(-1, 3)
+    elastic = Theta(theta.lambda_pa, theta.mu_pa, 0.0, 0.0)
+    lower = -body.linearise(state, np.zeros_like(state), elastic).by_position[0]
+    stiffness = sp.csc_array(body.pattern.matrix(lower)[:, free_dofs][free_dofs])
+    largest = float((stiffness.diagonal() / mass).max(initial=0.0))
+    wanted = count + RIGID_MOTIONS
+    if len(free_dofs) <= max(DENSE, 3 * wanted):
+        squares, vectors = _dense(stiffness, mass, wanted)
+    else:
+        lower[body.pattern.diagonal[free_dofs]] += SHIFT * largest * mass
+        factor = Factoriser.of(body.pattern, free_dofs).factorise(lower)
+        squares, vectors = _lanczos(stiffness, mass, factor, -SHIFT * largest, wanted)
+    oscillating = squares > RIGID * largest
+    shapes = np.zeros((int(oscillating.sum()), body.pattern.size))
+    shapes[:, free_dofs] = vectors[:, oscillating].T
+    frequencies = np.sqrt(squares[oscillating]) / (2 * np.pi)
+    return Modes(
+        frequencies[:count],
+        shapes[:count].reshape(-1, len(body.nodes_m), 3),
+        int((~oscillating).sum()),
+    )
+
+
+def _dense(stiffness: sp.csc_array, mass: Array, wanted: int) -> tuple[Array, Array]:
+    root = np.sqrt(mass)
+    scaled = stiffness.toarray() / np.outer(root, root)
+    last = min(wanted, len(mass)) - 1
+    squares, vectors = scipy.linalg.eigh(scaled, subset_by_index=(0, last))
+    return squares, vectors / root[:, None]
+
+
+class _Inverse(LinearOperator):
+    """(K − shift · M)⁻¹ from its factor."""
+
+    def __init__(self, factor: Factor, size: int) -> None:
+        super().__init__(np.dtype(float), (size, size))
+        self.factor = factor
+
+    def _matvec(self, x: Array) -> Array:
+        return self.factor.solve(np.ravel(x))
+
+
+def _lanczos(
+    stiffness: sp.csc_array, mass: Array, factor: Factor, shift: float, wanted: int
+) -> tuple[Array, Array]:
+    """Shift-invert Lanczos iterations: the modes nearest to `shift`, just below zero."""
+    squares, vectors = eigsh(
+        stiffness,
+        wanted,
+        M=sp.diags_array(mass, format="csc"),
+        sigma=shift,
+        OPinv=_Inverse(factor, len(mass)),
+        v0=np.random.default_rng(0).normal(size=len(mass)),
+    )
+    order = np.argsort(squares)
+    return squares[order], vectors[:, order]

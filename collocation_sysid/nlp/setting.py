@@ -1,0 +1,47 @@
+"""The physical parameters of one experiment at a point, with their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .dynamics import Dynamics
+from .parameters import Theta
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """θ and gravity at the parameters (q, φ) of one experiment.
+
+    Attributes
+    ----------
+    theta : Theta
+    theta_q, theta_qq : (4, nq) and (4, nq, nq) derivatives of θ
+    dynamics : Dynamics under that gravity
+    gravity_phi, gravity_phi_phi : (3, m) and (3, m, m) derivatives of gravity by the φ that turn it
+    """
+
+    theta: Theta
+    theta_q: Array
+    theta_qq: Array
+    dynamics: Dynamics
+    gravity_phi: Array
+    gravity_phi_phi: Array
+
+    def force_slopes(self, by_theta: Array, weighed_kg: Array) -> Array:
+        """∂F/∂(q, φ) of total forces, (…, 3n, nq + m).
+
+        Parameters
+        ----------
+        by_theta : (…, 3n, 4) of the internal forces
+        weighed_kg : (…, 3n) mass that gravity pulls at
+        """
+        of_q = by_theta @ self.theta_q
+        if not self.gravity_phi.shape[1]:
+            return of_q
+        pull = np.tile(self.gravity_phi, (by_theta.shape[-2] // 3, 1))
+        return np.concatenate([of_q, weighed_kg[..., None] * pull], axis=-1)

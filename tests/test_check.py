@@ -1,0 +1,253 @@
+"""What `check` finds wrong with a problem, and what it advises."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem_files import REFERENCES, Edit, both, replace_cell, replace_text, run_command, settings
+
+from collocation_sysid.check import Findings, check_problem
+from collocation_sysid.check.cost import Cost, cost_notes, cost_warnings
+from collocation_sysid.check.elements import element_warnings, slenderness, worst_elements
+from collocation_sysid.check.motion import motion_warnings
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.parameters import Theta
+from collocation_sysid.problem import load_problem
+from collocation_sysid.run import build_collocation
+
+# The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
+SILICONE = (
+    "parameters.lambda_pa.guess=570",
+    "parameters.mu_pa.guess=570",
+    "parameters.gamma_r_s.guess=1e-4",
+    "parameters.gamma_m_1_s.guess=0.1",
+)
+REGULAR = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 10
+COMPRESSIBLE = Theta(100.0, 100.0, 0.0, 0.0)
+
+
+def checked(folder: Path, *overrides: str) -> Findings:
+    return check_problem(load_problem(folder / "problem.toml", overrides))
+
+
+def about(findings: Findings, *words: str) -> str:
+    """The one warning that has all these words."""
+    found = [warning for warning in findings.warnings if all(word in warning for word in words)]
+    assert len(found) == 1, findings.warnings
+    return found[0]
+
+
+# The motion and the time grid -------------------------------------------------------------------
+
+
+def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_cure_it(tiny: Path):
+    euler = (*SILICONE, "transcription.scheme=backward-euler")
+    findings = checked(tiny, *euler)
+    first = findings.motions[0].modes[0]
+    assert first.frequency_hz == pytest.approx(7.7, abs=0.2)
+    assert first.numerical_damping_ratio == pytest.approx(0.23, abs=0.02)
+    warning = about(findings, "backward-euler at 10 ms", "damping found will be too low")
+    assert 'set transcription.scheme = "midpoint"' in warning
+    named = re.search(r"substeps = (\d+)", warning)
+    assert named is not None
+    needed = int(named[1])
+    assert needed == findings.motions[0].substeps_needed
+    cured = checked(tiny, *euler, f"transcription.substeps={needed}")
+    assert not any("backward-euler" in warning for warning in cured.warnings)
+    nearly = checked(tiny, *euler, f"transcription.substeps={needed - 1}")
+    assert about(nearly, "backward-euler", f"substeps = {needed}")
+
+
+def test_midpoint_at_ten_milliseconds_is_not_warned_of(tiny: Path):
+    findings = checked(tiny, *SILICONE)
+    first = findings.motions[0].modes[0]
+    assert first.numerical_damping_ratio == 0
+    assert first.samples_per_period == first.steps_per_period == pytest.approx(13, abs=0.5)
+    assert not any("midpoint" in warning for warning in findings.warnings)
+    assert any("midpoint lengthens" in note and "substeps = 2" in note for note in findings.notes)
+
+
+def test_damping_at_the_guess_is_rayleighs(tiny: Path):
+    gammas = ("parameters.gamma_r_s.guess=0.02", "parameters.gamma_m_1_s.guess=0.5")
+    for mode in checked(tiny, *gammas).motions[0].modes:
+        omega = 2 * np.pi * mode.frequency_hz
+        assert mode.damping_ratio == pytest.approx(0.01 * omega + 0.25 / omega)
+
+
+def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
+    motion = checked(tiny, *SILICONE).motions[0]
+    first = replace(motion.modes[0], steps_per_period=5.0, samples_per_period=2.5)
+    steps, samples = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))
+    assert "only 5.0 steps a period" in steps
+    assert f"substeps = {motion.substeps_needed}" in steps
+    assert "only 2.5 samples a period" in samples
+    assert re.search(r"record at 6\d Hz or more", samples)
+
+
+def test_a_recording_shorter_than_a_period_is_warned_of(tiny: Path):
+    assert about(checked(tiny, *SILICONE), "0.08 s recorded", "record longer")
+
+
+# The elements -----------------------------------------------------------------------------------
+
+
+def test_nearly_incompressible_linear_elements_are_warned_of(tiny: Path):
+    nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
+    warning = about(checked(tiny, *nearly), "Poisson's ratio is 0.49")
+    assert 'set object.element = "tet10"' in warning
+    quadratic = checked(tiny, *nearly, "object.element=tet10")
+    assert not any("Poisson" in warning for warning in quadratic.warnings)
+
+
+def test_the_worst_element_is_named():
+    flat = REGULAR + np.array([1.0, 0.0, 0.0])
+    flat[:, 2] *= 0.005
+    mesh = TetMesh(np.vstack([REGULAR, flat]), [[0, 1, 2, 3], [4, 5, 6, 7]])
+    worst, best = worst_elements(mesh)
+    assert (worst.element, best.element) == (1, 0)
+    assert best.quality == pytest.approx(1)
+    assert best.aspect_ratio == pytest.approx(np.sqrt(1.5))
+    assert worst.aspect_ratio > 20
+    body = Body(mesh, density_kg_m3=30.0)
+    warnings = element_warnings(body, COMPRESSIBLE, slenderness(mesh), worst)
+    assert "element 1 is nearly flat" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("size_m", "divisions", "element", "warned"),
+    [
+        ((0.1, 0.03, 0.03), (6, 2, 2), "tet4", True),
+        ((0.1, 0.03, 0.03), (6, 2, 2), "tet10", False),
+        ((0.1, 0.03, 0.03), (16, 5, 5), "tet4", False),
+        ((0.1, 0.1, 0.01), (10, 10, 1), "tet4", True),
+        ((0.1, 0.1, 0.1), (2, 2, 2), "tet4", False),
+    ],
+)
+def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, element, warned):
+    mesh = box_mesh(size_m, divisions)
+    shape = slenderness(mesh)
+    assert shape.thickness_m == pytest.approx(min(size_m))
+    body = Body(mesh, density_kg_m3=30.0, element=element)
+    warnings = element_warnings(body, COMPRESSIBLE, shape, worst_elements(mesh)[0])
+    assert any("too stiff in bending" in warning for warning in warnings) == warned
+
+
+def test_thickness_does_not_depend_on_how_the_body_lies():
+    mesh = box_mesh((0.1, 0.03, 0.03), (6, 2, 2))
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turned = slenderness(TetMesh(mesh.points_m @ turn.T, mesh.tetrahedra))
+    assert turned.thickness_m == pytest.approx(0.03)
+    assert turned.length_m == pytest.approx(0.1)
+
+
+# The measurements -------------------------------------------------------------------------------
+
+AWAY = replace_text(REFERENCES, REFERENCES.replace("[0.06, 0.06, 0.03]", "[0.06, 0.085, 0.03]"))
+
+
+def test_a_marker_far_from_the_body_is_named(tiny: Path):
+    AWAY(tiny)
+    findings = checked(tiny)
+    assert about(findings, "marker 'side' of 'swing' lies 25 mm", "reference_m")
+    assert findings.recordings[0].farthest.name == "side"
+    assert findings.largest_marker_distance_m == pytest.approx(0.025)
+
+
+def blank(*samples: tuple[int, int]) -> Edit:
+    """Leave out the x of (line, marker)."""
+    edits = [replace_cell("swing_markers.csv", line, 1 + 3 * m, "") for line, m in samples]
+    return both(*edits)
+
+
+def test_missing_samples_are_counted_by_marker(tiny: Path):
+    blank((3, 1), (4, 1), (4, 2))(tiny)
+    findings = checked(tiny)
+    (recording,) = findings.recordings
+    assert {m.name: (m.samples, m.missing) for m in recording.markers} == {
+        "low": (9, 0),
+        "mid": (7, 2),
+        "side": (8, 1),
+    }
+    assert (findings.samples, findings.missing) == (24, 3)
+    assert (recording.frames, recording.rate_hz) == (9, pytest.approx(100))
+    assert recording.duration_s == pytest.approx(0.08)
+
+
+def test_a_marker_that_is_mostly_missing_is_warned_of(tiny: Path):
+    blank(*((line, 1) for line in range(3, 9)))(tiny)
+    assert about(checked(tiny), "marker 'mid' of 'swing' is missing in 6 of 9 samples")
+
+
+def test_tracks_in_another_unit_are_warned_of(tiny: Path):
+    replace_text('file = "swing_markers.csv"', 'file = "swing_markers.csv"\nlength_unit = "cm"')(
+        tiny
+    )
+    assert about(checked(tiny), "is first seen", "check length_unit")
+
+
+# The cost ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["backward-euler", "midpoint", "bdf2"])
+def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme: str):
+    monkeypatch.setattr("collocation_sysid.check.SAMPLES", 5)
+    overrides = (f"transcription.scheme={scheme}", "transcription.substeps=2")
+    findings = checked(tiny, *overrides)
+    whole = build_collocation(load_problem(tiny / "problem.toml", overrides))
+    assert findings.jacobian_nonzeros == len(whole.jacobian_structure[1])
+    assert findings.hessian_nonzeros == len(whole.hessian_structure[1])
+
+
+def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):
+    findings = checked(tiny)
+    by_name = {cost.method: cost for cost in findings.costs}
+    assert set(by_name) == {"reduced-space", "interior-point"}
+    assert all(cost.memory_mb > 0 and (cost.time_s or 0) > 0 for cost in findings.costs)
+    assert findings.method == "interior-point"
+    assert findings.memory_mb == by_name["interior-point"].memory_mb
+
+
+def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
+    monkeypatch.setattr("collocation_sysid.check.cost._machine_memory_mb", lambda: 8000.0)
+    small, large = Cost("reduced-space", 500.0, 10.0), Cost("interior-point", 40000.0, 1000.0)
+    (warning,) = cost_warnings(large, (small, large))
+    assert "about 40 GB" in warning
+    assert 'set solver.method = "reduced-space"' in warning
+    assert cost_warnings(small, (small, large)) == []
+    assert len(cost_notes(large, (small, large))) == 1
+    assert cost_notes(small, (small, large)) == []
+
+
+# The screen and the JSON ------------------------------------------------------------------------
+
+
+def test_the_findings_fit_a_screen_with_the_warnings_last(tiny: Path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
+    euler = "transcription.scheme=backward-euler"
+    outcome = run_command("check", "problem.toml", *settings(*nearly, euler))
+    lines = outcome.out.rstrip("\n").split("\n")
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 80
+    heads = [line.split()[0] for line in lines if line and not line.startswith(" ")]
+    sections = [head for head in heads if head in ("Body", "Modes", "Measurements", "Solve")]
+    assert sections == ["Body", "Modes", "Measurements", "Solve"]
+    assert heads[-1] == "The"
+    assert heads[-2] == "warning:"
+    assert outcome.code == 0
+
+
+def test_the_json_holds_everything(tiny: Path):
+    found = json.loads(run_command("check", "problem.toml", "--json").out)
+    assert [m["name"] for m in found["recordings"][0]["markers"]] == ["low", "mid", "side"]
+    assert found["motions"][0]["modes"][0]["frequency_hz"] > 0
+    assert {cost["method"] for cost in found["costs"]} == {"reduced-space", "interior-point"}
+    assert isinstance(found["warnings"], list)
+    assert found["rms_at_guess_m"] > 0
