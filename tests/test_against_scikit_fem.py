@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import skfem
 from checks import relative_error
 from skfem.models.elasticity import linear_elasticity
 
+from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS
+from collocation_sysid.fem.mesh import TetMesh
 
 LAMBDA_PA, MU_PA = 200.0, 300.0
 
@@ -16,15 +20,23 @@ LAMBDA_PA, MU_PA = 200.0, 300.0
 class Library:
     """Scikit-fem's assembly on the same mesh, in this package's order of unknowns."""
 
-    def __init__(self, mesh) -> None:
+    def __init__(self, mesh, element=None, intorder: int = 1) -> None:
         self.basis = skfem.Basis(
             skfem.MeshTet(mesh.points_m.T.copy(), mesh.tetrahedra.T.copy()),
-            skfem.ElementVector(skfem.ElementTetP1()),
-            intorder=1,
+            skfem.ElementVector(element or skfem.ElementTetP1()),
+            intorder=intorder,
         )
         nodal_dofs = np.asarray(self.basis.nodal_dofs)
         self.dofs = nodal_dofs.T.ravel()  # node after node, xyz in each
         self.points_m = mesh.points_m
+        edge_dofs = np.asarray(self.basis.edge_dofs)
+        if edge_dofs.size:
+            # Both number edges by their sorted ends, but in orders of their own.
+            theirs = np.sort(np.asarray(self.basis.mesh.edges).T, axis=1).tolist()
+            column = {tuple(edge): k for k, edge in enumerate(theirs)}
+            columns = [column[tuple(edge)] for edge in mesh.edges.tolist()]
+            self.dofs = np.concatenate([self.dofs, edge_dofs[:, columns].T.ravel()])
+            self.points_m = np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)])
 
     def displacement(self, positions):
         nodal = np.zeros(self.basis.N)
@@ -85,6 +97,18 @@ def library(small_mesh) -> Library:
 
 
 @pytest.fixture
+def quadratic(small_mesh) -> tuple[Library, Callable[..., Body]]:
+    """The library and bodies with a node on every edge."""
+    # The order at which the library uses the same four points.
+    library = Library(small_mesh, skfem.ElementTetP2(), intorder=2)
+
+    def make_body(material: str) -> Body:
+        return Body(small_mesh, material, density_kg_m3=30.0, element="tet10")
+
+    return library, make_body
+
+
+@pytest.fixture
 def positions(small_mesh, rng) -> np.ndarray:
     return small_mesh.points_m + rng.uniform(-0.006, 0.006, small_mesh.points_m.shape)
 
@@ -123,3 +147,39 @@ def test_stiffness_at_rest_is_linear_elasticity(make_body, library, material):
     expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
     found = make_body(material).stiffness(library.points_m, LAMBDA_PA, MU_PA)
     assert relative_error(found.toarray(), expected) < 1e-12
+
+
+# Quadratic elements
+
+
+def test_quadratic_neo_hookean_energy_force_and_stiffness(quadratic, rng):
+    library, make_body = quadratic
+    body = make_body("neo-hookean")
+    np.testing.assert_allclose(body.nodes_m, library.points_m)
+    x = body.nodes_m + rng.uniform(-0.002, 0.002, body.nodes_m.shape)
+    energy = library.scalar(energy_density, x)
+    assert body.energy(x, LAMBDA_PA, MU_PA) == pytest.approx(energy, rel=1e-10)
+    force = -library.vector(virtual_work, x)
+    assert relative_error(body.elastic_force(x, LAMBDA_PA, MU_PA), force) < 1e-10
+    stiffness = library.matrix(tangent_work, x)
+    assert relative_error(body.stiffness(x, LAMBDA_PA, MU_PA).toarray(), stiffness) < 1e-10
+
+
+@pytest.mark.parametrize("intorder", [2, 6])
+def test_quadratic_stiffness_at_rest_is_exact(quadratic, small_mesh, intorder):
+    library = Library(small_mesh, skfem.ElementTetP2(), intorder)
+    body = quadratic[1]("linear")
+    expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
+    found = body.stiffness(library.points_m, LAMBDA_PA, MU_PA)
+    assert relative_error(found.toarray(), expected) < 1e-10
+
+
+def test_quadratic_consistent_mass_has_the_lumped_ones_proportions(quadratic, small_mesh):
+    """Of a single element; of many, each is scaled to its own mass."""
+    one = TetMesh(small_mesh.points_m, small_mesh.tetrahedra[:1])
+    library = Library(one, skfem.ElementTetP2(), intorder=4)
+    consistent = library.matrix(lambda u, v, w: 30.0 * (u * v).sum(0), library.points_m)
+    body = Body(one, density_kg_m3=30.0, element="tet10")
+    diagonal = np.diag(consistent)
+    expected = 3 * body.mass_kg * diagonal / diagonal.sum()
+    np.testing.assert_allclose(body.dof_mass, expected, rtol=1e-10)

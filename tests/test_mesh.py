@@ -14,6 +14,7 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.quadratic import EDGES
 from collocation_sysid.fem.selection import Named
 from collocation_sysid.fem.structured import box_mesh
 
@@ -212,11 +213,58 @@ def test_a_file_without_tetrahedra_tells_what_it_holds(tmp_path):
         TetMesh.read(tmp_path / "shell.vtu")
 
 
-def test_quadratic_tetrahedra_are_not_supported_yet(tmp_path):
-    cells = [("tetra10", [list(range(10))])]
-    write_file(tmp_path / "curved.vtu", np.eye(10, 3), cells)
-    with pytest.raises(InputError, match=r"1 tetra10.*quadratic element and not supported yet"):
-        TetMesh.read(tmp_path / "curved.vtu")
+MIDDLES = [CORNERS[[a, b]].mean(axis=0) for a, b in EDGES]
+
+
+def write_quadratic(path: Path, off: float = 0.0, cell: Any = range(10)) -> Path:
+    """One quadratic tetrahedron, the last of its mid nodes off the middle."""
+    points = np.vstack([CORNERS, MIDDLES])
+    points[9] += [off, 0, 0]
+    file_format = "gmsh" if path.suffix == ".msh" else None
+    meshio.write(path, meshio.Mesh(points, [("tetra10", [list(cell)])]), file_format)
+    return path
+
+
+@pytest.mark.parametrize("ending", ["vtu", "vtk", "msh", "inp"])
+def test_quadratic_tetrahedra_are_taken_by_their_corners(tmp_path, ending):
+    mesh = TetMesh.read(write_quadratic(tmp_path / f"a.{ending}"))
+    np.testing.assert_array_equal(mesh.points_m, CORNERS)
+    np.testing.assert_array_equal(mesh.tetrahedra, [[0, 1, 2, 3]])
+    (note,) = mesh.notes
+    assert "6 of 10 nodes were dropped (node 4 is the first): they are no element's corner" in note
+
+
+def test_linear_and_quadratic_tetrahedra_may_be_in_one_file(tmp_path):
+    points = np.vstack([CORNERS, MIDDLES, [[1, 1, 1]]])
+    write_file(
+        tmp_path / "a.vtu", points, [("tetra10", [list(range(10))]), ("tetra", [[1, 2, 3, 10]])]
+    )
+    mesh = TetMesh.read(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(np.sort(mesh.tetrahedra), [[0, 1, 2, 3], [1, 2, 3, 4]])
+
+
+def test_slightly_curved_sides_are_straightened_and_noted(tmp_path):
+    mesh = TetMesh.read(write_quadratic(tmp_path / "a.vtu", off=0.03 * np.sqrt(2)))
+    assert "1 mid nodes lie off the middle of their edges, by up to 0.03 of" in mesh.notes[0]
+
+
+def test_strongly_curved_sides_are_refused_with_the_worst(tmp_path):
+    file = write_quadratic(tmp_path / "curved.vtu", off=0.2)
+    message = r"curved\.vtu: .* mid node 9 lies 0\.2 m off .* node 2 to node 3, which is 1\.41 m"
+    with pytest.raises(InputError, match=message):
+        TetMesh.read(file)
+
+
+def test_mid_nodes_in_another_order_are_refused(tmp_path):
+    file = write_quadratic(tmp_path / "a.vtu", cell=[0, 1, 2, 3, 4, 6, 5, 7, 8, 9])
+    with pytest.raises(InputError, match="mid node 6 lies"):
+        TetMesh.read(file)
+
+
+def test_mid_nodes_that_are_not_there_are_refused(tmp_path):
+    file = write_quadratic(tmp_path / "a.vtu", cell=[*range(9), 10])
+    with pytest.raises(InputError, match=r"8, 10\], but there are 10 nodes"):
+        TetMesh.read(file)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.selection import Ball, Box, Indices, Named
 from collocation_sysid.fem.structured import box_mesh
@@ -91,6 +92,55 @@ def test_an_empty_selection_tells_where_the_body_is(box, selection):
 def test_ill_formed_selections_are_refused(kind, values, message):
     with pytest.raises(InputError, match=message):
         kind(*values)
+
+
+# --- nodes on edges
+
+
+def quadratic(mesh: TetMesh) -> Body:
+    return Body(mesh, density_kg_m3=30.0, element="tet10")
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [Box([-1, -1, -1], [0.011, 1, 1]), Ball([0, 0, 0], 0.012), Ball([0.01, 0, 0], 1e-6)],
+)
+def test_boxes_and_balls_act_on_nodes_on_edges_too(box, selection):
+    body = quadratic(box)
+    if isinstance(selection, Box):
+        expected = body.nodes_m[:, 0] < 0.0111
+    else:
+        distance = np.linalg.norm(body.nodes_m - selection.center_m, axis=1)
+        expected = distance < selection.radius_m + 1e-9
+    chosen = body.select(selection)
+    np.testing.assert_array_equal(chosen, np.flatnonzero(expected))
+    assert chosen.max() >= len(box.points_m)
+
+
+@pytest.mark.parametrize("selection", [Indices([1, 3, 4]), Named("grip")])
+def test_a_node_on_an_edge_is_selected_with_both_ends_of_the_edge(selection):
+    points = np.insert(CORNERS, 0, 9.0, axis=0)
+    mesh = TetMesh(points, [[1, 2, 3, 4]], {"grip": [0, 1, 0, 1, 1]})
+    body = quadratic(mesh)
+    np.testing.assert_array_equal(mesh.select(selection), [0, 2, 3])
+    chosen = body.select(selection)
+    np.testing.assert_array_equal(chosen[:3], [0, 2, 3])
+    np.testing.assert_allclose(
+        sorted(body.nodes_m[chosen[3:]].tolist()), [[0, 0, 0.5], [0, 0.5, 0], [0, 0.5, 0.5]]
+    )
+
+
+def test_linear_bodies_select_like_their_mesh(box):
+    body = Body(box, density_kg_m3=30.0)
+    selection = Box([-1, -1, -1], [0.02, 1, 1])
+    np.testing.assert_array_equal(body.select(selection), box.select(selection))
+
+
+def test_a_mid_node_of_the_file_cannot_be_given():
+    points = np.vstack([CORNERS, [[0.5, 0, 0]]])
+    body = quadratic(TetMesh(points, [[0, 1, 2, 3]]))
+    with pytest.raises(InputError, match=r"node 4 was dropped.*no element's corner; leave it out"):
+        body.select(Indices([0, 1, 4]))
 
 
 def test_selections_with_the_same_values_are_equal():

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -91,10 +90,9 @@ def test_long_trajectories_are_thinned_evenly(tmp_path):
 
 
 def test_frames_follow_the_element(tmp_path):
-    tet10 = replace(TET4, name="tet10", nodes=10, meshio_type="tetra10")
     positions = np.random.default_rng(0).normal(size=(3, 10, 3))
     cells = np.arange(10)[None]
-    write_frames(tmp_path, [0, 1, 2], positions, cells, tet10, positions[0])
+    write_frames(tmp_path, [0, 1, 2], positions, cells, element_named("tet10"), positions[0])
     assert "tetra10" in meshio.read(tmp_path / "frames" / "frame_0000.vtu").cells_dict
 
 

@@ -3,27 +3,37 @@
 from .alignment import align
 from .clock import sample_interval_s
 from .experiment import Experiment
+from .force_files import read_forces
 from .grasp import Grasp, PoseSequence, held_nodes
+from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
-from .readers import (
-    MarkerTable,
-    read_markers_csv,
-    read_poses_csv,
-    write_markers_csv,
-    write_poses_csv,
-)
+from .nuisance import Nuisance
+from .pose_files import read_poses, read_poses_csv
+from .readers import MarkerTable, read_markers, read_markers_csv
+from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
+from .writers import write_markers_csv, write_poses_csv
 
 __all__ = [
     "Experiment",
+    "Force",
     "Grasp",
     "MarkerTable",
     "Markers",
+    "Nuisance",
     "Placement",
+    "PointMass",
     "PoseSequence",
+    "RigidFit",
+    "TemplateFit",
     "align",
+    "align_to_template",
+    "fit_poses",
     "held_nodes",
     "place_markers",
+    "read_forces",
+    "read_markers",
     "read_markers_csv",
+    "read_poses",
     "read_poses_csv",
     "sample_interval_s",
     "write_markers_csv",

@@ -23,6 +23,7 @@ def align(
     table: MarkerTable,
     window_s: tuple[float, float] | None = None,
     resample_hz: float | None = None,
+    every: int = 1,
 ) -> tuple[FloatArray, PoseSequence, MarkerTable]:
     """Put poses and markers on one evenly spaced time grid.
 
@@ -42,6 +43,8 @@ def align(
         Samples before the first or after the second time are cut.
     resample_hz : float, optional
         Rate of the new grid, which starts at the first sample left.
+    every : int
+        Only every so-manieth sample of the markers is used.
 
     Returns
     -------
@@ -59,6 +62,8 @@ def align(
         samples at it.
     """
     table = table if window_s is None else _cut(table, window_s)
+    if every > 1:
+        table = MarkerTable(table.t_s[::every], table.names, table.positions_m[::every])
     if resample_hz is not None:
         return _resample(poses, table, resample_hz)
     step_s = sample_interval_s(table.t_s, "markers")

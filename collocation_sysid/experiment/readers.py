@@ -1,32 +1,24 @@
-"""Pose and marker files: CSV with the unit in the column name or in `length_unit`.
-
-Poses: columns t_s, x_m, y_m, z_m, qx, qy, qz, qw in any order. Markers: t_s, then <name>_x,
-<name>_y, <name>_z for each marker; a blank cell or NaN is a missing sample.
-"""
+"""Marker files of any known format behind one function, and the tracks they hold."""
 
 from __future__ import annotations
 
-import csv
 import difflib
 import math
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from .arrays import FloatArray, read_only_floats, read_only_tracks
 from .clock import first_time_fault
-from .grasp import PoseSequence, first_pose_fault
+from .formats import Choose, RawTracks, read_tracks
+from .formats.text import listed
+from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
 
-POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
-
-_AXES = ("x", "y", "z")
-_DIGITS = "%.12g"
+# A frame rate and a column of times agree within this part.
+_RATE_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +33,14 @@ class MarkerTable:
         M marker names.
     positions_m : (T, M, 3) array
         NaN where missing; a sample with one coordinate missing loses all three.
+    notes : tuple of str
+        What was missing or assumed in the file, a sentence each.
     """
 
     t_s: FloatArray
     names: tuple[str, ...]
     positions_m: FloatArray
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         names = tuple(self.names)
@@ -57,36 +52,23 @@ class MarkerTable:
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "t_s", t_s)
         object.__setattr__(self, "positions_m", positions)
+        object.__setattr__(self, "notes", tuple(self.notes))
 
 
-def read_poses_csv(path: str | Path) -> PoseSequence:
-    """Read grasp poses; the quaternion's columns are told apart by name, in any order.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, unknown or repeated, a cell is not a number, time does not
-        increase, or a quaternion is not of unit norm; the line is named.
-    """
-    header, lines, rows = _read_csv(path)
-    if sorted(header) != sorted(POSE_COLUMNS):
-        raise InputError(
-            f"the columns are {_listed(header)}; expected {_listed(POSE_COLUMNS)}, each once",
-            path,
-            "line 1",
-        )
-    columns = [header.index(name) for name in POSE_COLUMNS]
-    values = _numbers(path, header, lines, rows, columns, blank_allowed=False)
-    t_s, positions_m, quaternions = values[:, 0], values[:, 1:4], values[:, 4:]
-    if fault := first_pose_fault(t_s, positions_m, quaternions):
-        raise InputError(fault[1], path, f"line {lines[fault[0]]}")
-    return PoseSequence(t_s, positions_m, quaternions)
-
-
-def read_markers_csv(
-    path: str | Path, names: Sequence[str] | None = None, length_unit: str = "m"
+def read_markers(
+    path: str | Path,
+    *,
+    names: Sequence[str] | None = None,
+    labels: Mapping[str, str] | None = None,
+    length_unit: str | None = None,
+    rate_hz: float | None = None,
 ) -> MarkerTable:
-    """Read marker tracks.
+    """Read marker tracks; the format is recognised by the file's content.
+
+    Known are C3D (with the extra ``collocation-sysid[c3d]``), TRC, Qualisys TSV, Motive CSV, and
+    plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres) or long (t_s, marker, x_m,
+    y_m, z_m). A blank cell or NaN is a missing sample; in motion-capture formats, though not in
+    plain CSV, so is one at exactly (0, 0, 0).
 
     Parameters
     ----------
@@ -94,160 +76,151 @@ def read_markers_csv(
         The file.
     names : sequence of str, optional
         Markers to take, in this order; by default all, in the file's order.
-    length_unit : {"m", "cm", "mm", "in"}
-        Unit of the coordinates in the file.
+    labels : mapping of str to str, optional
+        From labels in the file to names here; other markers keep their labels as names.
+    length_unit : {"m", "cm", "mm", "in"}, optional
+        Unit of the coordinates, where the file does not state it.
+    rate_hz : float, optional
+        Frame rate, where the file states neither it nor times; the first frame is then at 0 s.
 
     Raises
     ------
     InputError
-        If the columns are not as expected, a marker asked for is not there, a cell is not a
-        number, or time does not increase; the line is named.
+        Naming the file and the line or key: where the file is damaged or contradicts itself or
+        what is given here, a unit or rate is neither in the file nor given, or a marker is not
+        there.
     """
-    if length_unit not in METRES_PER_UNIT:
-        raise InputError(
-            f"length_unit is {length_unit!r}; expected one of {_listed(METRES_PER_UNIT)}"
-        )
-    header, lines, rows = _read_csv(path)
-    there = _marker_names(path, header)
-    taken = there if names is None else _asked_for(path, there, names)
-    columns = [header.index(f"{name}_{axis}") for name in taken for axis in _AXES]
-    t_s = _numbers(path, header, lines, rows, [header.index("t_s")], blank_allowed=False)[:, 0]
-    if fault := first_time_fault(t_s):
-        raise InputError(fault[1], path, f"line {lines[fault[0]]}")
-    values = _numbers(path, header, lines, rows, columns, blank_allowed=True)
-    positions = values.reshape(len(rows), len(taken), 3) * METRES_PER_UNIT[length_unit]
-    return MarkerTable(t_s, tuple(taken), positions)
+    refuse_unknown_unit(length_unit)
+    if rate_hz is not None and not 0 < rate_hz < np.inf:
+        raise InputError(f"rate_hz is {rate_hz:g}; expected a rate above 0")
+    labels = dict(labels or {})
+    raw = read_tracks(path, _choice(path, names, labels))
+    metres = METRES_PER_UNIT[_unit(path, raw, length_unit)]
+    t_s = _times_s(path, raw, rate_hz)
+    taken = [labels.get(label, label) for label in raw.labels]
+    coordinates, notes = _present(raw, taken)
+    return MarkerTable(t_s, tuple(taken), coordinates * metres, (*raw.notes, *notes))
 
 
-def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
-    """Write poses in the format `read_poses_csv` reads; the file appears whole or not at all."""
-    values = np.column_stack([poses.t_s, poses.positions_m, poses.quaternions_xyzw])
-    _write_csv(path, POSE_COLUMNS, values)
+def read_markers_csv(
+    path: str | Path, names: Sequence[str] | None = None, length_unit: str = "m"
+) -> MarkerTable:
+    """Read marker tracks from a plain wide CSV; see `read_markers`."""
+    return read_markers(path, names=names, length_unit=length_unit)
 
 
-def write_markers_csv(
-    path: str | Path, t_s: ArrayLike, names: Sequence[str], positions_m: ArrayLike
-) -> None:
-    """Write marker tracks (T, M, 3) in metres as `read_markers_csv` reads them, blank for NaN."""
-    table = MarkerTable(np.asarray(t_s), tuple(names), np.asarray(positions_m))
-    header = ["t_s", *(f"{name}_{axis}" for name in table.names for axis in _AXES)]
-    tracks = table.positions_m.reshape(len(table.t_s), -1)
-    _write_csv(path, header, np.column_stack([table.t_s, tracks]))
+def _choice(path: str | Path, names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
+    """What picks the markers asked for from the labels in a file."""
 
-
-def _read_csv(path: str | Path) -> tuple[list[str], list[int], list[list[str]]]:
-    """Header, line number of each row, and rows of stripped cells; blank lines are skipped."""
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            cells = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path) from error
-    except UnicodeDecodeError:
-        raise InputError(
-            "is not a CSV text file (UTF-8); expected comma-separated values", path
-        ) from None
-    except csv.Error as error:
-        raise InputError(f"is not a CSV text file: {error}", path) from error
-    cells = [(line, row) for line, row in cells if any(row)]
-    if not cells:
-        raise InputError("is empty; expected a line of column names, then rows of numbers", path)
-    header = cells[0][1]
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise InputError(
-            "the cells are separated by semicolons or tabs; expected commas, and points in numbers",
-            path,
-            "line 1",
-        )
-    if len(cells) == 1:
-        raise InputError("has column names but no rows of numbers", path)
-    for line, row in cells[1:]:
-        if len(row) != len(header):
+    def choose(labels: Sequence[str], aside: Collection[str] = ()) -> list[int]:
+        _refuse_repeated(path, labels, "two markers are labelled")
+        for label in renamed:
+            _require_one_of(path, label, labels, "label")
+        known = [renamed.get(label, label) for label in labels]
+        _refuse_repeated(path, known, "after renaming two markers are named")
+        if names is None:
+            wanted = [k for k, label in enumerate(labels) if label not in aside or label in renamed]
+            if not wanted:
+                raise InputError(_no_markers(labels), path)
+            return wanted
+        if not names:
             raise InputError(
-                f"{len(row)} cells, but the header has {len(header)} columns", path, f"line {line}"
+                "no markers are asked for; leave the names out to take all of them", path
             )
-    return header, [line for line, _ in cells[1:]], [row for _, row in cells[1:]]
+        for name in names:
+            _require_one_of(path, name, known, "marker")
+        _refuse_repeated(path, names, "asked for more than once: marker")
+        return [known.index(name) for name in names]
+
+    return choose
 
 
-def _numbers(
-    path: str | Path,
-    header: list[str],
-    lines: list[int],
-    rows: list[list[str]],
-    columns: list[int],
-    blank_allowed: bool,
-) -> FloatArray:
-    """The cells of some columns as (rows, columns); NaN where blank."""
-    values = np.empty((len(rows), len(columns)))
-    for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            cell = row[column]
-            try:
-                value = float(cell) if cell else math.nan
-            except ValueError:
-                value = math.inf
-            if math.isinf(value) or (math.isnan(value) and not blank_allowed):
-                or_blank = " or a blank cell" if blank_allowed else ""
-                raise InputError(
-                    f"column {header[column]} holds '{cell}'; expected a number{or_blank}",
-                    path,
-                    f"line {lines[i]}",
-                )
-            values[i, j] = value
-    return values
+def _no_markers(labels: Sequence[str]) -> str:
+    if not labels:
+        return "holds no markers"
+    return f"holds unlabelled markers only; label them, or rename with labels: {listed(labels)}"
 
 
-def _marker_names(path: str | Path, header: list[str]) -> list[str]:
-    """Names of the markers in the file, in the order of their first columns."""
-    names = dict.fromkeys(
-        column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
-    )
-    expected = ["t_s", *(f"{name}_{axis}" for name in names for axis in _AXES)]
-    unknown = [column for column in header if column not in expected]
-    missing = [column for column in expected if column not in header]
-    repeated = sorted({column for column in header if header.count(column) > 1})
-    faults = [
-        f"{what} {_listed(columns)}"
-        for what, columns in (("unknown", unknown), ("missing", missing), ("repeated", repeated))
-        if columns
-    ]
-    if not faults and names:
-        return list(names)
-    raise InputError(
-        f"columns {'; '.join(faults) or 'hold no markers'}; expected t_s and, for each marker, "
-        f"<name>_x, <name>_y, <name>_z; found {_listed(header)}",
-        path,
-        "line 1",
-    )
-
-
-def _asked_for(path: str | Path, there: list[str], names: Sequence[str]) -> list[str]:
-    if not names:
-        raise InputError("no markers are asked for; leave the names out to take all of them", path)
+def _refuse_repeated(path: str | Path, names: Sequence[str], message: str) -> None:
     for name in names:
-        if name not in there:
-            close = difflib.get_close_matches(name, there, n=1)
-            hint = f"; did you mean '{close[0]}'?" if close else ""
-            raise InputError(f"no marker '{name}'; the file has {_listed(there)}{hint}", path)
         if list(names).count(name) > 1:
-            raise InputError(f"marker '{name}' is asked for more than once", path)
-    return list(names)
+            raise InputError(f"{message} '{name}'; expected names that differ", path)
 
 
-def _write_csv(path: str | Path, header: Sequence[str], values: FloatArray) -> None:
-    """Write beside the target and rename, so that a reader never meets half a file."""
-    target = Path(path)
-    draft = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        with open(draft, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(header)
-            for row in values:
-                writer.writerow("" if math.isnan(value) else _DIGITS % value for value in row)
-        os.replace(draft, target)
-    finally:
-        draft.unlink(missing_ok=True)
+def _require_one_of(path: str | Path, name: str, there: Sequence[str], what: str) -> None:
+    if name not in there:
+        close = difflib.get_close_matches(name, there, n=1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        raise InputError(f"no {what} '{name}'; the file has {listed(there)}{hint}", path)
 
 
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names)
+def _unit(path: str | Path, raw: RawTracks, given: str | None) -> str:
+    if given and raw.unit and given != raw.unit:
+        raise InputError(
+            f"length_unit is '{given}', but {raw.unit_key} says '{raw.unit}'; expected the same, "
+            "or no length_unit",
+            path,
+        )
+    unit = given or raw.unit or raw.default_unit
+    if unit is None:
+        raise InputError(
+            f"no unit of length is stated by {raw.unit_key}; expected length_unit, one of "
+            f"{listed(METRES_PER_UNIT)}",
+            path,
+        )
+    return unit
+
+
+def _times_s(path: str | Path, raw: RawTracks, given_hz: float | None) -> FloatArray:
+    """Times of the frames: as in the file, else from the rate."""
+    t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": given_hz}
+    stated = {key: rate for key, rate in rates.items() if rate}
+    if t_s is not None:
+        lines = raw.lines
+        if fault := first_time_fault(t_s):
+            raise InputError(fault[1], path, None if lines is None else f"line {lines[fault[0]]}")
+        for key, rate in stated.items():
+            _refuse_other_rate(path, t_s, key, rate)
+        return t_s
+    if not stated:
+        raise InputError(
+            f"neither {raw.rate_key} nor a column of times states when the frames were taken; "
+            "expected rate_hz",
+            path,
+        )
+    first, *others = stated.values()
+    if not all(math.isclose(first, other, rel_tol=1e-6) for other in others):
+        raise InputError(
+            f"rate_hz is {given_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
+            "rate_hz",
+            path,
+        )
+    return np.arange(len(raw.coordinates)) / first
+
+
+def _refuse_other_rate(path: str | Path, t_s: FloatArray, key: str, rate_hz: float) -> None:
+    """Lost frames spoil the mean step, and coarsely printed times the median: one must agree."""
+    if len(t_s) < 2:
+        return
+    steps = np.diff(t_s)
+    mean_hz, median_hz = 1 / steps.mean(), 1 / np.median(steps)
+    if min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1)) > _RATE_TOLERANCE:
+        raise InputError(
+            f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "
+            f"{mean_hz:.6g} Hz; expected the same",
+            path,
+        )
+
+
+def _present(raw: RawTracks, names: Iterable[str]) -> tuple[FloatArray, list[str]]:
+    """Coordinates with NaN for every missing sample, and a sentence for each marker with some."""
+    x = raw.coordinates
+    blank = np.asarray(np.isnan(x).any(axis=2))
+    zero = np.asarray((x == 0.0).all(axis=2)) & raw.zeros_are_missing
+    notes = []
+    for k, name in enumerate(names):
+        counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}
+        if missing := sum(counts.values()):
+            kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+            notes.append(f"{name}: {missing} of {len(x)} samples missing ({kinds})")
+    return np.where((blank | zero)[:, :, None], np.nan, x), notes

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from . import quadratic
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,8 @@ class Element:
         (nodes,) share of the element's mass lumped at each node, all positive, sum one.
     meshio_type : str
         Cell name for writing files.
+    edges : tuple of pairs
+        For each node after the corners, the two corners that it lies halfway between.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Element:
     weights: Array
     mass_shares: Array
     meshio_type: str
+    edges: tuple[tuple[int, int], ...] = ()
 
 
 def _linear_gradients(barycentric: Array) -> Array:
@@ -63,6 +67,19 @@ ELEMENTS: dict[str, Element] = {
         weights=np.ones(1),
         mass_shares=np.full(4, 0.25),
         meshio_type="tetra",
+    ),
+    # Bends without locking, and hardly locks near incompressibility; what is chosen for it, and
+    # why, is in `quadratic`.
+    "tet10": Element(
+        name="tet10",
+        nodes=10,
+        shape_functions=quadratic.shape_functions,
+        shape_gradients=quadratic.shape_gradients,
+        points=quadratic.POINTS,
+        weights=quadratic.WEIGHTS,
+        mass_shares=quadratic.MASS_SHARES,
+        meshio_type="tetra10",
+        edges=quadratic.EDGES,
     ),
 }
 

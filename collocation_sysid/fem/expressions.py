@@ -13,12 +13,18 @@ theta    3             λ [Pa], μ [Pa], γ_r [s]
 and outputs that are summed over points and elements. Symmetric matrices are given by their
 lower triangles, column after column. With S = −V ∂ψ/∂F − γ_r V (∂²ψ/∂F²):Ḟ the force on node a
 is S ∇N_a, so that f = −∂Ψ/∂x − γ_r K v.
+
+Up to that last product a kernel knows only F, Ḟ and the like: 9 or 9 × 9 numbers whatever the
+element, its *pieces*. How they meet the shape gradients is told by a `Contraction`, which an
+evaluator may do in loops: written out for ten nodes it is most of the instructions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
 
 import casadi as ca
 
@@ -27,14 +33,47 @@ from .materials import Energy
 
 THETA = ("lambda_pa", "mu_pa", "gamma_r_s")
 
+# What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
+# to the lower triangle of (3·nodes, 3·nodes).
+Contraction = Literal["none", "nodes", "pairs"]
+
 
 @dataclass(frozen=True, eq=False)
 class PointKernel:
-    """One SX function of a quadrature point, with the names of its inputs and outputs."""
+    """What one quadrature point contributes.
 
-    function: ca.Function
+    Attributes
+    ----------
+    pieces : casadi.Function
+        Of the fields, geometry and θ; one output for each piece.
+    fields : tuple of str
+        Names of the inputs that come first, each 3·nodes long.
+    contractions : dict of str to Contraction
+        For each output.
+    """
+
+    pieces: ca.Function
     fields: tuple[str, ...]
-    outputs: dict[str, int]
+    contractions: dict[str, Contraction]
+
+    @property
+    def nodes(self) -> int:
+        """Nodes per element."""
+        return self.pieces.nnz_in(0) // 3
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The whole kernel, contractions written out."""
+        sx = self.pieces
+        names = sx.name_in()
+        inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
+        gradients = _gradients(inputs[-2], self.nodes)
+        outputs = [
+            _contracted(piece, how, gradients)
+            for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
+        ]
+        dense = [ca.densify(ca.vec(output)) for output in outputs]
+        return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +99,13 @@ def _point(nodes: int) -> _Point:
         w=ca.SX.sym("w", 3 * nodes),
         geometry=geometry,
         theta=ca.SX.sym("theta", len(THETA)),
-        gradients=ca.reshape(geometry[: 3 * nodes], 3, nodes).T,
+        gradients=_gradients(geometry, nodes),
         volume=geometry[3 * nodes],
     )
+
+
+def _gradients(geometry: ca.SX, nodes: int) -> ca.SX:
+    return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
 
 
 def _material_gradient(point: _Point, field: ca.SX) -> ca.SX:
@@ -70,38 +113,42 @@ def _material_gradient(point: _Point, field: ca.SX) -> ca.SX:
     return ca.vec(ca.reshape(field, 3, point.nodes) @ point.gradients)
 
 
-def _to_nodes(point: _Point, stress: ca.SX) -> ca.SX:
-    """Contract columns of (9, k), conjugate to F, with the shape gradients: (3·nodes, k)."""
-    columns = [
-        ca.vec(ca.reshape(stress[:, k], 3, 3) @ point.gradients.T) for k in range(stress.shape[1])
-    ]
+def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
+    if how == "none":
+        return piece
+    nodes = gradients.shape[0]
+    half = ca.vertcat(*[_at_node(piece, gradients[a, :]) for a in range(nodes)])
+    if how == "nodes":
+        return half
+    # By symmetry the (3·nodes, 9) just found, read along its rows, has the columns contracted.
+    columns = []
+    for b in range(nodes):
+        rows = half[3 * b : 3 * b + 3, :].T
+        blocks = [_at_node(rows, gradients[a, :]) for a in range(b, nodes)]
+        whole = ca.vertcat(*blocks)
+        columns += [whole[j:, j] for j in range(3)]
+    return ca.vertcat(*columns)
+
+
+def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
+    """Columns of (9, k), conjugate to F, times one node's shape gradient: (3, k)."""
+    columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
     return ca.horzcat(*columns)
 
 
-def _lower_to_nodes(point: _Point, tangent: ca.SX) -> ca.SX:
-    """Lower triangle of Bᵀ A B for a symmetric (9, 9) tangent A, column after column."""
-    half = _to_nodes(point, tangent)  # (3·nodes, 9): rows contracted
-    size = 3 * point.nodes
-    entries = []
-    for b in range(point.nodes):
-        gradient = point.gradients[b, :]
-        for j in range(3):
-            column = 3 * b + j
-            rows = half[column:size, :]
-            entries.append(sum(rows[:, j + 3 * k] * gradient[k] for k in range(3)))
-    return ca.vertcat(*entries)
-
-
-def _function(
-    name: str, point: _Point, fields: tuple[str, ...], outputs: dict[str, ca.SX]
+def _kernel(
+    name: str,
+    point: _Point,
+    fields: tuple[str, ...],
+    outputs: dict[str, tuple[Contraction, ca.SX]],
 ) -> PointKernel:
     inputs = {field: getattr(point, field) for field in fields}
     inputs |= {"geometry": point.geometry, "theta": point.theta}
-    dense = {key: ca.densify(ca.vec(value)) for key, value in outputs.items()}
+    pieces = [ca.densify(piece) for _, piece in outputs.values()]
     function = ca.Function(
-        name, list(inputs.values()), list(dense.values()), list(inputs), list(dense), {"cse": True}
+        name, list(inputs.values()), pieces, list(inputs), list(outputs), {"cse": True}
     )
-    return PointKernel(function, fields, {key: value.numel() for key, value in dense.items()})
+    return PointKernel(function, fields, {key: how for key, (how, _) in outputs.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +174,7 @@ def energy_kernel(element: Element, energy: Energy) -> PointKernel:
     point = _point(element.nodes)
     F = ca.reshape(_material_gradient(point, point.x), 3, 3)
     psi = point.volume * energy(F, point.theta[0], point.theta[1])
-    return _function("energy", point, ("x",), {"energy": psi})
+    return _kernel("energy", point, ("x",), {"energy": ("none", psi)})
 
 
 def force_kernel(element: Element, energy: Energy) -> PointKernel:
@@ -135,7 +182,7 @@ def force_kernel(element: Element, energy: Energy) -> PointKernel:
     point = _point(element.nodes)
     law = _stress(point, energy)
     force = _at(point, law, law.stress)
-    return _function("force", point, ("x", "v"), {"force": _to_nodes(point, force)})
+    return _kernel("force", point, ("x", "v"), {"force": ("nodes", force)})
 
 
 def linearisation_kernel(element: Element, energy: Energy) -> PointKernel:
@@ -149,13 +196,13 @@ def linearisation_kernel(element: Element, energy: Energy) -> PointKernel:
         ca.jacobian(law.stress, point.theta),
     ]
     stress, by_f, by_rate, by_theta = (_at(point, law, piece) for piece in pieces)
-    outputs = {
-        "force": _to_nodes(point, stress),
-        "by_position": _lower_to_nodes(point, by_f),
-        "by_velocity": _lower_to_nodes(point, by_rate),
-        "by_theta": _to_nodes(point, by_theta),
+    outputs: dict[str, tuple[Contraction, ca.SX]] = {
+        "force": ("nodes", stress),
+        "by_position": ("pairs", by_f),
+        "by_velocity": ("pairs", by_rate),
+        "by_theta": ("nodes", by_theta),
     }
-    return _function("linearisation", point, ("x", "v"), outputs)
+    return _kernel("linearisation", point, ("x", "v"), outputs)
 
 
 def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
@@ -181,15 +228,15 @@ def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
     xx, xv, x_theta, v_theta, theta_theta, first = (
         ca.substitute(_at(point, law, piece), W, w_gradient) for piece in pieces
     )
-    outputs = {
-        "position_position": _lower_to_nodes(point, xx),
-        "position_velocity": _lower_to_nodes(point, xv),
-        "position_theta": _to_nodes(point, x_theta),
-        "velocity_theta": _to_nodes(point, v_theta),
-        "theta_theta": theta_theta,
-        "gradient_theta": first,
+    outputs: dict[str, tuple[Contraction, ca.SX]] = {
+        "position_position": ("pairs", xx),
+        "position_velocity": ("pairs", xv),
+        "position_theta": ("nodes", x_theta),
+        "velocity_theta": ("nodes", v_theta),
+        "theta_theta": ("none", theta_theta),
+        "gradient_theta": ("none", first),
     }
-    return _function("curvature", point, ("x", "v", "w"), outputs)
+    return _kernel("curvature", point, ("x", "v", "w"), outputs)
 
 
 def _at(point: _Point, law: _Stress, expression: ca.SX) -> ca.SX:

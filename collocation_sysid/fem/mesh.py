@@ -24,6 +24,7 @@ from .mesh_checks import (
     unique_edges,
 )
 from .mesh_files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
+from .nodes import Nodes
 from .selection import Selection
 from .surface import tetrahedralize_surface
 
@@ -34,8 +35,8 @@ _OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 class TetMesh:
     """A mesh of linear tetrahedra in metres; its arrays are read-only.
 
-    The constructor drops nodes that no element uses and reverses negatively oriented elements,
-    and says so in `notes`. The order of the nodes and of the elements is kept.
+    The constructor drops nodes that are no element's corner and reverses negatively oriented
+    elements, and says so in `notes`. The order of the nodes and of the elements is kept.
 
     Parameters
     ----------
@@ -49,9 +50,9 @@ class TetMesh:
     Attributes
     ----------
     file_index : (n,) int64
-        The number each node had before unused ones were dropped; increasing.
+        The number each node had before others were dropped; increasing.
     file_node_count : int
-        How many nodes there were before unused ones were dropped.
+        How many nodes there were before any were dropped.
     notes : tuple of str
         What was cleaned and what looks suspicious, in sentences.
 
@@ -99,6 +100,9 @@ class TetMesh:
     def read(cls, path: str | Path, length_unit: str = "m") -> TetMesh:
         """Read the tetrahedra of any file meshio knows; other cells are left out and noted.
 
+        Quadratic tetrahedra are taken by their corners: the body's element decides about nodes
+        on edges. Slightly curved sides are straightened and noted.
+
         Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`.
 
         Parameters
@@ -110,7 +114,8 @@ class TetMesh:
         Raises
         ------
         InputError
-            If the file cannot be read, holds no linear tetrahedra, or its mesh is refused.
+            If the file cannot be read, holds no tetrahedra, their sides are curved by more than
+            5 % of their length, or its mesh is refused.
         """
         points_m, tetrahedra, arrays, notes = read_tetrahedra(path, length_unit)
         try:
@@ -163,8 +168,11 @@ class TetMesh:
         write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays)
 
     def select(self, selection: Selection) -> np.ndarray:
-        """Return the nodes of a `selection.Selection`, as sorted int64 indices."""
-        return selection.resolve(self)
+        """Return the nodes of a `selection.Selection`, as sorted int64 indices.
+
+        Where a body's element has nodes between these, see `Body.select`.
+        """
+        return selection.resolve(Nodes.corners(self))
 
     @cached_property
     def volumes_m3(self) -> np.ndarray:

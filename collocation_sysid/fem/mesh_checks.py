@@ -40,16 +40,21 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
         raise InputError(f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}")
     if array.dtype.kind not in "iu":
         raise InputError(f"tetrahedra must hold integer node numbers, not {array.dtype}")
-    bad = np.flatnonzero(((array < 0) | (array >= node_count)).any(axis=1))
+    refuse_unknown_nodes(array, node_count)
+    return array.astype(np.int64)
+
+
+def refuse_unknown_nodes(cells: np.ndarray, node_count: int) -> None:
+    """Refuse cells (E, k) with nodes that are not there."""
+    bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
-            "; they seem to count from 1" if (array.min(), array.max()) == (1, node_count) else ""
+            "; they seem to count from 1" if (cells.min(), cells.max()) == (1, node_count) else ""
         )
         raise InputError(
-            f"element {bad[0]} has nodes {array[bad[0]].tolist()}, but there are {node_count} "
+            f"element {bad[0]} has nodes {cells[bad[0]].tolist()}, but there are {node_count} "
             f"nodes, counted from 0{hint} ({len(bad)} such in all)"
         )
-    return array.astype(np.int64)
 
 
 def checked_point_arrays(arrays: Mapping[str, ArrayLike], node_count: int) -> dict[str, np.ndarray]:
@@ -67,7 +72,7 @@ def checked_point_arrays(arrays: Mapping[str, ArrayLike], node_count: int) -> di
 def cleaned(
     points_m: np.ndarray, tetrahedra: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Drop nodes that no element uses and reverse negatively oriented elements, keeping orders.
+    """Drop nodes that are no element's corner, reverse negatively oriented elements, keep orders.
 
     Returns
     -------
@@ -94,7 +99,7 @@ def cleaned(
     if len(dropped):
         notes.append(
             f"{len(dropped)} of {len(points_m)} nodes were dropped (node {dropped[0]} is the "
-            "first): no element uses them."
+            "first): they are no element's corner."
         )
     if len(reversed_elements):
         notes.append(

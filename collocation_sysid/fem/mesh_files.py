@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from .quadratic import straightened
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 
+_TETRAHEDRA = ("tetra", "tetra10")
 _SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 
 
@@ -30,7 +32,7 @@ def length_in_metres(length_unit: str) -> float:
 def read_tetrahedra(
     path: str | Path, length_unit: str = "m"
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
-    """Read the linear tetrahedra of a file; other cells are left out.
+    """Read the tetrahedra of a file, quadratic ones by their corners; other cells are left out.
 
     Returns
     -------
@@ -40,24 +42,32 @@ def read_tetrahedra(
     point_arrays : dict of name to (n, ...) array
         The file's point data, and its point sets as booleans.
     notes : tuple of str
-        Which cells were left out, if any.
+        Which cells were left out and which sides straightened, if any.
 
     Raises
     ------
     InputError
-        If the file cannot be read or holds no linear tetrahedra.
+        If the file cannot be read, holds no tetrahedra, or their sides are strongly curved.
     """
     metres = length_in_metres(length_unit)
     data = _read(path)
     counts = _cell_counts(data)
-    blocks = [block.data for block in data.cells if block.type == "tetra" and len(block.data)]
+    points_m = np.asarray(data.points, dtype=float) * metres
+    blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
     if not blocks:
         raise InputError(_explain_no_tetrahedra(counts), path)
+    notes = _note_left_out(counts)
+    quadratic = [block.data for block in blocks if block.type == "tetra10"]
+    if quadratic:
+        try:
+            notes += straightened(points_m, np.concatenate(quadratic))
+        except InputError as error:
+            raise error.located(path) from None
     return (
-        np.asarray(data.points, dtype=float) * metres,
-        np.concatenate(blocks),
+        points_m,
+        np.concatenate([block.data[:, :4] for block in blocks]),
         {**_point_sets(data), **data.point_data},
-        _note_left_out(counts),
+        notes,
     )
 
 
@@ -159,7 +169,7 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 
 def _note_left_out(counts: Mapping[str, int]) -> tuple[str, ...]:
-    others = {name: count for name, count in counts.items() if name != "tetra" and count}
+    others = {name: count for name, count in counts.items() if name not in _TETRAHEDRA and count}
     if not others:
         return ()
     solid = any(name.startswith(_SOLID_CELLS) for name in others)
@@ -168,10 +178,5 @@ def _note_left_out(counts: Mapping[str, int]) -> tuple[str, ...]:
 
 
 def _explain_no_tetrahedra(counts: Mapping[str, int]) -> str:
-    if "tetra10" in counts:
-        return (
-            f"found only quadratic tetrahedra ({_listed(counts)}), which are for the quadratic "
-            "element and not supported yet; save the mesh with linear tetrahedra"
-        )
     surface = "; a closed surface can be filled by TetMesh.from_surface" * ("triangle" in counts)
     return f"no tetrahedra in this file, found {_listed(counts)}{surface}"

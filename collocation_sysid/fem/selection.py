@@ -1,32 +1,20 @@
-"""Node selections: which nodes of a mesh are grasped, loaded or observed."""
+"""Node selections: which nodes of a mesh or body are grasped, loaded or observed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import InputError
 
+if TYPE_CHECKING:
+    from .nodes import Nodes
+
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
 ROUND_OFF = 1e-9
-
-
-class _Mesh(Protocol):
-    """What a selection looks at of a `TetMesh`, which describes it."""
-
-    @property
-    def points_m(self) -> np.ndarray: ...
-    @property
-    def bounds_m(self) -> np.ndarray: ...
-    @property
-    def point_arrays(self) -> Mapping[str, np.ndarray]: ...
-    @property
-    def file_index(self) -> np.ndarray: ...
-    @property
-    def file_node_count(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -53,13 +41,13 @@ class Box:
         object.__setattr__(self, "low_m", low)
         object.__setattr__(self, "high_m", high)
 
-    def resolve(self, mesh: _Mesh) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
-        slack = _round_off_m(mesh)
-        above = mesh.points_m >= np.subtract(self.low_m, slack)
-        below = mesh.points_m <= np.add(self.high_m, slack)
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        slack = _round_off_m(nodes)
+        above = nodes.points_m >= np.subtract(self.low_m, slack)
+        below = nodes.points_m <= np.add(self.high_m, slack)
         low, high = (", ".join(f"{x:g}" for x in corner) for corner in (self.low_m, self.high_m))
-        return _chosen(np.all(above & below, axis=1), mesh, f"the box from ({low}) to ({high}) m")
+        return _chosen(np.all(above & below, axis=1), nodes, f"the box from ({low}) to ({high}) m")
 
 
 @dataclass(frozen=True)
@@ -74,20 +62,21 @@ class Ball:
         if not _is_number(self.radius_m) or not self.radius_m > 0:
             raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
-    def resolve(self, mesh: _Mesh) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
-        distance = np.linalg.norm(mesh.points_m - np.array(self.center_m), axis=1)
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        distance = np.linalg.norm(nodes.points_m - np.array(self.center_m), axis=1)
         center = ", ".join(f"{x:g}" for x in self.center_m)
         what = f"the ball of radius {self.radius_m:g} m about ({center}) m"
         nearest = f"; the nearest node is {distance.min():.4g} m from its centre"
-        return _chosen(distance <= self.radius_m + _round_off_m(mesh), mesh, what, nearest)
+        return _chosen(distance <= self.radius_m + _round_off_m(nodes), nodes, what, nearest)
 
 
 @dataclass(frozen=True)
 class Indices:
     """Nodes by number, counted from 0, as the mesh file (or the given array) numbers them.
 
-    These differ from the rows of `mesh.points_m` where unused nodes were dropped.
+    These differ from the rows of `mesh.points_m` where nodes were dropped. Only corners can be
+    given: a node on an edge is selected when both of the edge's ends are.
     """
 
     indices: Sequence[int]
@@ -98,8 +87,9 @@ class Indices:
             raise InputError(f"indices must be a list of whole node numbers, not {self.indices!r}")
         object.__setattr__(self, "indices", tuple(given.tolist()))
 
-    def resolve(self, mesh: _Mesh) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        mesh = nodes.mesh
         wanted = np.unique(np.array(self.indices, dtype=np.int64))
         outside = wanted[(wanted < 0) | (wanted >= mesh.file_node_count)]
         if len(outside):
@@ -110,20 +100,25 @@ class Indices:
         dropped = np.setdiff1d(wanted, mesh.file_index)
         if len(dropped):
             raise InputError(
-                f"indices: node {dropped[0]} was dropped from the mesh because no element uses it; "
-                "leave it out"
+                f"indices: node {dropped[0]} was dropped from the mesh because it is no element's "
+                "corner; leave it out (a node on an edge is selected when both of its ends are)"
             )
-        return _chosen(np.isin(mesh.file_index, wanted), mesh, "an empty list of indices")
+        chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, wanted))
+        return _chosen(chosen, nodes, "an empty list of indices")
 
 
 @dataclass(frozen=True)
 class Named:
-    """The nodes where a point array of the mesh, of booleans or of zeros and ones, is true."""
+    """The nodes where a point array of the mesh, of booleans or of zeros and ones, is true.
+
+    A node on an edge is selected when both of the edge's ends are.
+    """
 
     name: str
 
-    def resolve(self, mesh: _Mesh) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `mesh.points_m`."""
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        mesh = nodes.mesh
         if self.name not in mesh.point_arrays:
             names = ", ".join(f'"{name}"' for name in mesh.point_arrays)
             available = f"it has {names}" if names else "it has none"
@@ -140,26 +135,25 @@ class Named:
             raise InputError(
                 f'point array "{self.name}" holds {odd[0]}; a selection needs only 0 and 1'
             )
-        return _chosen(values.astype(bool), mesh, f'point array "{self.name}"')
+        chosen = nodes.with_mid_nodes(values.astype(bool))
+        return _chosen(chosen, nodes, f'point array "{self.name}"')
 
 
 Selection = Box | Ball | Indices | Named
 
 
-def _chosen(mask: np.ndarray, mesh: _Mesh, what: str, nearest: str = "") -> np.ndarray:
+def _chosen(mask: np.ndarray, nodes: Nodes, what: str, nearest: str = "") -> np.ndarray:
     if not mask.any():
-        body = ", ".join(
-            f"{axis} from {low:.4g} to {high:.4g} m"
-            for axis, low, high in zip("xyz", *mesh.bounds_m, strict=True)
-        )
+        span = zip("xyz", *nodes.mesh.bounds_m, strict=True)  # no mid node lies beyond
+        body = ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in span)
         raise InputError(
             f"{what} selects none of the {len(mask)} nodes{nearest}; the body spans {body}"
         )
     return np.flatnonzero(mask).astype(np.int64)
 
 
-def _round_off_m(mesh: _Mesh) -> float:
-    return ROUND_OFF * float(np.linalg.norm(np.ptp(mesh.points_m, axis=0)))
+def _round_off_m(nodes: Nodes) -> float:
+    return ROUND_OFF * float(np.linalg.norm(np.ptp(nodes.points_m, axis=0)))
 
 
 def _is_number(value: object) -> bool:

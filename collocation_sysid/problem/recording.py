@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +14,36 @@ from numpy.typing import NDArray
 from ..errors import InputError, SimulationError
 from ..experiment import (
     Experiment,
+    Force,
     Grasp,
     Markers,
     MarkerTable,
+    Nuisance,
     Placement,
+    PointMass,
     PoseSequence,
     align,
     held_nodes,
     place_markers,
-    read_markers_csv,
-    read_poses_csv,
+    read_forces,
+    read_poses,
 )
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
 from ..nlp.newton import Solver
 from ..nlp.parameters import Parameters
 from ..nlp.rest import start_state
-from .schema import ExperimentSection, GraspSection, MarkersSection, NodesSection
+from .schema import (
+    EstimateSection,
+    ExperimentSection,
+    ForceSection,
+    GraspSection,
+    MarkersSection,
+    MassSection,
+    NodesSection,
+    PosePrior,
+)
+from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
 Array = NDArray[np.float64]
 Build = Callable[[Markers], Experiment]
@@ -102,9 +116,11 @@ class RecordingReader:
         table = self._table(poses)
         t_s, poses, table = self._align(poses, table)
         grasps = tuple(
-            Grasp(self._nodes(k, grasp), sequence)
+            self._grasp(k, grasp, sequence)
             for k, (grasp, sequence) in enumerate(zip(section.grasps, poses, strict=True))
         )
+        masses = tuple(self._mass(k, mass) for k, mass in enumerate(section.mass))
+        forces = tuple(self._force(k, force) for k, force in enumerate(section.force))
 
         def build(markers: Markers) -> Experiment:
             return Experiment(
@@ -117,6 +133,9 @@ class RecordingReader:
                 start=section.start,
                 start_rule=section.start_rule,
                 validation=section.validation,
+                masses=masses,
+                forces=forces,
+                nuisance=_nuisance(section.estimate),
             )
 
         n = len(self.body.nodes_m)
@@ -133,25 +152,78 @@ class RecordingReader:
         return f"grasp.{k}.{key}" if len(self.section.grasps) > 1 else f"grasp.{key}"
 
     def _poses(self, k: int, grasp: GraspSection) -> PoseSequence:
+        if grasp.markers is not None:
+            return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.poses is None:
             return PoseSequence.fixed()
-        poses = read_poses_csv(existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses")))
+        file = existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses"))
+        poses = read_poses(file, grasp.quaternion, grasp.length_unit)
         return replace(poses, interpolation=grasp.interpolation)
 
-    def _nodes(self, k: int, grasp: GraspSection) -> NDArray[np.int64]:
+    def _poses_from_markers(self, grasp: GraspSection, key: str) -> PoseSequence:
+        if self._recorded is None:
+            raise InputError(
+                "there are no tracks to fit the poses to; expected markers.file, or poses",
+                None,
+                key,
+            )
+        _refuse_unknown(grasp.markers or (), self._recorded.names, key)
         try:
-            return self.body.mesh.select(selection(grasp.nodes))
+            poses, notes = poses_from_markers(grasp, self._recorded, self.section.window_s)
         except InputError as error:
-            raise InputError(error.message, None, self._grasp_key(k, "nodes")) from error
+            raise error.located(None, key) from error
+        self._note(*(f"{key}: {note}" for note in notes))
+        return poses
+
+    @cached_property
+    def _recorded(self) -> MarkerTable | None:
+        """All measured tracks that are used, in the body's frame; None to simulate without."""
+        markers = self.section.markers
+        if markers.file is None and not self.simulation:
+            raise InputError("missing; expected a file of marker tracks", None, "markers.file")
+        if not markers.file or (self.simulation and not (self.folder / markers.file).exists()):
+            return None
+        file = existing_file(self.folder, markers.file, "markers.file")
+        table = read_recorded(self.section, file)
+        self._note(*(f"{markers.file}: {note}" for note in table.notes))
+        _refuse_unknown(markers.template_m or (), table.names, "markers.template_m")
+        try:
+            table, notes = into_body_frame(markers, table)
+        except InputError as error:
+            raise error.located(None, "markers.template_m") from error
+        self._note(*notes)
+        return table
+
+    def _note(self, *notes: str) -> None:
+        self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
+
+    def _grasp(self, k: int, grasp: GraspSection, poses: PoseSequence) -> Grasp:
+        nodes = self._nodes(grasp.nodes, self._grasp_key(k, "nodes"))
+        return Grasp(nodes, poses, **grasp.model_dump(include={"from_s", "until_s"}, exclude_none=True))
+
+    def _mass(self, k: int, mass: MassSection) -> PointMass:
+        nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")
+        return PointMass(nodes, **mass.model_dump(include={"mass_kg", "from_s"}, exclude_none=True))
+
+    def _force(self, k: int, force: ForceSection) -> Force:
+        nodes = self._nodes(force.nodes, f"force.{k}.nodes")
+        if force.force_n is not None:
+            return Force(nodes, np.array(force.force_n))
+        assert force.file is not None  # by the schema
+        t_s, force_n = read_forces(existing_file(self.folder, force.file, f"force.{k}.file"))
+        return Force(nodes, force_n, t_s)
+
+    def _nodes(self, nodes: NodesSection | str, key: str) -> NDArray[np.int64]:
+        try:
+            return self.body.select(selection(nodes))
+        except InputError as error:
+            raise InputError(error.message, None, key) from error
 
     def _table(self, poses: list[PoseSequence]) -> MarkerTable:
         """The measured tracks; to simulate without them, zeros at the poses' times."""
+        if self._recorded is not None:
+            return self._fitted(self._recorded)
         markers = self.section.markers
-        if markers.file is None and not self.simulation:
-            raise InputError("missing; expected a markers CSV", None, "markers.file")
-        if markers.file and (not self.simulation or (self.folder / markers.file).exists()):
-            file = existing_file(self.folder, markers.file, "markers.file")
-            return read_markers_csv(file, markers.names, markers.length_unit)
         names = tuple(markers.names or markers.reference_m)
         lacking = [name for name in names if name not in markers.reference_m]
         if lacking or not names:
@@ -170,7 +242,28 @@ class RecordingReader:
                 None,
                 "grasp",
             )
-        return MarkerTable(times, names, np.zeros((len(times), len(names), 3)))
+        return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
+
+    def _fitted(self, table: MarkerTable) -> MarkerTable:
+        """The tracks without the gripper's markers and those of weight 0."""
+        markers = self.section.markers
+        for key in ("reference_m", "sigma_m", "weights"):
+            given = getattr(markers, key)
+            _refuse_unknown(given if isinstance(given, dict) else (), table.names, f"markers.{key}")
+        unweighted = [name for name in table.names if markers.weights.get(name) == 0]
+        if unweighted:
+            self._note(f"left out, with the weight 0: {', '.join(unweighted)}")
+        gripper = gripper_markers(self.section) - set(markers.names or ())
+        kept = [k for k, n in enumerate(table.names) if n not in gripper and n not in unweighted]
+        if not kept:
+            raise InputError(
+                f"none is left of {', '.join(table.names)}: all are the gripper's or have the "
+                "weight 0; expected at least one that the body's motion is compared with",
+                None,
+                "markers",
+            )
+        names = tuple(table.names[k] for k in kept)
+        return MarkerTable(table.t_s, names, table.positions_m[:, kept])
 
     def _align(
         self, poses: list[PoseSequence], table: MarkerTable
@@ -181,7 +274,9 @@ class RecordingReader:
         t_s, grid = table.t_s, table
         for sequence, file in zip(poses or [PoseSequence.fixed()], files, strict=True):
             try:
-                t_s, moved, grid = align(sequence, table, section.window_s, section.resample_hz)
+                t_s, moved, grid = align(
+                    sequence, table, section.window_s, section.resample_hz, section.every
+                )
             except InputError as error:
                 named = " and ".join(name for name in (file, section.markers.file) if name)
                 raise InputError(error.message, None, named) from error
@@ -196,7 +291,6 @@ class RecordingReader:
     def _place(self, t_s: Array, table: MarkerTable, build: Build) -> Experiment:
         """Attach the markers: by reference where given, else by their first sample."""
         spec, names, nodes_m = self.section.markers, table.names, self.body.nodes_m
-        _refuse_unknown(spec.reference_m, names, "markers.reference_m")
         sigma_m = _sigma(spec, names)
         known = [k for k, name in enumerate(names) if name in spec.reference_m]
         others = [k for k, name in enumerate(names) if name not in spec.reference_m]
@@ -245,6 +339,17 @@ class RecordingReader:
         return x.reshape(-1, 3)
 
 
+def _nuisance(section: EstimateSection) -> Nuisance:
+    pose = section.pose or PosePrior.model_construct()
+    return Nuisance(
+        marker_offset_m=section.marker_offsets and section.marker_offsets.prior_m,
+        time_shift_s=section.time_shift and section.time_shift.prior_s,
+        pose_turn_rad=pose.prior_rad,
+        pose_shift_m=pose.prior_m,
+        gravity_rad=section.gravity and section.gravity.prior_rad,
+    )
+
+
 def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> None:
     for name in given:
         if name not in names:
@@ -256,15 +361,16 @@ def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> Non
 
 
 def _sigma(spec: MarkersSection, names: Sequence[str]) -> Array:
+    """Standard deviations (M,) that give each marker its weight: σ/√w."""
+    weight = np.array([spec.weights.get(name, 1.0) for name in names])
     if not isinstance(spec.sigma_m, dict):
-        return np.full(len(names), spec.sigma_m)
-    _refuse_unknown(spec.sigma_m, names, "markers.sigma_m")
+        return spec.sigma_m / np.sqrt(weight)
     lacking = [name for name in names if name not in spec.sigma_m]
     if lacking:
         raise InputError(
             f"no value for {lacking[0]!r}; expected one for every marker", None, "markers.sigma_m"
         )
-    return np.array([spec.sigma_m[name] for name in names])
+    return np.array([spec.sigma_m[name] for name in names]) / np.sqrt(weight)
 
 
 def _refuse_other_scale(experiment: Experiment) -> None:

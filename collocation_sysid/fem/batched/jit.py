@@ -112,7 +112,7 @@ def _cached_object(build: Callable[[], ir.Module], key: str, machine: llvm.Targe
 def _generation() -> str:
     """Identify the code that emits and compiles: once it changes, old kernels must not be used."""
     digest = hashlib.sha256()
-    for file in ("jit.py", "simd.py", "combine.py"):
+    for file in ("jit.py", "simd.py", "instructions.py", "loops.py", "combine.py"):
         digest.update(Path(__file__).with_name(file).read_bytes())
     return digest.hexdigest()
 

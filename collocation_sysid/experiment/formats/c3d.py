@@ -1,0 +1,107 @@
+"""C3D, the binary format of most motion-capture systems (www.c3d.org), through ezc3d."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from .tracks import Choose, RawTracks
+from .units import stated_unit
+
+_KEY = 0x50
+_BLOCK = 512
+_DEC, _SGI = 85, 86  # processor types whose numbers are not as Intel's
+_COUNTER_LIMIT = 65535
+
+
+def recognises(content: bytes) -> bool:
+    """Return whether a file's content is C3D: its second byte is 0x50, and it is no text."""
+    return len(content) > 1 and content[1] == _KEY and b"\0" in content[:_BLOCK]
+
+
+def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
+    """Read a C3D file; ezc3d gives NaN for points with a negative residual."""
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise InputError(
+            "reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'", path
+        ) from error
+    points_stated, frames_stated = _stated_counts(path, content)
+    try:
+        file = ezc3d.c3d(str(path))
+    except Exception as error:  # whatever C++ throws at a damaged file
+        raise InputError(f"is a damaged C3D file: ezc3d says '{error}'", path) from error
+    points = np.asarray(file["data"]["points"], dtype=np.float64)[:3]  # (3, points, frames)
+    for what, stated, found in (
+        ("points", points_stated, points.shape[1]),
+        ("frames", frames_stated, points.shape[2]),
+    ):
+        if stated is not None and found != stated:
+            raise InputError(f"the header states {stated} {what}, but {found} are there", path)
+    parameters = file["parameters"]["POINT"]
+    labels = _labels(parameters)
+    if len(labels) != points.shape[1]:
+        raise InputError(
+            f"{len(labels)} labels, but {points.shape[1]} points in every frame; "
+            "expected a label for each",
+            path,
+            "POINT:LABELS",
+        )
+    chosen = choose(labels)
+    units = "".join(map(str, _values(parameters, "UNITS")[:1]))
+    rates = [float(rate) for rate in _values(parameters, "RATE")[:1]]
+    return RawTracks(
+        labels=[labels[k] for k in chosen],
+        coordinates=points[:, chosen].transpose(2, 1, 0),
+        unit=stated_unit(units, path, "POINT:UNITS"),
+        unit_key="POINT:UNITS",
+        rate_hz=rates[0] if rates and rates[0] > 0 else None,
+        rate_key="POINT:RATE",
+    )
+
+
+def _stated_counts(path: str | Path, content: bytes) -> tuple[int, int | None]:
+    """Points and frames by the header; no frames where they are too many for its counter.
+
+    Of a file that is cut short ezc3d returns what is left, so the size is compared here.
+    """
+    start = _BLOCK * (content[0] - 1)
+    if len(content) < max(start + 4, _BLOCK):
+        raise InputError("is cut short: the C3D header is not whole", path)
+    processor = content[start + 3]
+    order = ">" if processor == _SGI else "<"
+    points, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
+    if last >= _COUNTER_LIMIT:
+        return points, None
+    frames = last - first + 1
+    (scale,) = struct.unpack_from(f"{order}f", content, 12)
+    (data_block,) = struct.unpack_from(f"{order}H", content, 16)
+    # A negative scale says floats, else integers; DEC has its sign elsewhere, so take the least.
+    width = 4 if scale < 0 and processor != _DEC else 2
+    size = _BLOCK * (data_block - 1) + frames * (4 * points + analog) * width
+    if len(content) < size:
+        raise InputError(
+            f"has {len(content)} bytes, but {frames} frames of {points} points need {size}; "
+            "is the file cut short?",
+            path,
+        )
+    if frames < 1 or not points:
+        raise InputError(f"holds {points} points and {frames} frames; expected some", path)
+    return points, frames
+
+
+def _labels(parameters: Any) -> list[str]:
+    """Labels of the points; those beyond the 255th stand in LABELS2, LABELS3 …"""
+    keys = [key for key in parameters if re.fullmatch(r"LABELS\d*", key)]
+    ordered = sorted(keys, key=lambda key: int(key.removeprefix("LABELS") or 1))
+    return [str(label).strip() for key in ordered for label in _values(parameters, key)]
+
+
+def _values(parameters: Any, key: str) -> list[Any]:
+    return list(parameters[key]["value"]) if key in parameters else []

@@ -1,0 +1,113 @@
+"""Motive CSV (OptiTrack): line 1 of keys and values (Export Frame Rate, Length Units …), then rows
+Type, Name, ID, and Rotation or Position above the columns; blank cells where a marker is hidden.
+
+Columns of Type "Marker" are measured. Those of "Rigid Body Marker" are where Motive's solved rigid
+body would have them, so they are taken only for markers that have no measured columns. Bodies,
+bones and their rotations are skipped; unlabelled markers are taken only if they are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...errors import InputError
+from .text import Row, comma_rows, grid, header_number, numbers, refuse_other_count
+from .tracks import Choose, RawTracks
+from .units import stated_unit
+
+BEGINNING = "Format Version"
+_MEASURED = "Marker"
+_RATES = ("Export Frame Rate", "Capture Frame Rate")
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """The Type of a marker's columns, and where x, y and z stand."""
+
+    kind: str
+    places: tuple[int, int, int]
+
+
+def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
+    """Read a Motive CSV file."""
+    rows = comma_rows(text, path)
+    first = rows[0]
+    header = dict(zip(first.cells[::2], first.cells[1::2], strict=False))
+    top = next((k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None)
+    if top is None or top < 4 or not "".join(rows[top].cells[1:2]).startswith("Time"):
+        raise InputError(
+            "is no Motive CSV with markers: expected rows of Type, Name, ID and Position, then "
+            "'Frame,Time (Seconds),X,Y,Z,…'",
+            path,
+        )
+    heads = _heads(rows[1:top], rows[top])
+    columns = _marker_columns(path, heads, rows[top].line)
+    labels = list(columns)
+    chosen = [labels[k] for k in choose(labels, [n for n in labels if n.startswith("Unlabeled")])]
+    titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
+    table = grid(path, titles, rows[top + 1 :])
+    exported = header.get("Total Exported Frames", "")
+    refuse_other_count(
+        header_number(exported, "Total Exported Frames", path, first.line),
+        len(table.rows),
+        "Total Exported Frames",
+        "frames",
+        path,
+        first.line,
+    )
+    cells = [column for label in chosen for column in columns[label].places]
+    rate_key = next((key for key in _RATES if header.get(key)), _RATES[0])
+    return RawTracks(
+        labels=chosen,
+        coordinates=numbers(table, cells, blank_allowed=True).reshape(-1, len(chosen), 3),
+        unit=stated_unit(header.get("Length Units", ""), path, "line 1, Length Units"),
+        unit_key="Length Units",
+        t_s=numbers(table, [1], blank_allowed=False)[:, 0],
+        rate_hz=header_number(header.get(rate_key, ""), rate_key, path, first.line),
+        rate_key=rate_key,
+        lines=table.lines,
+        notes=tuple(
+            f"{label}: has no measured columns; those of Type '{columns[label].kind}' were taken, "
+            "which Motive places by the rigid body it fits"
+            for label in chosen
+            if columns[label].kind != _MEASURED
+        ),
+    )
+
+
+def _heads(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
+    """Type, name, quantity and axis of every column; older files do not say which row is which."""
+    width = len(axes.cells)
+    padded = [(row.cells + [""] * width)[:width] for row in above]
+    said = {cells[1]: cells for cells in padded}
+    types, names = said.get("Type", padded[0]), said.get("Name", padded[1])
+    return list(zip(types, names, padded[-1], axes.cells, strict=True))
+
+
+def _marker_columns(
+    path: str | Path, heads: Sequence[tuple[str, str, str, str]], line: int
+) -> dict[str, _Columns]:
+    """The columns of every marker by its name, measured ones before solved ones."""
+    found: dict[tuple[str, str], dict[str, int]] = {}
+    for column, (kind, name, quantity, axis) in enumerate(heads):
+        if not kind.endswith(_MEASURED) or quantity != "Position":
+            continue
+        axes = found.setdefault((name, kind), {})
+        if axis in axes:
+            raise InputError(
+                f"two markers are named '{name}'; expected names that differ", path, f"line {line}"
+            )
+        axes[axis] = column
+    columns: dict[str, _Columns] = {}
+    for (name, kind), axes in found.items():
+        if sorted(axes) != ["X", "Y", "Z"]:
+            raise InputError(
+                f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z",
+                path,
+                f"line {line}",
+            )
+        if kind == _MEASURED or name not in columns:
+            columns[name] = _Columns(kind, (axes["X"], axes["Y"], axes["Z"]))
+    return dict(sorted(columns.items(), key=lambda item: item[1].places))

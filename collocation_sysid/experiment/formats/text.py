@@ -1,0 +1,187 @@
+"""Text files as rows of cells: reading, and turning cells into numbers."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ..arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """The stripped cells of one line, which is counted from 1."""
+
+    line: int
+    cells: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Rows of equal length below column names."""
+
+    path: Path
+    columns: list[str]
+    rows: list[Row]
+
+    @property
+    def lines(self) -> list[int]:
+        """The line of each row."""
+        return [row.line for row in self.rows]
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return a file's content.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path) from error
+
+
+def decode(content: bytes, path: str | Path) -> str:
+    """Return the text that a file's content is.
+
+    Raises
+    ------
+    InputError
+        If it is empty, or no text.
+    """
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise InputError("is not a CSV text file (UTF-8), nor any other format known here", path)
+    if not text.strip():
+        raise _empty(path)
+    return text
+
+
+def _empty(path: str | Path) -> InputError:
+    return InputError("is empty; expected a line of column names, then rows of numbers", path)
+
+
+def comma_rows(text: str, path: str | Path) -> list[Row]:
+    """Rows of a comma-separated file; blank ones are skipped."""
+    reader = csv.reader(io.StringIO(text, newline=""))
+    try:
+        rows = [Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise InputError(f"is not a CSV text file: {error}", path) from error
+    rows = [row for row in rows if any(row.cells)]
+    if not rows:
+        raise _empty(path)
+    return rows
+
+
+def tab_rows(text: str) -> list[Row]:
+    """Rows of a tab-separated file; lines without any character are skipped."""
+    lines = enumerate(re.split("\r\n|\r|\n", text), start=1)
+    return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
+
+
+def grid(path: str | Path, columns: list[str], rows: list[Row]) -> Grid:
+    """Return rows as wide as their column names; blank columns at the end of all rows are cut.
+
+    Raises
+    ------
+    InputError
+        If there is no row, or one is of another length.
+    """
+    if not rows:
+        raise InputError("has column names but no rows of numbers", path)
+    width = len(columns)
+    common = len(rows[0].cells)
+    if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
+        rows = [Row(row.line, row.cells[:width]) for row in rows]
+    for row in rows:
+        if len(row.cells) != width:
+            raise InputError(
+                f"{len(row.cells)} cells, but the header has {width} columns",
+                path,
+                f"line {row.line}",
+            )
+    return Grid(Path(path), columns, rows)
+
+
+def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> FloatArray:
+    """The cells of some columns as (rows, columns); NaN where blank.
+
+    Raises
+    ------
+    InputError
+        If a cell is not a finite number; its line and column are named.
+    """
+    values = np.empty((len(grid.rows), len(columns)))
+    for i, row in enumerate(grid.rows):
+        for j, column in enumerate(columns):
+            cell = row.cells[column]
+            try:
+                value = float(cell) if cell else math.nan
+            except ValueError:
+                value = math.inf
+            if math.isinf(value) or (math.isnan(value) and not blank_allowed):
+                or_blank = " or a blank cell" if blank_allowed else ""
+                raise InputError(
+                    f"column {grid.columns[column]} holds '{cell}'; expected a number{or_blank}",
+                    grid.path,
+                    f"line {row.line}",
+                )
+            values[i, j] = value
+    return values
+
+
+def tracks(grid: Grid, first_columns: Sequence[int]) -> FloatArray:
+    """Coordinates (rows, M, 3) of markers whose x stands in `first_columns`, y and z after it."""
+    columns = [first + axis for first in first_columns for axis in range(3)]
+    return numbers(grid, columns, blank_allowed=True).reshape(-1, len(first_columns), 3)
+
+
+def header_number(text: str, key: str, path: str | Path, line: int) -> float | None:
+    """The number that a header states; None where it is blank.
+
+    Raises
+    ------
+    InputError
+        If it is no number above 0.
+    """
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError(f"{key} is '{text}'; expected a number above 0", path, f"line {line}")
+    return value
+
+
+def refuse_other_count(
+    stated: float | None, found: int, key: str, what: str, path: str | Path, line: int
+) -> None:
+    """Raise an `InputError` if a header states another count than there is."""
+    if stated is not None and stated != found:
+        raise InputError(
+            f"{key} is {stated:g}, but {found} {what} are there; is the file cut short?",
+            path,
+            f"line {line}",
+        )
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names with commas between them."""
+    return ", ".join(names)

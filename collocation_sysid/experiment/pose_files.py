@@ -1,0 +1,236 @@
+"""Pose files: CSV with quaternions or 4x4 matrices, and NumPy archives of matrices."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from .arrays import FloatArray
+from .formats.plain import read_grid
+from .formats.text import Grid, Row, decode, listed, numbers, read_bytes
+from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
+from .grasp import PoseSequence, first_pose_fault
+
+QuaternionOrder = Literal["xyzw", "wxyz"]
+
+POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+
+_MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
+_ORDERS = ("xyzw", "wxyz")
+_ORTHONORMAL, _LAST_ROW = 1e-3, 1e-6
+_ZIP = b"PK\x03\x04"
+
+
+def read_poses(
+    path: str | Path, quaternion: str | None = None, length_unit: str | None = None
+) -> PoseSequence:
+    """Read grasp poses, which map undeformed to current positions.
+
+    A CSV has the columns t_s, x_m, y_m, z_m (or _cm, _mm, _in; or x, y, z and `length_unit`) and a
+    quaternion, in any order: qx, qy, qz, qw, or q0 … q3 or q1 … q4 and its order in `quaternion`.
+    A CSV without column names holds t, x, y, z and a quaternion; `quaternion` and `length_unit`
+    say the rest. A CSV with m00, m01 … m33 beside t_s holds 4x4 matrices row by row, a NumPy
+    archive (.npz) has them as `matrices` (T, 4, 4) beside `t_s` (T,); both in metres unless
+    `length_unit` is given.
+
+    Parameters
+    ----------
+    path : str or Path
+    quaternion : {"xyzw", "wxyz"}, optional
+        Order of a quaternion whose columns do not name its components.
+    length_unit : {"m", "cm", "mm", "in"}, optional
+        Unit of the positions, where the columns do not name it.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, unknown or repeated, a cell is not a number, time does not
+        increase, a quaternion is not of unit norm or a matrix is no rigid motion; the line is
+        named. Also where order or unit is neither in the file nor given, or they differ.
+    """
+    refuse_unknown_unit(length_unit)
+    if quaternion not in (None, *_ORDERS):
+        raise InputError(f"quaternion is {quaternion!r}; expected one of {listed(_ORDERS)}")
+    content = read_bytes(path)
+    if content.startswith(_ZIP):
+        t_s, matrices = _archive(path)
+        return _from_matrices(
+            path, t_s, matrices, length_unit, [f"index {k}" for k in range(len(t_s))]
+        )
+    table = _with_names(read_grid(path, decode(content, path)))
+    lines = [f"line {line}" for line in table.lines]
+    if sorted(table.columns) == sorted(("t_s", *_MATRIX_COLUMNS)):
+        matrices = _columns(table, _MATRIX_COLUMNS).reshape(-1, 4, 4)
+        return _from_matrices(path, _columns(table, ["t_s"])[:, 0], matrices, length_unit, lines)
+    axes, unit = _axes(table, length_unit)
+    components = _components(table, quaternion, axes)
+    t_s = _columns(table, ["t_s"])[:, 0]
+    positions_m = _columns(table, axes) * METRES_PER_UNIT[unit]
+    quaternions = _columns(table, components)
+    return _sequence(path, t_s, positions_m, quaternions, lines)
+
+
+def read_poses_csv(path: str | Path) -> PoseSequence:
+    """Read poses with the columns t_s, x_m, y_m, z_m, qx, qy, qz, qw; see `read_poses`."""
+    return read_poses(path)
+
+
+def _sequence(
+    path: str | Path,
+    t_s: FloatArray,
+    positions_m: FloatArray,
+    quaternions: FloatArray,
+    places: list[str],
+) -> PoseSequence:
+    if fault := first_pose_fault(t_s, positions_m, quaternions):
+        raise InputError(fault[1], path, places[fault[0]])
+    return PoseSequence(t_s, positions_m, quaternions)
+
+
+# Columns ------------------------------------------------------------------------------------------
+
+
+def _columns(table: Grid, names: list[str] | tuple[str, ...]) -> FloatArray:
+    return numbers(table, [table.columns.index(name) for name in names], blank_allowed=False)
+
+
+def _with_names(table: Grid) -> Grid:
+    """Give names to eight columns that have none: the first row is numbers then."""
+    if len(table.columns) != 8 or not all(map(_is_number, table.columns)):
+        return table
+    names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
+    return Grid(table.path, names, [Row(1, table.columns), *table.rows])
+
+
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", cell) is not None
+
+
+def _other_columns(table: Grid) -> InputError:
+    return InputError(
+        f"the columns are {listed(table.columns)}; expected {listed(POSE_COLUMNS)}, each once "
+        "(or t_s and m00, m01 … m33)",
+        table.path,
+        "line 1",
+    )
+
+
+def _axes(table: Grid, given: str | None) -> tuple[list[str], str]:
+    """The columns of the position, and its unit."""
+    for unit in METRES_PER_UNIT:
+        axes = [f"{axis}_{unit}" for axis in "xyz"]
+        if all(axis in table.columns for axis in axes):
+            if given not in (None, unit):
+                raise InputError(
+                    f"length_unit is '{given}', but the columns are {listed(axes)}; expected the "
+                    "same unit, or no length_unit",
+                    table.path,
+                    "line 1",
+                )
+            return axes, unit
+    if not all(axis in table.columns for axis in "xyz"):
+        raise _other_columns(table)
+    if given is None:
+        raise InputError(
+            "the columns x, y, z name no unit; expected length_unit, one of "
+            f"{listed(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m",
+            table.path,
+            "line 1",
+        )
+    return ["x", "y", "z"], given
+
+
+def _components(table: Grid, given: str | None, axes: list[str]) -> list[str]:
+    """The columns of the quaternion in the order x, y, z, w."""
+    others = [column for column in table.columns if column not in ("t_s", *axes)]
+    if "t_s" not in table.columns or len(table.columns) != 8:
+        raise _other_columns(table)
+    if sorted(others) == ["qw", "qx", "qy", "qz"]:
+        order = "".join(column[1] for column in others)
+        if given not in (None, order):
+            raise InputError(
+                f"quaternion is '{given}', but the columns are {listed(others)}; expected the same "
+                "order, or no quaternion",
+                table.path,
+                "line 1",
+            )
+        return ["qx", "qy", "qz", "qw"]
+    numbered = sorted(others)
+    if numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
+        raise _other_columns(table)
+    if given is None:
+        raise InputError(
+            f"the columns {listed(numbered)} do not say which is the scalar; expected quaternion "
+            "= 'xyzw' or 'wxyz', or columns qx, qy, qz, qw",
+            table.path,
+            "line 1",
+        )
+    return [numbered[given.index(axis)] for axis in "xyzw"]
+
+
+# Matrices -----------------------------------------------------------------------------------------
+
+
+def _archive(path: str | Path) -> tuple[FloatArray, FloatArray]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: np.asarray(archive[key]) for key in archive.files}
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise InputError(f"is not a NumPy archive of numbers: {error}", path) from error
+    found = {key: array.shape for key, array in arrays.items()}
+    shape = found.get("t_s", ())
+    if len(shape) != 1 or found.get("matrices") != (*shape, 4, 4) or not shape[0]:
+        raise InputError(
+            f"holds {', '.join(f'{key} {size}' for key, size in found.items()) or 'nothing'}; "
+            "expected t_s (T,) and matrices (T, 4, 4)",
+            path,
+        )
+    try:
+        return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"t_s and matrices must hold numbers: {error}", path) from error
+
+
+def _from_matrices(
+    path: str | Path,
+    t_s: FloatArray,
+    matrices: FloatArray,
+    length_unit: str | None,
+    places: list[str],
+) -> PoseSequence:
+    """Poses of rigid motions; SciPy would make any matrix orthonormal without a word."""
+    rotations = matrices[:, :3, :3]
+    with np.errstate(invalid="ignore"):
+        gram = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2))
+        last = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
+        last_column = np.abs(matrices[:, :3, 3]).max(axis=1)
+    for k, place in enumerate(places):
+        at = f"the matrix at t_s = {t_s[k]:.9g}"
+        fault = None
+        if not np.isfinite(matrices[k]).all():
+            fault = f"{at} holds a value that is not a finite number"
+        elif last[k] > _LAST_ROW:
+            hint = "; is it written column by column?" if last_column[k] <= _LAST_ROW else ""
+            fault = f"{at} has the last row {_row(matrices[k, 3])}; expected 0, 0, 0, 1{hint}"
+        elif gram[k] > _ORTHONORMAL:
+            fault = (
+                f"{at} is no rotation: its RᵀR differs from the identity by {gram[k]:.3g}; "
+                f"expected at most {_ORTHONORMAL:g}"
+            )
+        elif np.linalg.det(rotations[k]) < 0:
+            fault = f"{at} mirrors: its determinant is −1; expected a rotation"
+        if fault:
+            raise InputError(fault, path, place)
+    metres = METRES_PER_UNIT[length_unit or "m"]
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    return _sequence(path, t_s, matrices[:, :3, 3] * metres, quaternions, places)
+
+
+def _row(values: FloatArray) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)

@@ -1,0 +1,50 @@
+"""Pose and marker files as this project writes them: CSV in metres and seconds."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import FloatArray
+from .grasp import PoseSequence
+from .pose_files import POSE_COLUMNS
+from .readers import MarkerTable
+
+_DIGITS = "%.12g"
+
+
+def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
+    """Write poses in the format `read_poses` reads; the file appears whole or not at all."""
+    values = np.column_stack([poses.t_s, poses.positions_m, poses.quaternions_xyzw])
+    _write_csv(path, POSE_COLUMNS, values)
+
+
+def write_markers_csv(
+    path: str | Path, t_s: ArrayLike, names: Sequence[str], positions_m: ArrayLike
+) -> None:
+    """Write marker tracks (T, M, 3) in metres as `read_markers` reads them, blank for NaN."""
+    table = MarkerTable(np.asarray(t_s), tuple(names), np.asarray(positions_m))
+    header = ["t_s", *(f"{name}_{axis}" for name in table.names for axis in "xyz")]
+    tracks = table.positions_m.reshape(len(table.t_s), -1)
+    _write_csv(path, header, np.column_stack([table.t_s, tracks]))
+
+
+def _write_csv(path: str | Path, header: Sequence[str], values: FloatArray) -> None:
+    """Write beside the target and rename, so that a reader never meets half a file."""
+    target = Path(path)
+    draft = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        with open(draft, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(header)
+            for row in values:
+                writer.writerow("" if math.isnan(value) else _DIGITS % value for value in row)
+        os.replace(draft, target)
+    finally:
+        draft.unlink(missing_ok=True)

@@ -1,0 +1,56 @@
+"""The nodes of a body: those of the mesh, then one halfway along each edge if the element asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from .elements import Element
+    from .mesh import TetMesh
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Where nodes are, and which of them make up each element.
+
+    Attributes
+    ----------
+    mesh : TetMesh
+        Its nodes are the corners and come first, with their numbers.
+    points_m : (n, 3)
+    cells : (E, nodes per element)
+    ends : (k, 2) the corners at the ends of each mid node's edge: rows of `mesh.edges`, or none
+    """
+
+    mesh: TetMesh
+    points_m: Array
+    cells: Index
+    ends: Index
+
+    @classmethod
+    def corners(cls, mesh: TetMesh) -> Nodes:
+        """Only the mesh's own."""
+        return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
+
+    @classmethod
+    def of_element(cls, mesh: TetMesh, element: Element) -> Nodes:
+        """All that the element has."""
+        if not element.edges:
+            return cls.corners(mesh)
+        count, ends = len(mesh.points_m), mesh.edges
+        points = np.vstack([mesh.points_m, mesh.points_m[ends].mean(axis=1)])
+        pairs = np.sort(mesh.tetrahedra[:, element.edges], axis=2)
+        edge = np.searchsorted(ends @ [count, 1], pairs @ [count, 1])
+        points.flags.writeable = False
+        return cls(mesh, points, np.hstack([mesh.tetrahedra, count + edge]), ends)
+
+    def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Extend a choice of mesh nodes to mid nodes: chosen when both ends of the edge are."""
+        return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
