@@ -218,7 +218,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("collocation_sysid.experiment.readers.os.replace", fail)
+    monkeypatch.setattr("collocation_sysid.experiment.writers.os.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_poses_csv(path, PoseSequence.fixed())
     assert path.read_text() == "old"

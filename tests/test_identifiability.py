@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, LAME, Parameter, Parameters
+from collocation_sysid.results.identifiability import verdicts
+from collocation_sysid.results.linearised import FitBlock, LinearisedFit
+from collocation_sysid.results.uncertainty import Uncertainty, uncertainty_of
+
+VALUES = {"lambda_pa": 2000.0, "mu_pa": 300.0, "young_pa": 800.0, "poisson": 0.4}
+VALUES |= {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
+Z95 = 1.96
+
+
+def parameters(elastic: tuple[str, str] = LAME, **changes) -> Parameters:
+    items = [
+        Parameter(name, VALUES[name], VALUES[name] / 1e4, 0.499 if name == "poisson" else 1e7)
+        for name in elastic + DAMPING
+    ]
+    return Parameters(tuple(replace(item, **changes.get(item.name, {})) for item in items))
+
+
+def uncertainty(covariance: np.ndarray, of: Parameters | None = None) -> Uncertainty:
+    """As of a fit with this covariance of q, whose residuals are exactly zero."""
+    of = of or parameters()
+    k = len(covariance)
+    values, vectors = np.linalg.eigh(covariance)
+    slope = np.zeros((4, 1, 3, k))
+    slope.reshape(-1, k)[:k] = (vectors / np.sqrt(values)).T
+    seen, residual = np.ones((4, 1), dtype=bool), np.zeros((4, 1, 3))
+    block = FitBlock("swing", 0.01 * np.arange(4), ("tip",), seen, residual, slope, np.ones(1))
+    names = tuple(item.name for item in of.free)
+    fit = LinearisedFit((block,), names, k, np.zeros(k), np.zeros(k), np.zeros(k, dtype=bool))
+    return uncertainty_of(fit, of, of.guess_q)
+
+
+def spread(deviations, correlations: dict[tuple[int, int], float] | None = None) -> np.ndarray:
+    correlation = np.eye(len(deviations))
+    for (i, j), value in (correlations or {}).items():
+        correlation[i, j] = correlation[j, i] = value
+    return correlation * np.outer(deviations, deviations)
+
+
+def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
+    (sentence,) = verdicts(uncertainty(spread([0.2, 0.01, 0.02, 0.05])))
+    assert sentence == (
+        "the data fix mu_pa to ±2 %, gamma_r_s to ±4 % and gamma_m_1_s to ±10 %; "
+        "lambda_pa only to ±48 % (95 %)"
+    )
+
+
+def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
+    found = uncertainty(spread([0.9, 0.01, 0.02, 0.05]))
+    assert found.estimates["lambda_pa"].std_error is None
+    low, high = found.estimates["lambda_pa"].ci95 or (0, 0)
+    assert np.log(high / low) == pytest.approx(2 * Z95 * 0.9, rel=1e-3)
+    (sentence,) = [s for s in verdicts(found) if "not identifiable" in s]
+    assert sentence in found.notes
+    assert sentence.startswith("lambda_pa is not identifiable from these data: its 95 % interval")
+    assert "fix it" in sentence
+
+
+def test_a_parameter_the_data_say_nothing_of_is_not_determined():
+    found = uncertainty(spread([0.1, 0.01, 0.02, 1e4]))
+    assert found.estimates["gamma_m_1_s"].ci95 is None
+    said = verdicts(found)
+    assert "gamma_m_1_s" not in said[0]
+    assert any(s.startswith("gamma_m_1_s is not determined by these data") for s in said)
+
+
+def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
+    of = parameters(ENGINEERING)
+    found = uncertainty(spread([0.15, 0.15, 0.02, 0.02], {(0, 1): -0.99}), of)
+    (sentence,) = [s for s in verdicts(found) if "confounded:" in s or "confounded (" in s]
+    assert sentence.startswith("young_pa and poisson are confounded (correlation -0.990)")
+    assert "combination young_pa · poisson is fixed" in sentence
+    # Deviation of the sum of two logarithms: 0.15 √(2 (1 − 0.99)).
+    assert f"to ±{100 * np.expm1(Z95 * 0.15 * np.sqrt(0.02)):.2g} %" in sentence
+    assert "each alone only to ±34 % and ±34 %" in sentence
+    for name in ENGINEERING:
+        assert found.estimates[name].std_error is None
+        assert "confounded with" in (found.estimates[name].reason or "")
+    assert "young_pa is not identifiable from these data: confounded with poisson" in "".join(
+        found.notes
+    )
+
+
+def test_the_powers_of_a_combination_are_those_that_cancel():
+    found = uncertainty(spread([0.4, 0.1, 0.02, 0.02], {(0, 1): 0.995}))
+    (sentence,) = [s for s in verdicts(found) if "only their combination" in s]
+    assert "lambda_pa^-0.25 · mu_pa " in sentence
+
+
+def test_parameters_known_very_well_keep_their_error_though_confounded():
+    found = uncertainty(spread([0.01, 0.01, 0.02, 0.02], {(0, 1): 0.99}))
+    assert found.estimates["mu_pa"].std_error is not None
+    assert any("confounded" in sentence for sentence in verdicts(found))
+
+
+def test_three_parameters_can_be_confounded_without_any_two_being_so():
+    basis = np.array([[1.0, 0, 0], [0, 1.0, 0], [1, 1, 0.1]])
+    covariance = np.zeros((4, 4))
+    covariance[:3, :3] = 0.01 * basis @ basis.T
+    covariance[3, 3] = 1e-4
+    found = uncertainty(covariance)
+    (sentence,) = [s for s in verdicts(found) if "confounded" in s]
+    assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded: only")
+
+
+def test_the_other_elastic_pair_is_told_where_it_is_known_better():
+    found = uncertainty(spread([0.7, 0.02, 0.02, 0.02]))
+    (sentence,) = [s for s in verdicts(found) if "other elastic pair" in s]
+    assert "young_pa to ±" in sentence
+    assert "poisson" in sentence
+
+
+def test_poisson_that_can_be_anything_is_not_identifiable():
+    of = parameters(ENGINEERING, poisson={"guess": 0.25})
+    found = uncertainty(spread([0.01, 1.2, 0.02, 0.02]), of)
+    estimate = found.estimates["poisson"]
+    assert estimate.std_error is None
+    low, high = estimate.ci95 or (0.0, 1.0)
+    assert 0 < low < 0.05
+    assert 0.45 < high < 0.5
+    assert "(0, 0.5)" in (estimate.reason or "")
+
+
+def test_an_interval_beyond_both_bounds_is_no_estimate():
+    of = parameters(mu_pa={"lower": 270.0, "upper": 330.0})
+    estimate = uncertainty(spread([0.1, 0.1, 0.02, 0.02]), of).estimates["mu_pa"]
+    assert estimate.std_error is None
+    assert "between its bounds" in (estimate.reason or "")
+
+
+def test_no_sentence_is_said_twice():
+    found = uncertainty(spread([0.9, 0.9, 0.02, 1e4], {(0, 1): -0.99}))
+    said = verdicts(found)
+    assert len(set(said)) == len(said)
+    assert len(set(found.notes)) == len(found.notes)
