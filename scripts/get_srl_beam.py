@@ -16,10 +16,8 @@ import tempfile
 import urllib.request
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from collocation_sysid.experiment import write_markers_csv
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import align_to_template, read_markers, write_markers_csv
 from collocation_sysid.fem.structured import box_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "srl_beam"
@@ -38,6 +36,9 @@ TEMPLATE_M = {
     "Base1": (-0.094, -0.01, -0.001),
     "Base2": (-0.094, 0.04, 0.0275),
     "Base3": (-0.094, 0.04, 0.0),
+}
+LABELS = {
+    f"{part} - {number}": f"{part}{number}" for part in ("Tip", "Base") for number in (1, 2, 3)
 }
 
 
@@ -66,20 +67,12 @@ def main() -> None:
 def convert(recording: Path, release: int, target: Path) -> None:
     """Write a C3D recording as CSV in the world frame."""
     try:
-        import ezc3d
-    except ImportError:
-        sys.exit("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
-    data = ezc3d.c3d(str(recording))
-    labels = [
-        str(label).replace(" - ", "") for label in data["parameters"]["POINT"]["LABELS"]["value"]
-    ]
-    rate_hz = float(data["parameters"]["POINT"]["RATE"]["value"][0])
-    tracks = np.moveaxis(data["data"]["points"][:3], 0, -1).swapaxes(0, 1)  # frame, marker, xyz
-    template = np.array([TEMPLATE_M[label] for label in labels])
-    before = tracks[:release].mean(axis=0)
-    fit = Rotation.align_vectors(template - template.mean(0), before - before.mean(0))
-    world = (tracks - before.mean(axis=0)) @ fit[0].as_matrix().T + template.mean(axis=0)
-    write_markers_csv(target, np.arange(len(world)) / rate_hz, labels, world)
+        raw = read_markers(recording, labels=LABELS)
+    except InputError as error:
+        sys.exit(str(error))
+    before_s = (0.0, raw.t_s[release - 1])
+    table = align_to_template(raw, TEMPLATE_M, before_s).apply(raw)
+    write_markers_csv(target, table.t_s, table.names, table.positions_m)
 
 
 if __name__ == "__main__":

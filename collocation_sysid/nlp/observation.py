@@ -40,12 +40,15 @@ class Observation:
     local : Local
     huber : float or None
         Huber's loss: ρ(d) = d² up to this many standard deviations, linear beyond; d² without it.
+    from_rest : bool
+        The body rests in its first state before the first time: a shifted marker reads that there.
     """
 
     markers: Markers
     grid_rows: Index
     local: Local
     huber: float | None = None
+    from_rest: bool = True
 
     @property
     def count(self) -> int:
@@ -66,11 +69,16 @@ class Observation:
         return min(NEIGHBOURS, len(self.grid_rows)) if shifted else 1
 
     @cached_property
+    def _first_neighbour(self) -> Index:
+        """(T,) the first sample that each one is interpolated from; negative before the start."""
+        samples = np.arange(len(self.grid_rows))
+        first = np.minimum(samples - self._neighbours // 2, len(samples) - self._neighbours)
+        return first if self.from_rest else np.maximum(first, 0)
+
+    @cached_property
     def _window(self) -> Index:
         """(T, neighbours) samples that each one is interpolated from."""
-        samples = np.arange(len(self.grid_rows))
-        first = np.clip(samples - self._neighbours // 2, 0, len(samples) - self._neighbours)
-        return first[:, None] + np.arange(self._neighbours)
+        return np.maximum(self._first_neighbour[:, None] + np.arange(self._neighbours), 0)
 
     @cached_property
     def _own(self) -> Index:
@@ -130,7 +138,7 @@ class Observation:
         """(8, T, M) measured position, 1/σ, place in the window, and pivot of every sample."""
         tracks = np.nan_to_num(self.markers.positions_m)
         samples, count = tracks.shape[:2]
-        place = np.arange(samples) - self._window[:, 0]
+        place = np.arange(samples) - self._first_neighbour
         pivot = np.nanmean(self.markers.positions_m[self.markers.present.any(axis=1)][0], axis=0)
         return np.stack(
             [

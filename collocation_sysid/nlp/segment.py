@@ -72,7 +72,13 @@ class Segment:
         grid = self.dynamics.t_s
         self.local = Local.of(experiment)
         samples = np.arange(len(experiment.t_s)) * substeps
-        self.observation = Observation(experiment.markers, samples, self.local, huber)
+        self.observation = Observation(
+            experiment.markers,
+            samples,
+            self.local,
+            huber,
+            from_rest=not self.dynamics.start_velocity_m_s.any(),
+        )
         self.explicit_grasps = explicit_grasps
         self.dofs = self.body.pattern.size
         self.free_dofs = dofs_of(experiment.free_nodes)
