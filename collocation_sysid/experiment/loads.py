@@ -17,7 +17,9 @@ TIME_TOLERANCE_S = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PointMass:
-    """A rigid mass tied to nodes, in equal parts: it adds inertia and weight, and no damping.
+    """A rigid mass tied to nodes, in equal parts.
+
+    It adds inertia and weight, and like all mass that moves it is damped by γ_m.
 
     Parameters
     ----------

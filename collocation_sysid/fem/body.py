@@ -174,16 +174,25 @@ class Body:
 
     # Many states ----------------------------------------------------------------------------
 
-    def force(self, positions: ArrayLike, velocities: ArrayLike, theta: Theta) -> Array:
+    def force(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        theta: Theta,
+        dof_mass: Array | None = None,
+    ) -> Array:
         """Internal force f(x, v; θ), (T, 3n) [N].
 
         Parameters
         ----------
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
         theta : (λ [Pa], μ [Pa], γ_r [s], γ_m [1/s])
+        dof_mass : (3n,) or (T, 3n), optional
+            The M that γ_m damps, where more than the body's own mass moves [kg].
         """
         x, v = self._states(positions, velocities)
-        return self._evaluate("force", [x, v], theta[:3]) - theta[3] * self.dof_mass * v
+        mass = self.dof_mass if dof_mass is None else dof_mass
+        return self._evaluate("force", [x, v], theta[:3]) - theta[3] * mass * v
 
     def linearise(
         self,
@@ -191,8 +200,9 @@ class Body:
         velocities: ArrayLike,
         theta: Theta,
         out: Array | None = None,
+        dof_mass: Array | None = None,
     ) -> Linearisation:
-        """Internal force and first derivatives at T states, see `Linearisation`.
+        """Internal force and first derivatives at T states, see `Linearisation` and `force`.
 
         The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
         """
@@ -202,9 +212,10 @@ class Body:
         force, by_position, by_velocity, by_theta = np.split(
             rows, np.cumsum([size, entries, entries]), axis=1
         )
-        drag = self.dof_mass * v
+        mass = self.dof_mass if dof_mass is None else dof_mass
+        drag = mass * v
         force -= theta[3] * drag
-        by_velocity[:, self.pattern.diagonal] -= theta[3] * self.dof_mass
+        by_velocity[:, self.pattern.diagonal] -= theta[3] * mass
         by_theta = by_theta.reshape(len(x), size, 4)
         by_theta[:, :, 3] = -drag
         return Linearisation(force, by_position, by_velocity, by_theta)
@@ -221,6 +232,7 @@ class Body:
         weights: ArrayLike,
         theta: Theta,
         out: Array | None = None,
+        dof_mass: Array | None = None,
     ) -> Curvature:
         """Second derivatives of wᵀ f at T states, see `Curvature`; `weights` like `positions`."""
         x, v, w = self._states(positions, velocities, weights)
@@ -230,7 +242,7 @@ class Body:
             rows, np.cumsum([entries, entries, 4 * size, 4 * size, 16]), axis=1
         )
         x_theta, v_theta = (part.reshape(len(x), size, 4) for part in (x_theta, v_theta))
-        v_theta[:, :, 3] = -self.dof_mass * w
+        v_theta[:, :, 3] = -(self.dof_mass if dof_mass is None else dof_mass) * w
         by_theta[:, 3] = np.einsum("ti,ti->t", v_theta[:, :, 3], v)
         return Curvature(xx, xv, x_theta, v_theta, theta_theta.reshape(len(x), 4, 4), by_theta)
 

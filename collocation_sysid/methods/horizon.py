@@ -23,7 +23,7 @@ Index = NDArray[np.int64]
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
-MARCHED = NewtonOptions(tolerance=1e-3)
+MARCHED = NewtonOptions(tolerance=1e-6)
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,6 +73,8 @@ DECREASE = 1e-3
 # Shorter than this over the body's size, feasibility is at rounding; shorter than the second,
 # it is where steps no longer change the parameters and it does not decrease any more.
 FEASIBLE, NEARLY_FEASIBLE = 1e-12, 1e-8
+# Longer than this over the body's size, it is refined before steps are judged too harshly.
+INFEASIBLE = 1e-6
 # A rejected step is tried again at this share of its length, down to the shortest.
 SHRINK, SMALLEST_TRUST = 0.25, 1e-10
 # The last step is taken without another sweep when its error, judged by the rate at which steps
@@ -154,6 +156,12 @@ class Search:
             known = self.x
             reached, failure = rung.extend(self.p, known)
             self.sweeps += 1
+            if failure is not None and known is not None:
+                # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
+                afresh, failure_afresh = rung.extend(self.p)
+                self.sweeps += 1
+                if sum(map(len, afresh)) > sum(map(len, reached)):
+                    reached, failure = afresh, failure_afresh
             if failure is None:
                 self.x = reached
                 return
@@ -232,8 +240,8 @@ class Search:
                 return Status.STALLED
             self.trust = SHRINK * length
             rejections += 1
-            if rejections == 2 and point.feasibility_m > SMALL_STRAIN * self.edge_m:
-                point = self._restored(rung, point)
+            if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
+                point = self._refined(rung, point)
 
     def _curvature(self, curvature: Array, before: Point, after: Point) -> Array:
         """What Gauss–Newton leaves out at `after`, the secant's or the exact."""
@@ -286,6 +294,17 @@ class Search:
         elif actual < 0.25 * predicted - noise:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
+
+    def _refined(self, rung: Horizon, point: Point) -> Point:
+        """The point after its feasibility step, or with a simulated trajectory.
+
+        The loss of the projected trajectory is then exact to a higher order: trials that were
+        judged against too low a loss get another chance.
+        """
+        refined = self._try(rung, point, np.zeros(len(point.p)))
+        if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
+            return self._restored(rung, point)
+        return self._accepted(refined)
 
     def _restored(self, rung: Horizon, point: Point) -> Point:
         """The point with a simulated trajectory, where that exists."""

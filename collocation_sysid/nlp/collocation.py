@@ -397,7 +397,7 @@ class Collocation:
         largest = 0.0
         for segment, x, _, setting in self._parts(z):
             dynamics = setting.dynamics
-            internal = dynamics.body.force(*dynamics.evaluation_states(x), setting.theta)
+            internal = dynamics.internal_force(x, setting.theta)
             for force in (internal, dynamics.external_force_n):
                 largest = max(largest, float(np.abs(force[:, segment.free_dofs]).max()))
         return largest

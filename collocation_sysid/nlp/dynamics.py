@@ -52,7 +52,7 @@ class Dynamics:
     t_s : (N,) grid times
     first_row : int
     mass_kg : (N, 3n) of every dof in each row, point masses included
-    weighed_kg : (N, 3n) the same at each row's evaluation, where gravity acts
+    weighed_kg : (N, 3n) the same at each row's evaluation, where gravity and γ_m act
     external_force_n : (N, 3n) gravity and other forces at each row's evaluation
     taken : (N, 3n) bool, or None where no grasp ends or begins
         Held dofs that are free at other times: while one is held, the grasp takes what force
@@ -159,7 +159,12 @@ class Dynamics:
 
     def residual(self, x: Array, theta: Theta) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
-        return self.assemble_residual(x, self.body.force(*self.evaluation_states(x), theta))
+        return self.assemble_residual(x, self.internal_force(x, theta))
+
+    def internal_force(self, x: Array, theta: Theta) -> Array:
+        """Internal forces (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
+        damped = self.weighed_kg[self.first_row :]
+        return self.body.force(*self.evaluation_states(x), theta, damped)
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """The same from the internal forces (N − first_row, 3n) at the evaluation states."""
@@ -181,7 +186,8 @@ class Dynamics:
 
     def linearise(self, x: Array, theta: Theta, out: Array | None = None) -> Linearisation:
         """Forces and derivatives at the evaluation states of x (N, 3n)."""
-        return self.body.linearise(*self.evaluation_states(x), theta, out)
+        damped = self.weighed_kg[self.first_row :]
+        return self.body.linearise(*self.evaluation_states(x), theta, out, damped)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
         """The force part of ∂c_t/∂x_{t−lag} as Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.

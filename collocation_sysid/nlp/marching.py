@@ -80,7 +80,8 @@ def march_on(
     xi, nu = dynamics.evaluation_states(x)
     first, seen = dynamics.first_row, done - dynamics.first_row
     if seen > 0:
-        internal = dynamics.body.force(xi[:seen], nu[:seen], theta)
+        damped = dynamics.weighed_kg[first:done]
+        internal = dynamics.body.force(xi[:seen], nu[:seen], theta, damped)
         forces[first:done] = internal + dynamics.external_force_n[first:done]
     dynamics.without_taken(forces)
     for t in range(done, dynamics.rows):
@@ -114,7 +115,8 @@ class _Row:
     def __init__(self, dynamics: Dynamics, theta: Theta, x: Array, forces: Array, t: int) -> None:
         self.dynamics, self.theta = dynamics, theta
         table, step = dynamics.tables, dynamics.step_s
-        self.mass, self.load = dynamics.mass_kg[t], dynamics.external_force_n[t]
+        self.mass, self.damped = dynamics.mass_kg[t], dynamics.weighed_kg[t]
+        self.load = dynamics.external_force_n[t]
         past = range(1, min(dynamics.reach, t) + 1)
         zero = np.zeros(x.shape[1])
         self.p, self.q = table.p[t, 0], table.q[t, 0] / step
@@ -127,7 +129,8 @@ class _Row:
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        return self.dynamics.body.force(*self._states(x), self.theta)[0] + self.load
+        states, body = self._states(x), self.dynamics.body
+        return body.force(*states, self.theta, self.damped)[0] + self.load
 
     def _states(self, x: Array) -> tuple[Array, Array]:
         return (self.xi + self.p * x)[None], (self.nu + self.q * x)[None]
@@ -139,7 +142,7 @@ class _Row:
     def linearise(self, x: Array) -> tuple[Array, Array]:
         """c_t and the lower triangle of −∂c_t/∂x_t."""
         body = self.dynamics.body
-        at = body.linearise(*self._states(x), self.theta)
+        at = body.linearise(*self._states(x), self.theta, dof_mass=self.damped)
         matrix = -self.w * (self.p * at.by_position[0] + self.q * at.by_velocity[0])
         matrix[body.pattern.diagonal] += self.s * self.mass
         force = at.force[0] + self.load

@@ -104,10 +104,11 @@ class _Stepper:
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""
-        force = self.body.force(state.x, state.v, self.theta)[0]
+        mass = self._mass(load_s)
+        force = self.body.force(state.x, state.v, self.theta, mass)[0]
         force += external_force(self.experiment, load_s)
         acceleration = state.a.copy()
-        acceleration[dofs] = (force / self._mass(load_s))[dofs]
+        acceleration[dofs] = (force / mass)[dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
@@ -127,11 +128,11 @@ class _Stepper:
 
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            return body.force(x, v, theta)[0] + load - mass * a
+            return body.force(x, v, theta, mass)[0] + load - mass * a
 
         def linearise(x: Array) -> tuple[Array, Array]:
             v, a = kinematics(x)
-            at = body.linearise(x, v, theta)
+            at = body.linearise(x, v, theta, dof_mass=mass)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
             matrix[body.pattern.diagonal] += slope**2 * mass
             return at.force[0] + load - mass * a, matrix

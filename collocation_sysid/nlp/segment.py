@@ -340,7 +340,11 @@ class Segment:
         weights = dynamics.combine_transposed(dynamics.tables.w, row_weights)
         weights = dynamics.without_taken(weights)[first:]
         curvature = self.body.curvature(
-            *dynamics.evaluation_states(x), weights, setting.theta, self._curvature_rows
+            *dynamics.evaluation_states(x),
+            weights,
+            setting.theta,
+            self._curvature_rows,
+            dynamics.weighed_kg[first:],
         )
         layout = self.hessian_layout
         of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)

@@ -257,7 +257,8 @@ class BlockSolver:
             stop = min(start + self.chunk, dynamics.rows)
             here = slice(start - dynamics.first_row, stop - dynamics.first_row)
             with self.stopwatch.evaluating():
-                at = body.linearise(xi[here], nu[here], theta)
+                damped = dynamics.weighed_kg[start:stop]
+                at = body.linearise(xi[here], nu[here], theta, dof_mass=damped)
             with self.stopwatch.solving():
                 factors = self._factorise(at, slice(start, stop))
             order = range(stop - start)
