@@ -16,8 +16,9 @@ from .nlp.collocation import Collocation
 from .nlp.parameters import Parameter, Parameters, Theta
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem, load_problem
+from .record import write_run
 from .results.solution import Solution, Status
-from .run import run, solve, write_run
+from .run import run, solve
 
 __version__ = version("collocation-sysid")
 

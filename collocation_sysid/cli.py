@@ -55,10 +55,11 @@ def solve(
 ) -> None:
     """Identify the parameters and write a run folder."""
     from .problem import load_problem
+    from .record import as_json as json_text
+    from .record import result, write_run
     from .results.solution import Status
     from .results.writers import require_replaceable
-    from .run import as_json as json_text
-    from .run import result, run, write_run
+    from .run import run
     from .terminal import Progress, summary
 
     folder = out or Path("runs") / _run_name(problem)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
@@ -15,9 +16,11 @@ from .nlp.parameters import Theta
 from .problem import Problem
 from .results.solution import Iteration
 from .results.uncertainty import Estimate
-from .run import Rollout, Run
+from .rollout import Rollout
+from .run import Run
 
 SHOWN_ITERATIONS = 12
+SHOWN_DIAGNOSES = 2
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 UNITS = {
     "lambda_pa": ("λ", "Pa"),
@@ -116,11 +119,9 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [_parameter_table(finished), *_verdict(finished)]
-    notes = [*solution.notes, *finished.notes]
-    if finished.uncertainty is not None:
-        notes += finished.uncertainty.notes
-    parts += [Text(f"note: {note}") for note in notes]
+    parts += [_parameter_table(finished), *_verdict(finished), *_own_unknowns(finished)]
+    parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
+    parts += _residuals(finished)
     parts.append(Text(f"written to {folder}"))
     return Group(*parts)
 
@@ -147,8 +148,43 @@ def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
     interval = "" if estimate.ci95 is None else "{:.5g} … {:.5g}".format(*estimate.ci95)
     if estimate.at_bound:
         interval = "at its bound"
+    elif estimate.reason:
+        interval = "not determined" if estimate.ci95 is None else "not identifiable"
     spread = "" if estimate.std_error is None else f"{estimate.std_error:.2g}"
     return [f"{symbol} {unit}".strip(), f"{estimate.value:.5g}", spread, interval]
+
+
+def _own_unknowns(finished: Run) -> list[Text]:
+    """One line for each experiment that has unknowns of its own; offsets by their length."""
+    collocation, lines = finished.solution.collocation, []
+    for segment, phi in zip(
+        collocation.segments, collocation.unpack_own(finished.solution.z), strict=True
+    ):
+        local, name = segment.local, segment.experiment.name
+        values, said = phi * local.scales, []
+        offsets = values[local.places("offset")].reshape(-1, 3)
+        if len(offsets):
+            lengths = np.linalg.norm(offsets, axis=1)
+            worst = segment.experiment.markers.names[int(lengths.argmax())]
+            said.append(
+                f"markers sit off their places by up to {1e3 * lengths.max():.2g} mm ({worst})"
+            )
+        said += [f"{1e3 * values[k]:.2g} ms time shift" for k in local.places("time")]
+        for kind, what in (("turn", "turn of the pose"), ("tilt", "tilt of gravity")):
+            if len(places := local.places(kind)):
+                degrees = np.degrees(np.linalg.norm(values[places]))
+                said.append(f"{degrees:.2g}° {what}")
+        if len(places := local.places("shift")):
+            said.append(f"{1e3 * np.linalg.norm(values[places]):.2g} mm shift of the pose")
+        if said:
+            lines.append(Text(f"unknowns of '{name}': {', '.join(said)}"))
+    return lines
+
+
+def _residuals(finished: Run) -> list[Text]:
+    """What the largest residuals suggest."""
+    largest = sorted(finished.diagnoses, key=lambda d: -d.rms_m)[:SHOWN_DIAGNOSES]
+    return [Text(f"residuals: {diagnosis.sentence}") for diagnosis in largest]
 
 
 def _verdict(finished: Run) -> list[Text]:

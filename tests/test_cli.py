@@ -33,7 +33,7 @@ from collocation_sysid.experiment import read_markers_csv, read_poses_csv
 from collocation_sysid.problem import ProblemFile, read_problem_file
 from collocation_sysid.results.solution import Iteration
 
-RUN = import_module("collocation_sysid.run")  # in the package, `run` is the function
+ROLLOUT = import_module("collocation_sysid.rollout")
 RESULT_KEYS = {
     "schema": set(),
     "status": set(),
@@ -230,7 +230,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(RUN, "simulate", interrupt)
+    monkeypatch.setattr(ROLLOUT, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert "roll-out 'swing': failed: interrupted" in outcome.out
     result = result_in(tiny / "run")

@@ -11,7 +11,7 @@ u = (h(x_i), φ of its marker), mapped over all samples; linear operators lead f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -229,6 +229,11 @@ class Observation:
         data[:3], data[3] = 0.0, 1.0
         (values,) = self._mapped(0, u, data)
         return np.moveaxis(values[:, 0], 0, 2)
+
+    def of_samples(self, positions_m: Array, phi: Array) -> Array:
+        """Readings (T, M, 3) [m] of the body's positions (T, n, 3) at the samples."""
+        rows = np.arange(len(positions_m))
+        return replace(self, grid_rows=rows).predicted(positions_m.reshape(len(rows), -1), phi)
 
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
         """Squared distances between readings of the first grid positions and present samples."""

@@ -199,7 +199,9 @@ class RecordingReader:
 
     def _grasp(self, k: int, grasp: GraspSection, poses: PoseSequence) -> Grasp:
         nodes = self._nodes(grasp.nodes, self._grasp_key(k, "nodes"))
-        return Grasp(nodes, poses, **grasp.model_dump(include={"from_s", "until_s"}, exclude_none=True))
+        return Grasp(
+            nodes, poses, **grasp.model_dump(include={"from_s", "until_s"}, exclude_none=True)
+        )
 
     def _mass(self, k: int, mass: MassSection) -> PointMass:
         nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")
@@ -339,7 +341,9 @@ class RecordingReader:
         return x.reshape(-1, 3)
 
 
-def _nuisance(section: EstimateSection) -> Nuisance:
+def _nuisance(section: EstimateSection | None) -> Nuisance:
+    if section is None:
+        return Nuisance()
     pose = section.pose or PosePrior.model_construct()
     return Nuisance(
         marker_offset_m=section.marker_offsets and section.marker_offsets.prior_m,

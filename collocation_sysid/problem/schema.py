@@ -308,7 +308,9 @@ class MassSection(Section):
 class ForceSection(Section):
     """A force on nodes besides gravity."""
 
-    nodes: Nodes = Field(description="Nodes that it acts on in equal parts, selected as in a grasp.")
+    nodes: Nodes = Field(
+        description="Nodes that it acts on in equal parts, selected as in a grasp."
+    )
     force_n: Vector | None = Field(None, description="Constant force [x, y, z].")
     file: Text | None = Field(None, description="CSV with the columns t_s, fx_n, fy_n, fz_n.")
 
@@ -397,13 +399,14 @@ class ExperimentSection(Section):
         1, description="Use every so-manieth sample of the markers."
     )
     mass: list[MassSection] = Field(
-        default_factory=list, description="[[experiment.mass]] tables: point masses tied to the body."
+        default_factory=list,
+        description="[[experiment.mass]] tables: point masses tied to the body.",
     )
     force: list[ForceSection] = Field(
         default_factory=list, description="[[experiment.force]] tables: forces besides gravity."
     )
-    estimate: EstimateSection = Field(
-        EstimateSection(), description="What is estimated of this recording alone."
+    estimate: EstimateSection | None = Field(
+        None, description="What is estimated of this recording alone."
     )
     validation: Flag = Field(False, description="Not fitted, only predicted.")
 
@@ -470,6 +473,21 @@ class SolverSection(Section):
     )
 
 
+class UncertaintySection(Section):
+    """How the error bars are found."""
+
+    noise: Literal["given", "estimated"] = Field(
+        default="given", description="Trust sigma_m, or scale it by the residuals."
+    )
+    errors: Literal["auto", "independent", "autocorrelated"] = Field(
+        default="auto", description="What to assume of the errors; auto tests the residuals."
+    )
+    profile: list[Text] = Field(
+        default_factory=list,
+        description="List of the parameters whose profile likelihood is wanted.",
+    )
+
+
 class RolloutSection(Section):
     """The forward simulation that checks the answer."""
 
@@ -491,6 +509,7 @@ class ProblemFile(Section):
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = SolverSection()
     rollout: RolloutSection = RolloutSection()
+    uncertainty: UncertaintySection = UncertaintySection()
 
     @model_validator(mode="after")
     def _names_differ(self) -> ProblemFile:
@@ -498,6 +517,20 @@ class ProblemFile(Section):
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"two experiments are named {repeated[0]!r}; names must differ")
+        return self
+
+    @model_validator(mode="after")
+    def _profiles_are_of_estimated_parameters(self) -> ProblemFile:
+        given = {
+            name: getattr(self.parameters, name) for name in type(self.parameters).model_fields
+        }
+        free = [name for name, section in given.items() if section and section.fixed is None]
+        for name in self.uncertainty.profile:
+            if name not in free:
+                raise ValueError(
+                    f"uncertainty.profile names {name!r}; expected estimated parameters, "
+                    f"{', '.join(free)}"
+                )
         return self
 
     @model_validator(mode="after")

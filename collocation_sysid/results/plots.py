@@ -251,10 +251,9 @@ def solution_plots(
         "convergence": convergence(solution.history, free, truth),
         "jacobian": jacobian_sparsity(collocation, solution.z),
     }
-    for segment, positions in zip(collocation.segments, solution.positions_m, strict=True):
+    for segment, fitted in zip(collocation.segments, solution.readings_m, strict=True):
         experiment = segment.experiment
         measured = experiment.markers.positions_m
-        fitted = experiment.markers.observe(positions[segment.observation.grid_rows])
         rolled_out = (rolled_out_m or {}).get(experiment.name)
         figures[f"tracks_{experiment.name}"] = tracks(
             experiment.t_s, experiment.markers.names, measured, fitted, rolled_out

@@ -138,6 +138,17 @@ class Solution:
         return [x.reshape(len(x), -1, 3) for x in positions]
 
     @cached_property
+    def readings_m(self) -> list[Array]:
+        """Fitted markers (T, M, 3) of each experiment, with its own unknowns."""
+        collocation = self.collocation
+        _, positions = collocation.unpack(self.z)
+        own = collocation.unpack_own(self.z)
+        return [
+            segment.observation.predicted(x, phi)
+            for segment, x, phi in zip(collocation.segments, positions, own, strict=True)
+        ]
+
+    @cached_property
     def rms_m(self) -> float:
         """Root mean square distance of markers from their measurements."""
         return self.collocation.rms_m(self.z)

@@ -1,0 +1,99 @@
+"""The check of an answer: every experiment simulated forward with it, and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import SimulationError
+from .experiment import Experiment
+from .methods import METHODS
+from .nlp.collocation import Collocation
+from .nlp.parameters import LAME, Parameter, Parameters, Theta
+from .nlp.segment import Segment
+from .nlp.simulation import Trajectory, simulate
+from .problem import Problem
+from .results.solution import Solution
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A forward simulation with the answer's parameters, against the measurements.
+
+    Attributes
+    ----------
+    rms_m, max_m : distance of the readings from the measurements; the tip error is in `max_m`
+    trajectory : Trajectory
+    readings_m : (T, M, 3) markers of the simulation, with the experiment's own unknowns
+    unknowns : mapping of name to value
+        Own unknowns of an experiment for validation, fitted with the material as found.
+    """
+
+    rms_m: float
+    max_m: float
+    trajectory: Trajectory
+    readings_m: Array
+    unknowns: Mapping[str, float]
+
+
+def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
+    """Simulate an experiment with a solution's parameters; or say why that fails."""
+    section, transcription = problem.file.rollout, problem.file.transcription
+    integrator = "newmark" if section.integrator == "newmark" else transcription.scheme
+    try:
+        segment, phi = _seen(experiment, solution)
+        trajectory = simulate(
+            segment.corrected(phi),
+            solution.theta,
+            integrator,
+            timestep_s=section.timestep_s,
+            substeps=transcription.substeps,
+        )
+    except SimulationError as error:
+        return str(error)
+    except KeyboardInterrupt:  # the answer itself is there, and worth writing
+        return "interrupted"
+    readings = segment.observation.of_samples(trajectory.positions_m, phi)
+    distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
+    present = distances[experiment.markers.present]
+    local = segment.local
+    return Rollout(
+        float(np.sqrt(np.mean(present**2))),
+        float(present.max()),
+        replace(trajectory, markers_m=readings),
+        readings,
+        dict(zip(local.names, (phi * local.scales).tolist(), strict=True))
+        if experiment.validation
+        else {},
+    )
+
+
+def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
+    """The experiment with its own unknowns: those of the fit, or fitted with θ as found."""
+    collocation = solution.collocation
+    own = collocation.unpack_own(solution.z)
+    for segment, phi in zip(collocation.segments, own, strict=True):
+        if segment.experiment is experiment:
+            return segment, phi
+    alone = Collocation(
+        [replace(experiment, validation=False)],
+        _fixed(solution.theta),
+        collocation.scheme,
+        collocation.substeps,
+        huber=collocation.huber,
+    )
+    (segment,) = alone.segments
+    if not alone.own:
+        return segment, np.zeros(0)
+    predicted = METHODS["reduced-space"].solve(alone)
+    return segment, alone.unpack_own(predicted.z)[0]
+
+
+def _fixed(theta: Theta) -> Parameters:
+    names = (*LAME, *Theta._fields[2:])
+    return Parameters(tuple(Parameter(n, v, fixed=True) for n, v in zip(names, theta, strict=True)))
