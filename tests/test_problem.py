@@ -330,3 +330,91 @@ def test_a_shipped_problem_follows_the_schema(path):
     schema = json.loads(json.dumps(ProblemFile.model_json_schema()))
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(content, schema)
+
+
+# What else a recording's table may say --------------------------------------------------------------
+
+LOADS = """
+[[experiment.mass]]
+nodes = { box_m = [[-1, -1, -1], [1, 1, 0.001]] }
+mass_kg = 0.002
+from_s = 0.03
+
+[[experiment.force]]
+nodes = "top"
+force_n = [0.0, 0.1, 0.0]
+
+[[experiment.force]]
+nodes = { indices = [0] }
+file = "push.csv"
+
+[experiment.estimate]
+marker_offsets = { prior_m = 0.003 }
+time_shift = { prior_s = 0.01 }
+pose = { prior_rad = 0.02 }
+gravity = { prior_rad = 0.03 }
+"""
+
+
+@pytest.fixture
+def loaded(tiny: Path) -> Path:
+    """The tiny problem with loads and unknowns."""
+    file = tiny / "problem.toml"
+    file.write_text(file.read_text() + LOADS)
+    (tiny / "push.csv").write_text("t_s,fx_n,fy_n,fz_n\n0.0,0,0,0\n0.05,0,0,0.2\n")
+    return tiny
+
+
+def test_masses_and_forces_are_read(loaded):
+    experiment = experiment_of(loaded)
+    (mass,) = experiment.masses
+    assert (mass.mass_kg, mass.from_s, len(mass.nodes)) == (0.002, 0.03, 9)
+    assert experiment.node_mass_kg([0.0, 0.04]).sum(axis=1) == pytest.approx(
+        [experiment.body.mass_kg, experiment.body.mass_kg + 0.002]
+    )
+    total = experiment.node_forces_n([0.025]).sum(axis=1)[0]
+    np.testing.assert_allclose(total, [0.0, 0.1, 0.1], atol=1e-12)
+
+
+def test_unknowns_are_read(loaded):
+    unknown = experiment_of(loaded).nuisance
+    assert (unknown.marker_offset_m, unknown.time_shift_s) == (0.003, 0.01)
+    assert (unknown.pose_turn_rad, unknown.pose_shift_m, unknown.gravity_rad) == (0.02, None, 0.03)
+
+
+def test_a_grasp_may_hold_for_a_while(tiny):
+    experiment = experiment_of(tiny, "experiment.swing.grasp.until_s=0.02")
+    held, _ = experiment.grasped([0.0, 0.02, 0.03])
+    np.testing.assert_array_equal(held.any(axis=1), [True, True, False])
+    assert len(experiment.held_nodes) == 0
+
+
+def test_every_takes_only_some_samples(tiny):
+    whole, some = experiment_of(tiny), experiment_of(tiny, "experiment.swing.every=3")
+    np.testing.assert_allclose(some.t_s, whole.t_s[::3])
+    np.testing.assert_array_equal(some.markers.positions_m, whole.markers.positions_m[::3])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("mass_kg = 0.002", "mass_kg = 0"), r"mass.0.mass_kg: found 0; expected a number above 0"),
+        (('"top"', '"middle"'), r"force.0.nodes: .*"middle""),
+        (("[0.0, 0.1, 0.0]", "[0.0, 0.1]"), r"force.0.force_n"),
+        (('file = "push.csv"', 'file = "pull.csv"'), r"force.1.file: .*pull.csv does not exist"),
+        (('file = "push.csv"', ""), r"force.1: .*exactly one of force_n, file"),
+        (("{ prior_rad = 0.02 }", "{}"), r"estimate.pose: .*expected one or both"),
+        (("prior_s = 0.01", "prior_ms = 10"), r"estimate.time_shift.prior_ms"),
+    ],
+)
+def test_loads_and_unknowns_that_are_wrong_name_their_key(loaded, change, message: str):
+    replace_text(*change)(loaded)
+    with pytest.raises(InputError, match=message):
+        load(loaded)
+
+
+def test_profiles_are_of_estimated_parameters_only(tiny):
+    text = (tiny / "problem.toml").read_text() + '\n[uncertainty]\nprofile = ["young_pa"]\n'
+    (tiny / "problem.toml").write_text(text)
+    with pytest.raises(InputError, match=r"names 'young_pa'; expected estimated parameters, lam"):
+        load(tiny)

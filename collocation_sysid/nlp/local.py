@@ -12,8 +12,8 @@ tilt of gravity        two angles about axes across it [rad]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
-c being where the markers are first seen. In the body's frame that changes nothing but what the
-markers read, and the direction of gravity, which becomes R(a)ᵀ g.
+c being the middle of the undeformed body in its first pose. In the body's frame that changes
+nothing but what the markers read, and the direction of gravity, which becomes R(a)ᵀ g.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class Local:
     scales : (k,) prior standard deviations, in the names' units
     limits : (k,) largest |φ|
     gravity_m_s2 : (3,) as stated
+    pivot_m : (3,) c
     """
 
     names: tuple[str, ...]
@@ -52,6 +53,7 @@ class Local:
     scales: Array
     limits: Array
     gravity_m_s2: Array
+    pivot_m: Array
 
     @classmethod
     def of(cls, experiment: Experiment) -> Local:
@@ -84,7 +86,8 @@ class Local:
         late = np.array([kind == "time" for kind in kinds], dtype=bool)
         limits[late] = LARGEST_SHIFT_SAMPLES * experiment.timestep_s / scales[late]
         names = tuple(f"{experiment.name}: {label}" for label in labels)
-        return cls(names, tuple(kinds), scales, limits, np.array(experiment.gravity_m_s2))
+        pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
+        return cls(names, tuple(kinds), scales, limits, np.array(experiment.gravity_m_s2), pivot)
 
     @property
     def size(self) -> int:

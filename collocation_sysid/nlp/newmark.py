@@ -149,15 +149,19 @@ class _Stepper:
         self, solver: Solver, time_s: float, h: float, holding_s: float
     ) -> tuple[Array, Array, Array]:
         """Position, velocity and acceleration of the held dofs, by central differences."""
-        experiment = self.experiment
-        times = np.clip([time_s - h, time_s, time_s + h], experiment.t_s[0], experiment.t_s[-1])
-        carried = np.zeros((3, *experiment.body.nodes_m.shape))
+        experiment, nodes_m = self.experiment, self.experiment.body.nodes_m
+        motion = np.zeros((3, *nodes_m.shape))
         for grasp in experiment.grasps:
-            if grasp.holds(holding_s):
-                carried[:, grasp.nodes] = grasp.carry(experiment.body.nodes_m, times)
-        before, now, after = carried.reshape(3, -1)[:, solver.held]
-        span = times[2] - times[0]
-        velocity = (after - before) / span
-        if times[2] - times[1] < 0.5 * h:
-            return now, velocity, np.zeros_like(now)
-        return now, velocity, (after - 2 * now + before) / h**2
+            if not grasp.holds(holding_s):
+                continue
+            # What it does before it holds and after it has let go means nothing.
+            first = max(grasp.from_s, float(experiment.t_s[0]))
+            last = min(grasp.until_s, float(experiment.t_s[-1]))
+            times = np.clip([time_s - h, time_s, time_s + h], first, last)
+            before, now, after = grasp.carry(nodes_m, times)
+            velocity = (after - before) / (times[2] - times[0])
+            whole = times[2] - times[1] > 0.5 * h
+            acceleration = (after - 2 * now + before) / h**2 if whole else np.zeros_like(now)
+            motion[:, grasp.nodes] = now, velocity, acceleration
+        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.held]
+        return now, velocity, acceleration

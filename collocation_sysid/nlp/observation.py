@@ -94,10 +94,10 @@ class Observation:
         """Reading with slope by u, and loss with gradient and Hessian, of one sample."""
         nodes = ca.SX.sym("h", 3 * self._neighbours)
         own = ca.SX.sym("phi", self._own.shape[1])
-        data = ca.SX.sym("data", 3 + 1 + 1 + 3)  # ŷ, 1/σ, place in the window, c
-        measured, weight, place, pivot = ca.vertsplit(data, [0, 3, 4, 5, 8])
+        data = ca.SX.sym("data", 3 + 1 + 1)  # ŷ, 1/σ, place in the window
+        measured, weight, place = ca.vertsplit(data, [0, 3, 4, 5])
         u = ca.vertcat(nodes, own)
-        residual = weight * (self._reading(nodes, own, place, pivot) - measured)
+        residual = weight * (self._reading(nodes, own, place) - measured)
         square = ca.sumsqr(residual)
         loss = square
         if self.huber is not None:
@@ -111,7 +111,7 @@ class Observation:
             ca.Function("loss", [u, data], [loss, gradient, ca.densify(hessian)], {"cse": True}),
         )
 
-    def _reading(self, nodes: ca.SX, own: ca.SX, place: ca.SX, pivot: ca.SX) -> ca.SX:
+    def _reading(self, nodes: ca.SX, own: ca.SX, place: ca.SX) -> ca.SX:
         """Y of one sample."""
         scale = self.local.scales[self._own[0]]
         kinds = [self.local.kinds[i] for i in self._own[0]]
@@ -126,6 +126,7 @@ class Observation:
             step_s = float(self.markers.t_s[1] - self.markers.t_s[0])
             reading = at @ lagrange_weights(place + values("time") / step_s, self._neighbours)
         if "turn" in kinds:
+            pivot = ca.DM(self.local.pivot_m)
             reading = rotation(values("turn")) @ (reading - pivot) + pivot
         if "shift" in kinds:
             reading += values("shift")
@@ -135,17 +136,15 @@ class Observation:
 
     @cached_property
     def _data(self) -> Array:
-        """(8, T, M) measured position, 1/σ, place in the window, and pivot of every sample."""
+        """(5, T, M) measured position, 1/σ, and place in the window of every sample."""
         tracks = np.nan_to_num(self.markers.positions_m)
         samples, count = tracks.shape[:2]
         place = np.arange(samples) - self._first_neighbour
-        pivot = np.nanmean(self.markers.positions_m[self.markers.present.any(axis=1)][0], axis=0)
         return np.stack(
             [
                 *np.moveaxis(tracks, 2, 0),
                 self.weights[:, ::3],
                 np.broadcast_to(place[:, None], (samples, count)),
-                *np.broadcast_to(pivot[:, None, None], (3, samples, count)),
             ]
         )
 

@@ -1,0 +1,214 @@
+"""What else an experiment may not know of itself, and how it is found beside the material."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from problems_small import (
+    GUESS,
+    TRUTH,
+    cube_with_gaps,
+    cube_with_unknowns,
+    hung_cube,
+    measured,
+    released_cube,
+    vertex_markers,
+)
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.methods import METHODS
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.local import Local
+from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.results.uncertainty import covariance
+
+ONE_OF_EACH = {
+    "offset": Nuisance(marker_offset_m=0.003),
+    "time": Nuisance(time_shift_s=0.004),
+    "turn": Nuisance(pose_turn_rad=0.03),
+    "shift": Nuisance(pose_shift_m=0.003),
+    "tilt": Nuisance(gravity_rad=0.05),
+}
+
+
+def alone(experiment: Experiment, **options) -> Collocation:
+    return Collocation([experiment], GUESS, **options)
+
+
+def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
+    """What the markers read at the truth with unknowns φ; the scheme's own trajectory."""
+    (segment,) = alone(experiment).segments
+    motion = simulate(segment.corrected(phi), TRUTH, "midpoint")
+    return segment.observation.of_samples(motion.positions_m, phi)
+
+
+def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:
+    tracks = readings(experiment, phi)
+    present = experiment.markers.present[:, :, None]
+    return with_markers(experiment, np.where(present, tracks, np.nan))
+
+
+# What they do
+
+
+def test_without_unknowns_markers_read_where_they_are():
+    cube = hung_cube()
+    plain = simulate(cube, TRUTH, "midpoint").markers_m
+    np.testing.assert_allclose(readings(cube, np.zeros(0)), plain, atol=1e-15)
+    everything = cube_with_unknowns()
+    zero = np.zeros(Local.of(everything).size)
+    np.testing.assert_allclose(readings(everything, zero), plain, atol=1e-12)
+
+
+def test_an_offset_moves_its_marker():
+    cube = replace(hung_cube(), nuisance=ONE_OF_EACH["offset"])
+    phi = np.zeros(Local.of(cube).size)
+    phi[3:6] = [1.0, -2.0, 0.5]
+    change = readings(cube, phi) - readings(cube, 0 * phi)
+    expected = np.zeros_like(change)
+    expected[:, 1] = [0.003, -0.006, 0.0015]
+    np.testing.assert_allclose(change, expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("share", [-0.6, 0.3, 1.0])
+def test_a_time_shift_reads_the_motion_at_another_time(share: float):
+    cube = replace(hung_cube(20), nuisance=Nuisance(time_shift_s=0.01))
+    (segment,) = alone(cube, substeps=10).segments
+    grid = simulate(cube, TRUTH, "midpoint", substeps=10)
+    found = segment.observation.of_samples(grid.positions_m, np.array([share]))
+    dense = replace(cube, t_s=np.linspace(0, 0.2, 201), markers=_on(cube, np.linspace(0, 0.2, 201)))
+    expected = simulate(dense, TRUTH, "midpoint").markers_m
+    moved = np.abs(expected - expected[0]).max()
+    inside = np.arange(3, 18)
+    wanted = expected[inside * 10 + round(10 * share)]
+    assert np.abs(found[inside] - wanted).max() < 2e-3 * moved
+
+
+def test_before_the_start_a_body_at_rest_reads_its_start():
+    cube = replace(released_cube(), nuisance=Nuisance(time_shift_s=0.01))
+    late = readings(cube, np.array([-1.0]))
+    start = cube.markers.observe(cube.body.nodes_m)
+    np.testing.assert_allclose(late[:2], [start, start], atol=1e-12)
+
+
+def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
+    """The reading with φ is that of the experiment whose grasp really is turned and shifted."""
+    plain = hung_cube()
+    unknown = Nuisance(pose_turn_rad=0.1, pose_shift_m=0.01)
+    cube = replace(measured(plain), nuisance=unknown)
+    phi = np.array([1.0, -0.6, 0.8, 0.5, -1.0, 0.3])
+    pivot = plain.rigid_positions(plain.t_s[:1])[0].mean(axis=0)
+    half = 0.1 * phi[:3] / 2  # Cayley's parameters: tan(angle / 2) along the axis
+    length = np.linalg.norm(half)
+    turn = Rotation.from_rotvec(2 * np.arctan(length) * half / length)
+    poses = plain.grasps[0].poses
+    rotations, positions = poses.at(plain.t_s)
+    moved = PoseSequence(
+        plain.t_s,
+        turn.apply(positions - pivot) + pivot + 0.01 * phi[3:],
+        (turn * Rotation.from_matrix(rotations)).as_quat(),
+    )
+    really = replace(plain, grasps=(Grasp(plain.grasps[0].nodes, moved),))
+    expected = simulate(really, TRUTH, "midpoint").markers_m
+    np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
+
+
+def test_a_tilt_turns_gravity_and_keeps_its_size():
+    local = Local.of(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
+    gravity, slope, _ = local.gravity(np.array([1.0, -2.0]))
+    assert np.linalg.norm(gravity) == pytest.approx(9.81)
+    angle = np.arccos(gravity @ local.gravity_m_s2 / 9.81**2)
+    assert angle == pytest.approx(np.arctan(0.05 * np.sqrt(5)), rel=1e-9)
+    np.testing.assert_allclose(gravity @ slope, 0, atol=1e-12)
+
+
+def test_without_gravity_there_is_no_tilt():
+    floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
+    local = Local.of(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
+    np.testing.assert_array_equal(local.gravity(np.ones(2))[0], np.zeros(3))
+
+
+def test_deviations_must_be_positive():
+    with pytest.raises(InputError, match=r"time_shift_s is 0; expected a deviation above 0"):
+        Nuisance(time_shift_s=0.0)
+
+
+# Finding them
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ONE_OF_EACH)
+def test_unknowns_are_found_beside_the_material(kind: str, method: str, rng):
+    cube = replace(cube_with_gaps(14), nuisance=ONE_OF_EACH[kind])
+    precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-7))
+    cube = replace(cube, markers=precise)
+    phi = rng.uniform(-1, 1, Local.of(cube).size)
+    solution = METHODS[method].solve(alone(seen_with(cube, phi)))
+    assert solution.status.converged
+    (found,) = solution.collocation.unpack_own(solution.z)
+    np.testing.assert_allclose(found, phi, atol=1e-3)
+    np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
+
+
+def test_a_prior_keeps_what_the_data_do_not_tell():
+    """With one marker the offset and the pose's shift are the same: the priors share it."""
+    cube = hung_cube()
+    one = replace(cube, markers=_only_first(cube))
+    unknown = Nuisance(marker_offset_m=0.002, pose_shift_m=0.001)
+    tracks = measured(one).markers.positions_m + np.array([0.005, 0.0, 0.0])
+    both = replace(with_markers(one, tracks), nuisance=unknown)
+    solution = METHODS["reduced-space"].solve(alone(both))
+    (phi,) = solution.collocation.unpack_own(solution.z)
+    offset, shift = 0.002 * phi[0], 0.001 * phi[3]
+    assert offset / shift == pytest.approx(4.0, rel=0.05)  # as their variances
+    assert offset + shift == pytest.approx(0.005, rel=0.05)
+
+
+def test_a_shift_beyond_the_neighbouring_samples_ends_at_its_bound():
+    cube = replace(hung_cube(20), nuisance=Nuisance(time_shift_s=1.0))
+    local = Local.of(cube)
+    np.testing.assert_allclose(local.limits * local.scales, 2 * cube.timestep_s)
+
+
+def test_unknowns_widen_the_error_bars_of_the_material():
+    plain = measured(hung_cube(20))
+    known = METHODS["reduced-space"].solve(alone(plain))
+    unknown = METHODS["reduced-space"].solve(
+        alone(replace(plain, nuisance=cube_with_unknowns().nuisance))
+    )
+    narrow, wide = (
+        np.sqrt(np.diag(covariance(s.collocation, s.z).covariance)) for s in (known, unknown)
+    )
+    assert (wide > 1.05 * narrow).all()
+
+
+def test_experiments_keep_their_unknowns_to_themselves(rng):
+    first, second = (replace(hung_cube(n), nuisance=ONE_OF_EACH["time"]) for n in (12, 16))
+    second = replace(second, name="second")
+    both = [seen_with(first, np.array([0.7])), seen_with(second, np.array([-0.4]))]
+    exact = [
+        replace(e, markers=replace(e.markers, sigma_m=np.full(len(e.markers.names), 1e-7)))
+        for e in both
+    ]
+    solution = METHODS["reduced-space"].solve(Collocation(exact, GUESS))
+    found = np.concatenate(solution.collocation.unpack_own(solution.z))
+    np.testing.assert_allclose(found, [0.7, -0.4], atol=1e-3)
+    assert solution.collocation.names[4:] == (
+        "hung cube: time shift [s]",
+        "second: time shift [s]",
+    )
+
+
+def _on(cube: Experiment, t_s: np.ndarray):
+    markers = cube.markers
+    return replace(
+        markers, t_s=t_s, positions_m=np.zeros((len(t_s), *markers.positions_m.shape[1:]))
+    )
+
+
+def _only_first(cube: Experiment):
+    return vertex_markers(cube.body, cube.markers.placement.nodes[0][[0]], cube.t_s)
