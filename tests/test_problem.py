@@ -332,7 +332,7 @@ def test_a_shipped_problem_follows_the_schema(path):
     jsonschema.validate(content, schema)
 
 
-# What else a recording's table may say --------------------------------------------------------------
+# What else a recording's table may say ------------------------------------------------------------
 
 LOADS = """
 [[experiment.mass]]
@@ -399,7 +399,7 @@ def test_every_takes_only_some_samples(tiny):
     ("change", "message"),
     [
         (("mass_kg = 0.002", "mass_kg = 0"), r"mass.0.mass_kg: found 0; expected a number above 0"),
-        (('"top"', '"middle"'), r"force.0.nodes: .*"middle""),
+        (('"top"', '"middle"'), r'force.0.nodes: .*"middle"'),
         (("[0.0, 0.1, 0.0]", "[0.0, 0.1]"), r"force.0.force_n"),
         (('file = "push.csv"', 'file = "pull.csv"'), r"force.1.file: .*pull.csv does not exist"),
         (('file = "push.csv"', ""), r"force.1: .*exactly one of force_n, file"),
