@@ -19,23 +19,42 @@ poisson     = {{ guess = 0.3, lower = 0.05, upper = 0.45 }}
 gamma_r_s   = {{ guess = 0.01, lower = 1e-5, upper = 1.0 }}
 gamma_m_1_s = {{ guess = 1.0, lower = 1e-3, upper = 100.0 }}
 
-[[experiment]]
+[[experiment]]                 # one for each recording; all share the parameters
 name = "swing"
-start = "equilibrium"          # at rest in the grasp; or "undeformed": released at the first time
+start = "equilibrium"          # at rest in the grasps that hold then; or "undeformed"
 gravity_m_s2 = [0.0, 0.0, -9.81]
 # window_s = [0.5, 2.0]        # use only this span of time
+# every = 2                    # and every second sample
 # resample_hz = 100.0          # if poses and markers have different rates
 # validation = true            # not fitted, only predicted
 
 [experiment.grasp]             # which nodes the gripper holds, and how it moves
 nodes = {{ box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }}   # or ball_m, indices, a point array's name
 poses = "poses.csv"            # t_s,x_m,y_m,z_m,qx,qy,qz,qw: undeformed to current position
+# markers = {{ base1 = [0, 0, 0], base2 = [0.1, 0, 0], base3 = [0, 0.1, 0] }}   # or from these tracks
+# until_s = 1.2                # let go then; several grasps: a list of such tables
 
 [experiment.markers]
-file = "markers.csv"           # t_s,<name>_x,<name>_y,<name>_z,...; blank or NaN is missing
+file = "markers.csv"           # t_s,<name>_x,<name>_y,<name>_z,...; or C3D, TRC, Qualisys, Motive
 sigma_m = 0.001                # standard deviation of a coordinate
-# length_unit = "mm"
+# length_unit = "mm"           # where the file does not say
+# labels = {{ "Body:tip" = "tip" }}           # the file's labels, and the names used here
 # reference_m = {{ tip = [0.0, 0.0, 0.2] }}   # places on the undeformed body, where they are known
+
+# [experiment.estimate]        # what is not known of this recording, with its standard deviation
+# marker_offsets = {{ prior_m = 0.003 }}
+# time_shift = {{ prior_s = 0.01 }}
+# pose = {{ prior_rad = 0.02, prior_m = 0.002 }}
+# gravity = {{ prior_rad = 0.02 }}
+
+# [[experiment.mass]]          # a point mass tied to the body
+# nodes = {{ box_m = [[-1, -1, 0.19], [1, 1, 0.21]] }}
+# mass_kg = 0.05
+# from_s = 0.1
+
+# [[experiment.force]]         # a force besides gravity
+# nodes = {{ indices = [12, 13] }}
+# force_n = [0.0, 0.0, 0.5]    # or file = "force.csv": t_s,fx_n,fy_n,fz_n
 
 [transcription]
 scheme = "midpoint"            # or "bdf2", "backward-euler"
@@ -43,6 +62,11 @@ substeps = 1                   # grid steps between samples
 
 [solver]
 method = "reduced-space"       # or "interior-point", which needs no simulable guess
+# huber = 3.0                  # samples farther off than this many sigmas count linearly
+
+# [uncertainty]
+# noise = "estimated"          # sigma_m tells only the markers' relative precision
+# profile = ["poisson"]        # profile likelihood of these parameters
 
 # [rollout]                    # the forward simulation that checks the answer
 # timestep_s = 0.002
