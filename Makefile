@@ -5,7 +5,7 @@ DEV := .venv/.installed-dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 RUN := runs/foam_cylinder
 
-.PHONY: help solve test check bench clean
+.PHONY: help solve test check bench docs clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' Makefile
@@ -25,8 +25,13 @@ check: $(DEV) ## lint, formatting and types
 bench: $(CORE) ## time the constraint Jacobian
 	@$(BIN)/python scripts/benchmark_jacobian.py
 
+docs: $(CORE) ## build the documentation's pages
+	@$(PIP) -e '.[docs]'
+	@$(BIN)/sphinx-build -q -W -b html docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
+
 clean: ## remove the environment and caches; runs stay
-	@rm -rf .venv build dist .pytest_cache .ruff_cache
+	@rm -rf .venv build dist .pytest_cache .ruff_cache docs/_build docs/generated
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/pip:
