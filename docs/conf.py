@@ -28,3 +28,13 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 # The package exports what its modules define: a name then has two places, either will do.
 suppress_warnings = ["ref.python"]
+
+
+def _absolute_values(_app, _what, _name, _object, _options, lines: list[str]) -> None:
+    """|φ| in a docstring is a length, not a substitution."""
+    lines[:] = [line.replace("|", r"\|") for line in lines]
+
+
+def setup(app) -> None:
+    """Connect what the extensions leave to the project."""
+    app.connect("autodoc-process-docstring", _absolute_values)
