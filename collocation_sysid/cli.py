@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console, RenderableType
 from rich.text import Text
 
 from .errors import InputError, SimulationError
+
+if TYPE_CHECKING:
+    from .study import Limits, PlannedRun
+    from .study.table import Yardstick
 
 app = typer.Typer(
     name="collocation-sysid",
@@ -39,6 +46,21 @@ Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where to
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="A line per iteration.")]
+Workers = Annotated[
+    int | None, typer.Option(help="Runs at once; as many as there are cores by default.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A dask.distributed scheduler to run on.")
+]
+TimeLimit = Annotated[
+    float | None,
+    typer.Option(metavar="SECONDS", help="A run is ended after this; it counts as a failure."),
+]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
+OneExperiment = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Experiment; by default the first.")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list the runs.")]
 
 EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -118,6 +140,136 @@ def simulate(
 
 
 @app.command()
+def compare(
+    problem: ProblemPath,
+    methods: Annotated[str, typer.Option(metavar="A,B,…", help="Methods, separated by commas.")],
+    starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
+    spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
+    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
+    truth: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE|NAME=VALUE", help="True parameters: a TOML file, or values."),
+    ] = None,
+    within: Annotated[float, typer.Option(help="Relative error of a success.")] = 0.01,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    time_limit: TimeLimit = None,
+    set_: Overrides = None,
+    out: Out = None,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run methods side by side from many starts; finished runs are kept and not done again."""
+    from .problem import load_problem
+    from .study import Limits, plan_comparison
+    from .study.arguments import parse_methods, read_truth
+    from .study.table import Yardstick
+
+    names, limits = parse_methods(methods), Limits(workers, scheduler, time_limit)
+    loaded = load_problem(problem, set_ or ())
+    free = [item.name for item in loaded.parameters.free]
+    yardstick = Yardstick(read_truth(truth or (), loaded.parameters.names, free), within)
+    planned = plan_comparison(loaded, names, set_ or (), starts, spread, seed, yardstick.truth)
+    study = _Study("compare", problem, planned, yardstick, out)
+    _study(study, limits, dry_run, as_json, quiet)
+
+
+@app.command()
+def sweep(
+    problem: ProblemPath,
+    over: Annotated[
+        list[str],
+        typer.Option(
+            metavar="KEY=VALUES",
+            help="Key and its values: a,b,c or first:last:count or first:last:log:count.",
+        ),
+    ],
+    method: Annotated[str | None, typer.Option(help="Method, instead of the problem's.")] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    time_limit: TimeLimit = None,
+    set_: Overrides = None,
+    out: Out = None,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Solve for every combination of values of the problem file's keys."""
+    from .problem import load_problem
+    from .study import Limits, plan_sweep
+    from .study.arguments import parse_methods, parse_over
+    from .study.table import Yardstick
+
+    chosen = parse_methods(method, "--method")[0] if method else None
+    limits = Limits(workers, scheduler, time_limit)
+    planned = plan_sweep(problem, parse_over(over), set_ or (), chosen)
+    load_problem(problem, planned[0].overrides)  # a missing file would fail every run
+    _study(_Study("sweep", problem, planned, Yardstick(), out), limits, dry_run, as_json, quiet)
+
+
+@dataclass(frozen=True)
+class _Study:
+    """A study as the command line gives it."""
+
+    kind: str
+    problem: Path
+    planned: Sequence[PlannedRun]
+    yardstick: Yardstick
+    out: Path | None
+
+    @property
+    def folder(self) -> Path:
+        return self.out or Path("runs") / f"{_run_name(self.problem)}-{self.kind}"
+
+
+def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: bool) -> None:
+    """Do the runs that are left, write the tables and plots, and print them."""
+    from .record import as_json as json_text
+    from .study import RunStore, run_all
+    from .study.display import StudyProgress, study_tables
+    from .study.report import load_report, report_json, write_report
+
+    folder = study.folder
+    store = RunStore(folder / "runs")
+    finished = [r.key for r in study.planned if store.finished(r.key, limits.time_limit_s)]
+    left = [run for run in study.planned if run.key not in finished]
+    if dry_run:
+        _dry_run(study.planned, finished, as_json)
+        return
+    _require_possible(folder)
+    interrupted = False
+    try:
+        with StudyProgress(errors, left, len(study.planned), quiet) as progress:
+            run_all(left, store, limits, progress.done)
+    except KeyboardInterrupt:
+        interrupted = True
+    title = f"{study.kind.capitalize()}: {_run_name(study.problem)}"
+    report = load_report(title, study.kind, study.planned, store, study.yardstick)
+    if report.records:
+        write_report(report, folder)
+    if interrupted:
+        kept = f"{len(report.records)} of {len(study.planned)} runs are kept in {folder}"
+        again = shlex.join(["collocation-sysid", *sys.argv[1:]])
+        errors.print(Text(f"interrupted: {kept}; resume with: {again}"), soft_wrap=True)
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if as_json:
+        typer.echo(json_text(report_json(report)))
+    else:
+        _show(study_tables(report, folder))
+
+
+def _dry_run(planned: Sequence[PlannedRun], finished: Sequence[str], as_json: bool) -> None:
+    from .study.display import plan_table
+
+    if as_json:
+        listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
+        typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
+    else:
+        _show(plan_table(planned, finished))
+
+
+@app.command()
 def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False) -> None:
     """Validate a problem, print its sizes, and check the derivatives."""
     from .check import check_problem
@@ -134,15 +286,82 @@ def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False)
 
 @app.command()
 def plot(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: RunFolder,
     out: Out = None,
 ) -> None:
-    """Draw the plots of a run again, from its files."""
+    """Draw the pictures of a run again, from its files."""
     from .results.redraw import redraw
 
     _require_possible(out or run_folder)
     for file in redraw(run_folder, out or run_folder):
         typer.echo(file)
+
+
+@app.command()
+def report(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A run folder, or one of compare or sweep.")
+    ],
+    to: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Where to write; report.html in the folder.")
+    ] = None,
+) -> None:
+    """Write one HTML page with everything a run or a study found, pictures inside."""
+    from .report import comparison_page, run_page
+
+    file = to or folder / "report.html"
+    study = (folder / "summary.json").is_file()
+    page = comparison_page(folder) if study else run_page(folder)
+    _require_possible(file.parent)
+    file.write_text(page, encoding="utf-8")
+    typer.echo(file)
+
+
+@app.command()
+def animate(
+    run_folder: RunFolder,
+    to: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A .gif, or an .mp4, which needs ffmpeg.")
+    ] = None,
+    fps: Annotated[float, typer.Option(help="Frames a second.")] = 25.0,
+    slow: Annotated[float, typer.Option(help="How many times slower than it was.")] = 1.0,
+    experiment: OneExperiment = None,
+    quiet: Quiet = False,
+) -> None:
+    """Film a run from its files: the body as fitted beside the body as rolled out."""
+    from rich.progress import Progress
+
+    from .results.animation import animate as film
+
+    _require_possible(to.parent if to is not None else run_folder)
+    with Progress(console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
+        task = bar.add_task("filming", total=1.0)
+        file = film(
+            run_folder, to, fps, slow, experiment, lambda share: bar.update(task, completed=share)
+        )
+    typer.echo(file)
+
+
+@app.command()
+def view(
+    run_folder: RunFolder,
+    field: Annotated[
+        str, typer.Option(help="Field of the frames that colours the body.")
+    ] = "von_mises_pa",
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a web page, open no window.")
+    ] = None,
+    experiment: OneExperiment = None,
+) -> None:
+    """Look at a run in 3-D: in a window (needs pyvista), or as a web page that needs nothing."""
+    from .results.view import export_page
+    from .results.view import view as show
+
+    if html is None:
+        show(run_folder, field, experiment)
+        return
+    _require_possible(html.parent)
+    typer.echo(export_page(run_folder, html, experiment))
 
 
 @app.command()

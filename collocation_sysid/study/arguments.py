@@ -1,0 +1,196 @@
+"""What the command line of a study says: methods, the truth, and the values to sweep over."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..methods import METHODS
+
+RANGE = "such as 50:5000:log:9 or 0:1:5"
+
+
+def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
+    """Names of methods separated by commas, in their order, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the one that was probably meant.
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names:
+        raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
+    for name in names:
+        if name not in METHODS:
+            raise InputError(f"found {name!r}; {_meant(name, METHODS)}", None, option)
+    return names
+
+
+# The truth ----------------------------------------------------------------------------------------
+
+
+def read_truth(
+    given: Sequence[str], known: Sequence[str], needed: Sequence[str]
+) -> dict[str, float]:
+    """True values of the parameters, by name.
+
+    Parameters
+    ----------
+    given : sequence of str
+        TOML files, or "name=value" separated by commas; later ones win.
+    known, needed : sequences of str
+        All parameters of the problem, and those that are estimated.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read, a name the problem has not, a value that is no positive
+        number, and when a needed one is missing.
+    """
+    truth: dict[str, float] = {}
+    for item in given:
+        source, table = _truth_table(item)
+        for name, value in table.items():
+            if name not in known:
+                raise InputError(f"found {name!r}; {_meant(name, known)}", source, "--truth")
+            truth[name] = _positive(name, value, source)
+    if missing := [name for name in needed if given and name not in truth]:
+        raise InputError(
+            f"{', '.join(missing)} missing; expected the true value of every estimated parameter",
+            None,
+            "--truth",
+        )
+    return truth
+
+
+def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
+    if "=" in item:
+        pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
+        return None, {name.strip(): value.strip() for name, _, value in pairs}
+    path = Path(item)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not valid TOML: {error}", path, "--truth") from error
+    except FileNotFoundError:
+        raise InputError(
+            "there is no such file; expected a TOML file of true values, or name=value such as "
+            "mu_pa=300",
+            path,
+            "--truth",
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", path, "--truth") from error
+    return path, content.get("parameters", content)
+
+
+def _positive(name: str, value: Any, source: Path | None) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not 0 < number < np.inf:
+        raise InputError(f"found {name} = {value}; expected a positive number", source, "--truth")
+    return number
+
+
+# Swept keys ---------------------------------------------------------------------------------------
+
+
+def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Values of each swept key, as `--set` takes them.
+
+    Parameters
+    ----------
+    texts : sequence of "key=a,b,c" or "key=first:last:count" or "key=first:last:log:count"
+
+    Raises
+    ------
+    InputError
+        Quoting the text that cannot be read.
+    """
+    over: dict[str, tuple[str, ...]] = {}
+    for text in texts:
+        key, equals, values = (part.strip() for part in text.partition("="))
+        if not (equals and key and values):
+            raise InputError(
+                f"found {text!r}; expected key=values such as parameters.mu_pa.guess="
+                "50:5000:log:9 or transcription.substeps=1,2,4",
+                None,
+                "--over",
+            )
+        if key in over:
+            raise InputError(f"{key} is given twice; put its values in one list", None, "--over")
+        over[key] = tuple(_range(key, values) if _is_range(values) else _items(values))
+    if not over:
+        raise InputError("missing; expected at least one key to sweep over", None, "--over")
+    return over
+
+
+def _is_range(values: str) -> bool:
+    return ":" in values and not values.startswith(('"', "'", "[", "{"))
+
+
+def _range(key: str, text: str) -> Iterable[str]:
+    first, *middle, count = text.split(":")
+    try:
+        low, high = float(first), float(middle[0])
+        number = int(count)
+        spacing = middle[1] if len(middle) == 2 else "linear"
+        if len(middle) > 2 or number < 1:
+            raise ValueError
+    except (ValueError, IndexError):
+        raise InputError(
+            f"found {text} for {key}; expected first:last:count or first:last:log:count, {RANGE}",
+            None,
+            "--over",
+        ) from None
+    if spacing not in ("log", "lin", "linear"):
+        raise InputError(
+            f"found the spacing {spacing!r} for {key}; expected log or linear, {RANGE}",
+            None,
+            "--over",
+        )
+    if spacing == "log":
+        if not (low > 0 and high > 0):
+            raise InputError(
+                f"found {text} for {key}; a logarithmic range needs ends above 0", None, "--over"
+            )
+        return map(_plain, np.geomspace(low, high, number))
+    return map(_plain, np.linspace(low, high, number))
+
+
+def _plain(value: float) -> str:
+    """A number without the rounding errors of its computation."""
+    return f"{value:.12g}"
+
+
+def _items(text: str) -> list[str]:
+    """Split at the commas that are outside brackets, braces and quotes."""
+    items, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        depth += (letter in "[{") - (letter in "]}") if not quote else 0
+        if letter == "," and not depth and not quote:
+            items.append("")
+        else:
+            items[-1] += letter
+    return [item.strip() for item in items if item.strip()]
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    names = list(known)
+    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
+    close = longer or difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]!r}? Expected" if close else "expected"
+    return f"{hint} one of {', '.join(names)}"

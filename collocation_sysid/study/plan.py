@@ -1,0 +1,205 @@
+"""What a study runs: every run is a problem file, overrides and a method.
+
+So any of them can be repeated with ``collocation-sysid solve PROBLEM --method M --set …``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..problem import Problem, ProblemFile, read_problem_file
+
+KEY_LENGTH = 20
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a study.
+
+    Attributes
+    ----------
+    key : str
+        Hash of all that decides the result: problem, data files, method, start, options, version.
+    problem : str, the problem file's whole path
+    method : str
+    start : int, 0 is the file's guess
+    overrides : tuple of "key=value"
+    guess : mapping of the estimated parameters to their guesses
+    swept : mapping of swept keys to their values as text
+    """
+
+    key: str
+    problem: str
+    method: str
+    start: int = 0
+    overrides: tuple[str, ...] = ()
+    guess: Mapping[str, float] = field(default_factory=dict)
+    swept: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The run in a few words."""
+        if not self.swept:
+            return f"{self.method}, start {self.start}"
+        return ", ".join(f"{short}={self.swept[key]}" for key, short in short_keys(self.swept))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Content for JSON."""
+        return asdict(self)
+
+
+def short_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Each dotted key with as much of its end as tells it from the others, and what it is of."""
+    for key in keys:
+        parts = key.split(".")
+        least = 2 if parts[0] == "parameters" else 1
+        ends = [".".join(parts[-count:]) for count in range(least, len(parts) + 1)]
+        alone = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
+        yield key, next(alone, key)
+
+
+def plan_comparison(
+    problem: Problem,
+    methods: Sequence[str],
+    overrides: Sequence[str] = (),
+    starts: int = 1,
+    spread: float = 10.0,
+    seed: int = 0,
+    truth: Mapping[str, float] | None = None,
+) -> list[PlannedRun]:
+    """Every method from every start; all methods get the same starts.
+
+    Parameters
+    ----------
+    problem : Problem
+        Loaded with the same overrides.
+    methods : sequence of str
+    overrides : sequence of "key=value"
+    starts : int
+        Start 0 is the file's guess. The others are log-uniform within a factor `spread` of the
+        truth, or of the guess where there is none, and clipped to the bounds. A start depends on
+        the seed and its number alone, so that more of them can be asked for later.
+    spread : float
+    seed : int
+    truth : mapping of name to value, optional
+
+    Raises
+    ------
+    InputError
+        For a number of starts, spread or seed that cannot be.
+    """
+    _refuse_options(starts, spread, seed)
+    planned = []
+    for start in range(starts):
+        moved = list(overrides) + _start_overrides(problem, truth or {}, start, spread, seed)
+        file, _ = read_problem_file(problem.path, moved)
+        planned += [_planned(problem.path, file, method, moved, start) for method in methods]
+    return planned
+
+
+def plan_sweep(
+    path: Path,
+    over: Mapping[str, Sequence[str]],
+    overrides: Sequence[str] = (),
+    method: str | None = None,
+) -> list[PlannedRun]:
+    """Every combination of the swept values; the last key changes fastest.
+
+    Raises
+    ------
+    InputError
+        For a key or value that the problem file cannot have.
+    """
+    read_problem_file(path, overrides)
+    planned = []
+    for values in itertools.product(*over.values()):
+        swept = dict(zip(over, values, strict=True))
+        moved = [*overrides, *(f"{key}={value}" for key, value in swept.items())]
+        try:
+            file, _ = read_problem_file(path, moved)
+        except InputError as error:
+            where = "--over" if error.source == "--set" else error.source
+            raise InputError(error.message, where, error.where) from error
+        planned.append(_planned(path, file, method or file.solver.method, moved, swept=swept))
+    return planned
+
+
+def _refuse_options(starts: int, spread: float, seed: int) -> None:
+    if starts < 1:
+        raise InputError(f"found {starts}; expected 1 or more", None, "--starts")
+    if not 1 <= spread < np.inf:
+        raise InputError(f"found {spread:g}; expected a factor of 1 or more", None, "--spread")
+    if seed < 0:
+        raise InputError(f"found {seed}; expected a whole number, 0 or more", None, "--seed")
+
+
+def _start_overrides(
+    problem: Problem, truth: Mapping[str, float], start: int, spread: float, seed: int
+) -> list[str]:
+    if start == 0:
+        return []
+    free = problem.parameters.free
+    exponents = np.random.default_rng([seed, start]).uniform(-1, 1, len(free))
+    moved = []
+    for item, exponent in zip(free, exponents, strict=True):
+        value = truth.get(item.name, item.guess) * spread**exponent
+        inside = float(np.clip(value, item.lower, item.upper))
+        moved.append(f"parameters.{item.name}.guess={inside!r}")
+    return moved
+
+
+def _planned(
+    path: Path,
+    file: ProblemFile,
+    method: str,
+    overrides: Sequence[str],
+    start: int = 0,
+    swept: Mapping[str, str] | None = None,
+) -> PlannedRun:
+    guess = {
+        name: section.guess
+        for name in type(file.parameters).model_fields
+        if (section := getattr(file.parameters, name)) is not None and section.guess is not None
+    }
+    content = file.model_dump(mode="json", exclude_unset=True)
+    content.setdefault("solver", {})["method"] = method
+    decisive = [content, start, _hashes_of_files(content, path.parent), _version()]
+    text = json.dumps(decisive, sort_keys=True)
+    key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
+    whole = str(path.resolve())
+    return PlannedRun(key, whole, method, start, tuple(overrides), guess, dict(swept or {}))
+
+
+def _version() -> str:
+    return version("collocation-sysid")
+
+
+def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
+    """Hashes of the files that a problem names: other data is another run."""
+    found = {}
+    for text in _texts(content):
+        try:
+            data = (folder / text).read_bytes()
+        except (OSError, ValueError):  # a text that is no file's name
+            continue
+        found[text] = hashlib.sha256(data).hexdigest()
+    return found
+
+
+def _texts(content: Any) -> Iterator[str]:
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, Mapping):
+        yield from itertools.chain.from_iterable(map(_texts, content.values()))
+    elif isinstance(content, (list, tuple)):
+        yield from itertools.chain.from_iterable(map(_texts, content))

@@ -1,0 +1,269 @@
+"""What a study leaves behind: tables for the terminal and for Markdown, CSV, JSON and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..record import as_json
+from ..terminal import UNITS
+from .plan import PlannedRun, short_keys
+from .plots import comparison_plots, sweep_plots
+from .store import Record, RunStore, write_whole
+from .table import Row, Yardstick, method_rows, run_row
+
+SCHEMA_VERSION = 1
+RESOLUTION_DPI = 150
+SHOWN_FAILURES = 8
+MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answer."
+
+
+@dataclass(frozen=True)
+class View:
+    """A table of texts, the first columns to the left and the others to the right."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    names: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A study's numbers, finished or not.
+
+    Attributes
+    ----------
+    title : str
+    kind : {"compare", "sweep"}
+    planned : tuple of PlannedRun
+    records : mapping of key to record, those there are
+    yardstick : Yardstick
+    """
+
+    title: str
+    kind: str
+    planned: tuple[PlannedRun, ...]
+    records: Mapping[str, Record]
+    yardstick: Yardstick
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row for each planned run."""
+        return [run_row(run, self.records.get(run.key), self.yardstick) for run in self.planned]
+
+    @property
+    def views(self) -> list[View]:
+        """The tables people look at, each within 80 columns."""
+        if self.kind == "compare":
+            return comparison_views(method_rows(self.rows))
+        return sweep_views(self.rows, list(self.planned[0].swept))
+
+    @property
+    def failures(self) -> list[str]:
+        """A line for each run without an answer."""
+        return [
+            f"{run.label}: {record['outcome']}: {record.get('message', '')}"
+            for run in self.planned
+            if (record := self.records.get(run.key)) is not None and "result" not in record
+        ]
+
+    @property
+    def notes(self) -> list[str]:
+        """What to know when reading the tables."""
+        missing = len(self.planned) - len(self.records)
+        kept = [f"{missing} of {len(self.planned)} runs are still to be done."] if missing else []
+        return [*((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == "compare" else ()), *kept]
+
+
+def load_report(
+    title: str,
+    kind: str,
+    planned: Sequence[PlannedRun],
+    store: RunStore,
+    yardstick: Yardstick | None = None,
+) -> Report:
+    """Gather the records of planned runs."""
+    loaded = {run.key: store.load(run.key) for run in planned}
+    records = {key: record for key, record in loaded.items() if record is not None}
+    return Report(title, kind, tuple(planned), records, yardstick or Yardstick())
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+def write_report(report: Report, folder: Path) -> None:
+    """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = report.rows
+    write_whole(folder / "runs.csv", as_csv(rows))
+    if report.kind == "compare":
+        write_whole(folder / "summary.csv", as_csv(method_rows(rows)))
+    write_whole(folder / "summary.json", as_json(report_json(report)) + "\n")
+    write_whole(folder / "summary.md", as_markdown(report))
+    if report.kind == "compare":
+        figures = comparison_plots(rows, report.records, report.yardstick)
+    else:
+        figures = sweep_plots(rows, list(report.planned[0].swept))
+    for name, figure in figures.items():
+        figure.savefig(folder / f"{name}.png", dpi=RESOLUTION_DPI)
+
+
+def report_json(report: Report) -> dict[str, Any]:
+    """Content of summary.json."""
+    rows = report.rows
+    first = report.planned[0]
+    content: dict[str, Any] = {
+        "schema": SCHEMA_VERSION,
+        "kind": report.kind,
+        "title": report.title,
+        "problem": first.problem,
+        "runs": rows,
+    }
+    if report.kind == "compare":
+        content |= {
+            "truth": dict(report.yardstick.truth) or None,
+            "within": report.yardstick.within,
+            "methods": method_rows(rows),
+        }
+    else:
+        content["swept"] = list(first.swept)
+    return content
+
+
+def as_csv(rows: Sequence[Row]) -> str:
+    """Rows as CSV; the columns are those of all rows, in the order they first come."""
+    columns = dict.fromkeys(name for row in rows for name in row)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def as_markdown(report: Report) -> str:
+    """The views and the failures for a paper's appendix or an issue."""
+    parts = [f"# {report.title}", *report.notes]
+    for view in report.views:
+        numbers = len(view.heads) - view.names
+        lines = [view.heads, ("---",) * view.names + ("---:",) * numbers, *view.rows]
+        table = "\n".join("| " + " | ".join(map(_escaped, line)) + " |" for line in lines)
+        parts.append(f"## {view.title}\n\n{table}")
+    if report.failures:
+        listed = "\n".join(f"- {failure}" for failure in report.failures)
+        parts.append(f"## Runs without an answer\n\n{listed}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+# Views --------------------------------------------------------------------------------------------
+
+Cell = Callable[[Row], str]
+
+
+def comparison_views(summaries: Sequence[Row]) -> list[View]:
+    """Success, quality and cost of every method."""
+    errors = [name for name in summaries[0] if name.startswith("error_")]
+    success: dict[str, Cell] = {
+        "runs": lambda row: str(row["runs"]),
+        "success": lambda row: f"{row['successes']}/{row['runs']}",
+        "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
+    }
+    for name in errors:
+        symbol, _ = UNITS[name.removeprefix("error_")]
+        success[f"Δ{symbol} %"] = _number(name, 100)
+    quality = {
+        "violation N": _number("violation_n", 1, ".1e"),
+        "relative": _number("violation_relative", 1, ".1e"),
+        "markers mm": _number("rms_m", 1e3),
+        "roll-out mm": _number("rollout_rms_m", 1e3),
+        "tip mm": _number("tip_max_m", 1e3),
+    }
+    cost = {
+        "iterations": _number("iterations", 1, ".4g"),
+        "evaluations": _number("evaluations", 1, ".4g"),
+        "build s": _number("build_s"),
+        "evaluate s": _number("evaluations_s"),
+        "lin. alg. s": _number("linear_algebra_s"),
+        "total s": _number("total_s"),
+    }
+    if all(row["evaluations"] is None for row in summaries):
+        del cost["evaluations"]
+    return [
+        _view("Success", {"method": _text("method")}, success, summaries),
+        _view("Quality", {"method": _text("method")}, quality, summaries),
+        _view("Cost", {"method": _text("method")}, cost, summaries),
+    ]
+
+
+def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:
+    """Estimates and quality against the swept values."""
+    places = {short: _swept(key) for key, short in short_keys(swept)}
+    estimates: dict[str, Cell] = {}
+    for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
+        symbol, unit = UNITS[name]
+        estimates[f"{symbol} {unit}".strip()] = _estimate(name)
+    quality = {
+        "status": _text("status"),
+        "markers mm": _number("rms_m", 1e3),
+        "roll-out mm": _number("rollout_rms_m", 1e3),
+        "iterations": _number("iterations", 1, ".4g"),
+        "total s": _number("total_s"),
+    }
+    return [
+        _view("Estimates ± standard error", places, estimates, rows),
+        _view("Quality and cost", places, quality, rows),
+    ]
+
+
+def _view(
+    title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
+) -> View:
+    columns = {**names, **numbers}
+    cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
+    return View(title, tuple(columns), cells, len(names))
+
+
+def _text(name: str) -> Cell:
+    return lambda row: str(row[name])
+
+
+def _swept(key: str) -> Cell:
+    """A swept value, numbers shortened."""
+
+    def cell(row: Row) -> str:
+        try:
+            return f"{float(row[key]):.5g}"
+        except ValueError:
+            return str(row[key])
+
+    return cell
+
+
+def _number(name: str, factor: float = 1.0, form: str = ".2g") -> Cell:
+    def cell(row: Row) -> str:
+        if row[name] is None:
+            return "–"
+        value = factor * row[name]
+        if form == ".2g" and abs(value) >= 100:
+            return f"{value:.0f}"
+        return format(value, form)
+
+    return cell
+
+
+def _estimate(name: str) -> Cell:
+    def cell(row: Row) -> str:
+        value, spread = row.get(f"value_{name}"), row.get(f"std_error_{name}")
+        if value is None:
+            return "–"
+        return f"{value:.4g}" if spread is None else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
+
+    return cell

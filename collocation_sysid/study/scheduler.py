@@ -1,0 +1,222 @@
+"""Runs side by side: on this machine's cores, or on a cluster through dask.distributed.
+
+A worker of either kind only starts and watches the run's own process (`process.execute`): a time
+limit or a segmentation fault costs that run alone.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from ..errors import InputError
+from ..fem.batched import available_threads
+from .plan import PlannedRun
+from .process import execute
+from .store import CRASHED, STOPPED, Record, RunStore
+
+CONNECT_WITHIN_S = 15
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How the runs of a study are done.
+
+    Attributes
+    ----------
+    workers : int or None
+        Runs at once on this machine; as many as there are cores by default.
+    scheduler : str or None
+        Address of a dask.distributed scheduler, whose workers see the same files.
+    time_limit_s : float or None
+        Of a run, loading included.
+    retries : int
+        Further tries of a run whose process dies.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
+    time_limit_s: float | None = None
+    retries: int = 1
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"found {self.workers}; expected 1 or more", None, "--workers")
+        if self.workers is not None and self.scheduler is not None:
+            raise InputError(
+                "the scheduler has workers of its own; leave out one of the two",
+                None,
+                "--workers and --scheduler",
+            )
+        if self.time_limit_s is not None and not self.time_limit_s > 0:
+            raise InputError(
+                f"found {self.time_limit_s:g}; expected a number of seconds above 0",
+                None,
+                "--time-limit",
+            )
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Where runs are done.
+
+    Attributes
+    ----------
+    submit : function of a planned run, gives the future of its record
+    slots : int, runs at once
+    stop : function that ends the runs that are going on
+    """
+
+    submit: Callable[[PlannedRun], Future]
+    slots: int
+    stop: Callable[[], Any]
+
+
+def run_all(
+    planned: Sequence[PlannedRun],
+    store: RunStore,
+    limits: Limits,
+    done: Callable[[Record, int], None] = lambda record, slots: None,
+) -> None:
+    """Do the runs that are not in the store and put them there, each as soon as it has ended.
+
+    Parameters
+    ----------
+    planned : sequence of PlannedRun, started in this order
+    store : RunStore
+    limits : Limits
+    done : callable
+        Called with every new record and the number of runs at once.
+
+    Raises
+    ------
+    InputError
+        If the scheduler cannot be had.
+    KeyboardInterrupt
+        After the runs that are going on were ended; finished ones are in the store.
+    """
+    if not planned:
+        return
+    with _pool(limits) as pool:
+        futures = {pool.submit(run): run for run in planned}
+        try:
+            for future in as_completed(futures):
+                record = _record_of(future, futures[future], limits)
+                if record["outcome"] != STOPPED:
+                    store.save(record)
+                    done(record, pool.slots)
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            pool.stop()
+            raise
+
+
+def _record_of(future: Future, planned: PlannedRun, limits: Limits) -> Record:
+    """A run's record, also when the worker that watched it is lost."""
+    try:
+        return future.result()
+    except Exception as error:
+        return {
+            **planned.as_dict(),
+            "outcome": CRASHED,
+            "message": f"its worker was lost ({type(error).__name__}: {error})",
+            "attempts": 1,
+            "time_limit_s": limits.time_limit_s,
+            "wall_s": None,
+        }
+
+
+@contextmanager
+def _pool(limits: Limits) -> Iterator[Pool]:
+    if limits.scheduler is None and find_spec("distributed") is None:
+        with _threads(limits) as pool:
+            yield pool
+    else:
+        with _dask(limits) as pool:
+            yield pool
+
+
+@contextmanager
+def _threads(limits: Limits) -> Iterator[Pool]:
+    """Threads that wait for processes: all that one machine needs."""
+    slots = limits.workers or available_threads()
+    stop = threading.Event()
+    with ThreadPoolExecutor(slots) as executor:
+        yield Pool(
+            lambda run: executor.submit(
+                execute, run.as_dict(), limits.time_limit_s, limits.retries, stop.is_set
+            ),
+            slots,
+            stop.set,
+        )
+
+
+@contextmanager
+def _dask(limits: Limits) -> Iterator[Pool]:
+    """An existing scheduler by address, else a cluster on this machine."""
+    distributed = _distributed()
+    cluster = None
+    if limits.scheduler is None:
+        slots = limits.workers or available_threads()
+        # Its workers are threads, for each run is a process anyhow.
+        cluster = distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=slots,
+            processes=False,
+            protocol="tcp",
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.ERROR,
+        )
+    try:
+        client = distributed.Client(
+            cluster or limits.scheduler, timeout=CONNECT_WITHIN_S, set_as_default=False
+        )
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"found {limits.scheduler!r}, where no scheduler answers ({error}); expected an "
+            "address such as tcp://10.0.0.5:8786",
+            None,
+            "--scheduler",
+        ) from error
+    flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
+    stop = distributed.Event(flag, client=client)
+    try:
+        with client.get_executor(pure=False) as executor:
+            yield Pool(
+                lambda run: executor.submit(
+                    _execute_on_worker, run.as_dict(), limits.time_limit_s, limits.retries, flag
+                ),
+                max(1, sum(client.nthreads().values())),
+                stop.set,
+            )
+    finally:
+        client.close()
+        if cluster is not None:
+            cluster.close()
+
+
+def _execute_on_worker(
+    planned: dict[str, Any], time_limit_s: float | None, retries: int, flag: str
+) -> Record:
+    return execute(planned, time_limit_s, retries, _distributed().Event(flag).is_set)
+
+
+def _distributed() -> Any:
+    if find_spec("distributed") is None:
+        raise InputError(
+            "a scheduler needs dask.distributed: pip install 'collocation-sysid[cluster]', or "
+            "leave it out to run on this machine's cores",
+            None,
+            "--scheduler",
+        )
+    return import_module("distributed")

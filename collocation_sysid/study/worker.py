@@ -1,0 +1,82 @@
+"""One run of a study in a process of its own: ``python -m collocation_sysid.study.worker OUT``.
+
+The run comes as one line of JSON on stdin, and its record goes to the file OUT. The process ends
+when its stdin is closed, so that none outlives the study that started it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, SimulationError
+from ..experiment.grasp import held_nodes
+from ..problem import load_problem
+from ..record import as_json, result
+from ..rollout import Rollout
+from ..run import Run, run
+from .store import ERROR, FINISHED, write_whole
+
+
+def main() -> None:
+    """Entry point."""
+    planned = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_the_study, daemon=True).start()
+    write_whole(Path(sys.argv[1]), as_json(attempt(planned)))
+
+
+def attempt(planned: dict[str, Any]) -> dict[str, Any]:
+    """Do a planned run; what goes wrong becomes part of its record."""
+    try:
+        problem = load_problem(planned["problem"], planned["overrides"])
+        finished = run(problem, planned["method"])
+        return {
+            "outcome": FINISHED,
+            "message": finished.solution.message,
+            "result": result(finished),
+            "tip": _tip(finished),
+        }
+    except (InputError, SimulationError) as error:
+        return {"outcome": ERROR, "message": str(error)}
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+        return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
+
+
+def _tip(finished: Run) -> dict[str, Any]:
+    """Measured and re-simulated track of the marker farthest from the grasp."""
+    experiment = finished.solution.collocation.segments[0].experiment
+    markers, nodes_m = experiment.markers, experiment.body.nodes_m
+    held = held_nodes(experiment.grasps)
+    centre = nodes_m[held if len(held) else slice(None)].mean(axis=0)
+    tip = int(np.linalg.norm(markers.observe(nodes_m) - centre, axis=1).argmax())
+    measured = markers.positions_m[:, tip]
+    rollout = finished.rollouts[experiment.name]
+    rolled = rollout.readings_m[:, tip] if isinstance(rollout, Rollout) else None
+    error = None
+    if rolled is not None and markers.present[:, tip].any():
+        error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
+    return {
+        "experiment": experiment.name,
+        "marker": markers.names[tip],
+        "max_m": error,
+        "t_s": experiment.t_s.tolist(),
+        "measured_m": measured.tolist(),
+        "rolled_out_m": None if rolled is None else rolled.tolist(),
+    }
+
+
+def _end_with_the_study() -> None:
+    os.read(0, 1)  # returns when the other end is closed
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,260 @@
+"""`compare` and `sweep` from the command line: what they run, print, write and keep."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from matplotlib.image import imread
+from problem_files import TRUTH, Outcome, run_command, write_problem
+from rich.console import Console
+
+from collocation_sysid import cli
+from collocation_sysid.study import display, process
+
+KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
+METHODS = ("interior-point", "reduced-space")
+# Answers with the guess, as a run that did not move; the second start never ends.
+STAND_IN = """
+import json, sys
+planned, out = json.loads(sys.stdin.readline()), sys.argv[-1]
+if planned["start"] == 1:
+    sys.stdin.read()
+times = [0.0, 0.01]
+record = {
+    "outcome": "finished",
+    "message": "Converged.",
+    "result": {
+        "status": "converged",
+        "converged": True,
+        "parameters": {
+            name: {"value": guess, "std_error": 0.1 * guess, "ci95": [0.8 * guess, 1.2 * guess]}
+            for name, guess in planned["guess"].items()
+        },
+        "fit": {"rms_m": 1e-3},
+        "dynamics": {"max_violation_n": 1e-9, "max_violation_relative": 1e-8},
+        "rollout": {"rms_m": 1e-3, "max_m": 3e-3},
+        "iterations": 5,
+        "timing_s": {"build": 0.1, "evaluations": 0.2, "linear_algebra": 0.3, "total": 0.6},
+        "history": [
+            {"iteration": k, "loss": 10.0 / k, "violation_n": 10.0**-k, "time_s": 0.1 * k}
+            for k in (1, 2)
+        ],
+    },
+    "tip": {
+        "experiment": "swing", "marker": "low", "max_m": 1e-3, "t_s": times,
+        "measured_m": [[0, 0, 0], [None, None, None]], "rolled_out_m": [[0, 0, 0], [1, 1, 1]],
+    },
+}
+with open(out, "w") as file:
+    json.dump(record, file)
+"""
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """Replaces the runs' processes."""
+    script = tmp_path / "stand_in.py"
+    script.write_text(STAND_IN)
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, str(script)))
+
+
+def table(file: Path) -> list[dict[str, str]]:
+    with open(file, newline="", encoding="utf-8") as text:
+        return list(csv.DictReader(text))
+
+
+def drawn(folder: Path) -> set[str]:
+    files = list(folder.glob("*.png"))
+    assert all(imread(file).size for file in files)
+    return {file.stem for file in files}
+
+
+# A real comparison --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Two methods from three starts, and the same command once more."""
+    folder = tmp_path_factory.mktemp("compared")
+    file = write_problem(folder, {"swing": 6})
+    out = folder / "study"
+    command = ["compare", file, "--methods", ",".join(METHODS), "--starts", 3, "--spread", 2]
+    command += ["--workers", 2, "--out", out, *KNOWN]
+    first = run_command(*command)
+    written = {path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
+    return SimpleNamespace(
+        out=out, first=first, written=written, again=run_command(*command, "--json")
+    )
+
+
+def test_every_method_runs_from_every_start(compared):
+    assert compared.first.code == 0, compared.first.err
+    rows = table(compared.out / "runs.csv")
+    assert [(row["method"], row["start"]) for row in rows] == [
+        (method, str(start)) for start in range(3) for method in METHODS
+    ]
+    assert {row["status"] for row in rows} == {"converged"}
+    assert {row["success"] for row in rows} == {"True"}
+    for row in rows:
+        for name, value in TRUTH.items():
+            assert float(row[f"value_{name}"]) == pytest.approx(value, rel=1e-4)
+            assert float(row[f"error_{name}"]) < 1e-4
+
+
+def test_the_summary_has_a_row_for_each_method(compared):
+    rows = table(compared.out / "summary.csv")
+    assert [row["method"] for row in rows] == list(METHODS)
+    for row in rows:
+        assert (row["runs"], row["successes"], row["success_rate"]) == ("3", "3", "1.0")
+        assert float(row["success_low"]) == pytest.approx(0.4385, abs=1e-4)
+        numbers = ("violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m")
+        costs = ("iterations", "build_s", "evaluations_s", "linear_algebra_s", "total_s")
+        assert all(float(row[name]) >= 0 for name in numbers + costs)
+        assert all(float(row[f"error_{name}"]) < 1e-4 for name in TRUTH)
+
+
+def test_the_tables_fit_a_terminal_and_the_plots_are_drawn(compared):
+    lines = compared.first.out.splitlines()
+    assert [line for line in lines if line in ("Success", "Quality", "Cost")]
+    assert max(len(line) for line in lines if "written to" not in line) <= 90
+    assert "3/3  44–100 %" in compared.first.out
+    assert drawn(compared.out) == {"convergence", "tip", "success", "basins"}
+    text = (compared.out / "summary.md").read_text()
+    assert "| interior-point | 3 | 3/3 | 44–100 % |" in text
+    assert "within 1 % of the truth" in text
+
+
+def test_progress_tells_the_time_left(compared):
+    lines = compared.first.err.splitlines()
+    assert len(lines) == 6
+    assert lines[0].startswith("1/6 runs: ")
+    assert lines[0].endswith(" left")
+    assert "; about" not in lines[-1]
+
+
+def test_finished_runs_are_not_done_again(compared):
+    assert compared.again.err == "6 of 6 runs are finished already\n"
+    runs = compared.out / "runs"
+    assert {path.name: path.stat().st_mtime_ns for path in runs.iterdir()} == compared.written
+    content = json.loads(compared.again.out)
+    assert content["truth"] == TRUTH
+    assert [row["method"] for row in content["methods"]] == list(METHODS)
+    assert len(content["runs"]) == 6
+
+
+# Late, interrupted and missing runs ---------------------------------------------------------------
+
+
+def compare(*more: object) -> Outcome:
+    return run_command(
+        "compare", "problem.toml", "--methods", "reduced-space", "--out", "out", *more
+    )
+
+
+def test_a_late_run_is_a_row(tiny, stand_in):
+    outcome = compare("--starts", 3, "--time-limit", 3, "--workers", 3, *KNOWN)
+    assert outcome.code == 0
+    rows = table(tiny / "out" / "runs.csv")
+    assert [row["status"] for row in rows] == ["converged", "timeout", "converged"]
+    late = "reduced-space, start 1: timeout: killed after the time limit of 3 s"
+    assert late in outcome.out
+    assert late in (tiny / "out" / "summary.md").read_text()
+    (summary,) = table(tiny / "out" / "summary.csv")
+    assert (summary["runs"], summary["converged"], summary["rms_m"]) == ("3", "2", "0.001")
+
+
+def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
+    done = display.StudyProgress.done
+
+    def interrupt(self, record, slots):
+        done(self, record, slots)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(display.StudyProgress, "done", interrupt)
+    outcome = compare("--starts", 2, "--workers", 2)
+    assert outcome.code == 130
+    assert outcome.out == ""
+    assert "interrupted: 1 of 2 runs are kept in out; resume with: " in outcome.err
+    assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
+    assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == ["converged", "missing"]
+    assert "1 of 2 runs are still to be done." in (tiny / "out" / "summary.md").read_text()
+
+
+def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr(cli, "errors", Console(force_terminal=True, width=80, file=shown))
+    monkeypatch.setenv("TERM", "xterm")
+    assert compare().code == 0
+    assert "0/1 runs" in shown.getvalue()
+
+
+# Plans only ---------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_only_lists_the_runs(tiny):
+    outcome = compare("--starts", 2, "--dry-run")
+    assert outcome.code == 0
+    assert outcome.out.count("to do") == 2
+    assert "reduced-space, start 1" in outcome.out
+    assert not (tiny / "out").exists()
+    listed = json.loads(compare("--starts", 2, "--dry-run", "--json").out)
+    assert [run["start"] for run in listed] == [0, 1]
+    assert len(listed[1]["overrides"]) == 4
+    assert not listed[0]["finished"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare", "problem.toml", "--methods", "interior"], "did you mean 'interior-point'?"),
+        (["compare", "nowhere.toml", "--methods", "reduced-space"], "there is no such file"),
+        (["sweep", "problem.toml", "--over", "a=1:2"], "error: --over: found 1:2 for a; expected"),
+        (["sweep", "problem.toml", "--over", "title=x", "--method", "nome"], "error: --method: "),
+        (["sweep", "problem.toml", "--over", "object.mesh=a.vtu,b.vtu"], "a.vtu"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_runs(tiny, arguments, message):
+    outcome = run_command(*arguments, "--out", "out")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert message in outcome.err
+    assert not (tiny / "out").exists()
+
+
+# Sweeps -------------------------------------------------------------------------------------------
+
+
+def test_a_sweep_tabulates_estimates_against_the_swept_values(tiny, stand_in):
+    outcome = run_command(
+        "sweep", "problem.toml", "--method", "reduced-space", "--out", "out",
+        "--over", "parameters.mu_pa.guess=50:5000:log:3", "--over", "transcription.substeps=1,2",
+    )  # fmt: skip
+    assert outcome.code == 0
+    rows = table(tiny / "out" / "runs.csv")
+    assert [(row["parameters.mu_pa.guess"], row["transcription.substeps"]) for row in rows] == [
+        (mu, m) for mu in ("50", "500", "5000") for m in ("1", "2")
+    ]
+    assert [float(row["value_mu_pa"]) for row in rows] == [50, 50, 500, 500, 5000, 5000]
+    assert "500 2 400 ± 40 500 ± 50" in " ".join(outcome.out.split())
+    assert max(map(len, outcome.out.splitlines())) <= 80
+    assert drawn(tiny / "out") == {"sweep"}
+    content = json.loads((tiny / "out" / "summary.json").read_text())
+    assert content["swept"] == ["parameters.mu_pa.guess", "transcription.substeps"]
+    assert "| mu_pa.guess | substeps |" in (tiny / "out" / "summary.md").read_text()
+
+
+def test_words_and_lists_can_be_swept(tiny, stand_in):
+    outcome = run_command(
+        "sweep", "problem.toml", "--out", "out", "--json", "-q",
+        "--over", "solver.method=interior-point,reduced-space",
+        "--over", "experiment.swing.gravity_m_s2=[0, 0, -9.81],[0, 0, 0]",
+    )  # fmt: skip
+    assert (outcome.code, outcome.err) == (0, "")
+    rows = json.loads(outcome.out)["runs"]
+    assert [row["method"] for row in rows] == [m for m in METHODS for _ in range(2)]
+    assert rows[1]["experiment.swing.gravity_m_s2"] == "[0, 0, 0]"
