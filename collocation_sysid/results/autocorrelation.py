@@ -7,15 +7,13 @@ and B depends on how the errors e hang together. Here, in every experiment on it
     Cov(e_{t,c}, e_{s,d}) = Σ_{c,d} ρ_{|t−s|}
 
 with ρ of one autoregressive process and Σ among the channels (marker and axis). The residuals of
-a fit are r = M e, M = I − S A⁻¹ Sᵀ, smaller and less persistent than the errors; their lagged
-products r D_k r have the expectations Σ_l γ_l tr(D_k M D_l M), linear in the autocovariances γ,
-which is solved for them (Worsley et al. 2002, "A general statistical analysis for fMRI data",
-NeuroImage 15, there for one series). The order minimises Schwarz's criterion. Σ is that
-of the innovations, which are nearly independent in time.
+a fit are smaller and less persistent than the errors; `autocovariance` corrects for that. The
+order minimises Schwarz's criterion. Σ is that of the innovations, which are nearly independent in
+time.
 
 Compared with it on simulated fits (tests/test_error_coverage.py), a kernel estimate of B from
 the scores of each time (Andrews 1991, prewhitened) covers 83–90 % where 95 % is meant, and one
-without the correction for M or without Σ fails for short records and for shared errors.
+without the correction of the residuals or without Σ fails for short records and shared errors.
 """
 
 from __future__ import annotations
@@ -24,9 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import matmul_toeplitz
 from scipy.stats import chi2, norm
 
+from .autocovariance import along_time, autocorrelation, autoregression, lagged_products
 from .curvature import Curvature
 from .linearised import FitBlock, LinearisedFit
 
@@ -35,8 +33,9 @@ Array = NDArray[np.float64]
 MAX_ORDER = 4
 # So many samples per coefficient of the autoregression.
 SAMPLES_PER_ORDER = 10
-# Partial autocorrelations beyond this belong to a process that never forgets.
-LARGEST_PARTIAL = 0.99
+# Of finding the autocovariances at the lags beyond from the few, and the few without those.
+# They end when nothing changes by more than a share that no error bar shows.
+ROUNDS, SETTLED = 4, 0.01
 SIGNIFICANCE = 0.01
 # Residuals this small, in units of σ, are rounding.
 ROUNDING = 1e-6
@@ -107,10 +106,10 @@ def dependence(fit: LinearisedFit, curvature: Curvature) -> Dependence:
     """Test the residuals for correlation, in time and among channels."""
     if fit.chi_squared <= ROUNDING**2 * fit.measurements:
         return Dependence(0.0, np.inf, 1.0)
-    products, expected = _lagged_products(fit, curvature, [1] * len(fit.blocks))
+    found = lagged_products(fit, curvature, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
-    products, expected = pool @ products, pool @ expected @ pool.T
+    products, expected = pool @ found.products, pool @ found.expected @ pool.T
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
@@ -138,43 +137,68 @@ def _shared_p(fit: LinearisedFit) -> float:
 def error_processes(fit: LinearisedFit, curvature: Curvature) -> tuple[ErrorProcess, ...]:
     """The error process of each experiment."""
     orders = [min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER) for block in fit.blocks]
-    lags = [max(1, order) for order in orders]
-    products, expected = _lagged_products(fit, curvature, lags)
-    autocovariances = np.linalg.lstsq(expected, products)[0].astype(np.float64)
-    ends = np.cumsum([lag + 1 for lag in lags])
+    moments = lagged_products(fit, curvature, [max(1, order) for order in orders])
+    found = moments.autocovariances()
+    for _ in range(ROUNDS):
+        tails = [
+            _tail(block, gamma, order)
+            for block, gamma, order in zip(fit.blocks, found, orders, strict=True)
+        ]
+        before, found = found, moments.autocovariances(moments.beyond(fit, curvature, tails))
+        if np.allclose(np.concatenate(found), np.concatenate(before), rtol=SETTLED, atol=0):
+            break
     return tuple(
         _error_process(block, slope, gamma[: order + 1])
-        for block, slope, order, gamma in zip(
-            fit.blocks, curvature.slopes, orders, np.split(autocovariances, ends[:-1]), strict=True
+        for block, slope, gamma, order in zip(
+            fit.blocks, curvature.slopes, found, orders, strict=True
         )
     )
+
+
+def _tail(block: FitBlock, autocovariance: Array, order: int) -> Array:
+    """(T,) autocovariances at the lags beyond those given, zero up to there."""
+    coefficients = _coefficients(block, autocovariance[: order + 1])
+    tail = max(0.0, autocovariance[0]) * autocorrelation(coefficients, len(block.t_s))
+    tail[: len(autocovariance)] = 0.0
+    return tail
+
+
+def _coefficients(block: FitBlock, autocovariance: Array) -> Array:
+    """Of the autoregression of the errors."""
+    residual, _, present = block.channels
+    channels = _effective_channels(_among_channels(residual, present))
+    return autoregression(autocovariance, _samples(present) * channels)
+
+
+def _samples(present: NDArray[np.bool_]) -> float:
+    """Mean number of samples of the channels that have any."""
+    return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
 def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
     residual, _, present = block.channels
     measured = present.any(axis=0)
-    samples = present.sum() / max(1, measured.sum())
     raw_variance = float(np.sum(residual**2)) / max(1, present.sum())
     if not autocovariance[0] > 0:  # the fit leaves too little to be corrected
         autocovariance = np.array([raw_variance])
-    raw = _among_channels(residual, present)
-    coefficients = _autoregression(autocovariance, samples * _effective_channels(raw))
-    along_time = _autocorrelation(coefficients, len(residual))
+    coefficients = _coefficients(block, autocovariance)
+    along = autocorrelation(coefficients, len(residual))
     innovation, known = _innovations(residual, present, coefficients)
     channels = _among_channels(innovation, known)
     weight = present.sum(axis=0)
     if not weight @ np.diag(channels) > 0:  # no run of samples is long enough
-        channels, known = raw, present
+        channels, known = _among_channels(residual, present), present
     level = weight @ np.diag(channels)
     channels *= autocovariance[0] * weight.sum() / level if level > 0 else 0.0
     fitted = float(np.sum(slope**2))
-    memory = 1 + 2 * float(np.sum(along_time[1:] ** 2))
+    memory = 1 + 2 * float(np.sum(along[1:] ** 2))
+    independent = _samples(present) * _effective_channels(channels)
     return ErrorProcess(
-        along_time=along_time,
+        along_time=along,
         among_channels=channels,
         order=len(coefficients),
         samples=max(1.0, (known.sum() - fitted) / max(1, measured.sum())),
-        degrees_of_freedom=max(1.0, samples * _effective_channels(channels) / memory - fitted),
+        degrees_of_freedom=max(1.0, (independent - fitted) / memory),
     )
 
 
@@ -195,14 +219,14 @@ def score_covariance(
     total = curvature.prior.copy()
     doubt = np.zeros(directions.shape[1])
     for slope, process in zip(curvature.slopes, processes, strict=True):
-        samples, _, width = slope.shape
-        smoothed = _along_time(process, slope.reshape(samples, -1)).reshape(slope.shape)
+        width = slope.shape[2]
+        smoothed = along_time(process.along_time, slope)
         mixed = np.einsum("cd,tdr->tcr", process.among_channels, smoothed)
         part = slope.reshape(-1, width).T @ mixed.reshape(-1, width)
         total += (part + part.T) / 2
         for k, direction in enumerate(directions.T):
             by_time = slope @ direction
-            share = process.among_channels @ (by_time.T @ _along_time(process, by_time))
+            share = process.among_channels @ (by_time.T @ along_time(process.along_time, by_time))
             variance, spread = np.trace(share), np.sum(share * share.T)
             if spread > 0:
                 freedom = process.samples * variance**2 / spread
@@ -211,95 +235,6 @@ def score_covariance(
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = np.where(doubt > 0, variances**2 / doubt, np.inf)
     return total, np.maximum(freedom, 1.0)
-
-
-def _along_time(process: ErrorProcess, columns: Array) -> Array:
-    """The Toeplitz matrix of the autocorrelation times (T, k)."""
-    return np.asarray(matmul_toeplitz(process.along_time, columns), dtype=np.float64)
-
-
-# Autocovariances ----------------------------------------------------------------------------
-
-
-def _lagged_products(
-    fit: LinearisedFit, curvature: Curvature, lags: list[int]
-) -> tuple[Array, Array]:
-    """Σ over channels r D_k r for k = 0 … lag of each experiment, and tr(D_k M D_l M).
-
-    D_0 is the identity and D_k has ones on both k-th diagonals of each channel.
-    """
-    products, traces, own, experiments = [], [], [], []
-    for number, (block, slope, last) in enumerate(
-        zip(fit.blocks, curvature.slopes, lags, strict=True)
-    ):
-        residual, _, present = block.channels
-        width = slope.shape[2]
-        shifted = [np.zeros((width, width)) for _ in range(last + 1)]
-        overlap = np.zeros((last + 1, last + 1))
-        for channel in range(residual.shape[1]):  # one at a time: all lags at once are large
-            seen = present[:, channel]
-            lagged = [_lagged(slope[:, channel], seen, k) for k in range(last + 1)]
-            stacked = np.stack([each.ravel() for each in lagged])
-            overlap += stacked @ stacked.T
-            for k, each in enumerate(lagged):
-                shifted[k] += slope[:, channel].T @ each
-        for k in range(last + 1):
-            twice = 1 if k == 0 else 2
-            ahead, behind = slice(k, None), slice(None, len(residual) - k)
-            products.append(twice * np.sum(residual[ahead] * residual[behind]))
-            own.append(twice * np.sum(present[ahead] & present[behind]))
-            experiments.append(number)
-        traces.append((shifted, overlap))
-    rows = np.array([s.ravel() for shifted, _ in traces for s in shifted])
-    expected = rows @ rows.T + np.diag(np.array(own, dtype=float))
-    for number, (_, overlap) in enumerate(traces):
-        here = np.flatnonzero(np.array(experiments) == number)
-        expected[np.ix_(here, here)] -= 2 * overlap
-    return np.array(products), expected
-
-
-def _lagged(columns: Array, seen: NDArray[np.bool_], lag: int) -> Array:
-    """D_k times the columns (T, r) of one channel, at its present samples."""
-    if lag == 0:
-        return columns
-    found = np.zeros_like(columns)
-    found[lag:] += columns[:-lag]
-    found[:-lag] += columns[lag:]
-    return found * seen[:, None]
-
-
-def _autoregression(autocovariance: Array, samples: float) -> Array:
-    """Coefficients of the order with the least Schwarz criterion, by Levinson's recursion."""
-    coefficients, innovation = np.zeros(0), autocovariance[0]
-    if not innovation > 0:
-        return coefficients
-    best, least = coefficients, samples * np.log(innovation)
-    for order in range(1, len(autocovariance)):
-        remainder = autocovariance[order] - coefficients @ autocovariance[1:order][::-1]
-        partial = np.clip(remainder / innovation, -LARGEST_PARTIAL, LARGEST_PARTIAL)
-        coefficients = np.append(coefficients - partial * coefficients[::-1], partial)
-        innovation *= 1 - partial**2
-        criterion = samples * np.log(innovation) + order * np.log(max(samples, 2.0))
-        if criterion < least:
-            best, least = coefficients, criterion
-    return best
-
-
-def _autocorrelation(coefficients: Array, samples: int) -> Array:
-    """(samples,) of the autoregressive process, from its Yule–Walker equations."""
-    order = len(coefficients)
-    found = np.zeros(samples + order)
-    found[0] = 1.0
-    if order:
-        equations = np.eye(order)
-        for k in range(1, order + 1):
-            for j, coefficient in enumerate(coefficients, start=1):
-                if k != j:
-                    equations[k - 1, abs(k - j) - 1] -= coefficient
-        found[1 : order + 1] = np.linalg.solve(equations, coefficients)
-        for k in range(order + 1, samples):
-            found[k] = coefficients @ found[k - order : k][::-1]
-    return found[:samples]
 
 
 def _innovations(

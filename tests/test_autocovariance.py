@@ -1,0 +1,89 @@
+"""Autocovariances of errors, of which the residuals of a fit show only a part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits_small import Problem, autoregressive, problem
+from scipy.linalg import block_diag, toeplitz
+
+from collocation_sysid.results.autocorrelation import error_processes
+from collocation_sysid.results.autocovariance import lagged_products
+from collocation_sysid.results.curvature import curvature
+from collocation_sysid.results.linearised import LinearisedFit
+
+LAG = 2
+PROBLEMS = {
+    "one": problem((30,), markers=1),
+    "two": problem((30, 20), markers=1),
+    "gaps": problem((30,), markers=2, missing=0.2),
+}
+
+
+def some_fit(of: Problem, phi: float = 0.9, seed: int = 0) -> LinearisedFit:
+    rng = np.random.default_rng(seed)
+    errors = [autoregressive(rng, *present.shape, phi) for present in of.present]
+    return of.fit(errors, np.zeros(len(of.names)))[0]
+
+
+def dense(of: Problem, by_experiment: list[np.ndarray]) -> np.ndarray:
+    """Matrix of all measurements, from one of the times (T, T) of each experiment."""
+    blocks = []
+    for matrix, present in zip(by_experiment, of.present, strict=True):
+        seen = np.repeat(present, 3, axis=1).ravel()
+        blocks.append(np.kron(matrix, np.eye(3 * present.shape[1])) * np.outer(seen, seen))
+    return block_diag(*blocks)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_lags_explain_the_expected_products_of_residuals(name):
+    of = PROBLEMS[name]
+    fit = some_fit(of)
+    factored = curvature(fit)
+    lengths = [len(present) for present in of.present]
+    found = lagged_products(fit, factored, [LAG] * len(lengths))
+    true = [0.7**k * 0.9 ** np.arange(length) for k, length in enumerate(lengths)]
+    tails = [np.where(np.arange(len(gamma)) > LAG, gamma, 0.0) for gamma in true]
+    explained = found.expected @ np.concatenate([gamma[: LAG + 1] for gamma in true])
+    explained += found.beyond(fit, factored, tails)
+
+    slopes = np.concatenate([slope.reshape(-1, slope.shape[2]) for slope in factored.slopes])
+    maker = np.eye(len(slopes)) - slopes @ slopes.T
+    of_residuals = maker @ dense(of, [toeplitz(gamma) for gamma in true]) @ maker
+    expected = []
+    for k, length in enumerate(lengths):
+        for lag in range(LAG + 1):
+            diagonals = [np.zeros((other, other)) for other in lengths]
+            diagonals[k] = toeplitz(np.arange(length) == lag).astype(float)
+            expected.append(np.sum(dense(of, diagonals) * of_residuals))
+    np.testing.assert_allclose(explained, expected, rtol=1e-9)
+
+
+def test_the_size_of_errors_is_found_where_offsets_hide_their_mean():
+    of, variances, lag1 = problem((60,), markers=4), [], []
+    for seed in range(60):
+        fit = some_fit(of, 0.85, seed)
+        (process,) = error_processes(fit, curvature(fit))
+        variances.append(np.diag(process.among_channels).mean())
+        lag1.append(process.along_time[1])
+    assert np.mean(variances) == pytest.approx(1.0, abs=4 * np.std(variances) / np.sqrt(60))
+    assert np.mean(lag1) == pytest.approx(0.85, abs=4 * np.std(lag1) / np.sqrt(60))
+    assert np.std(variances) < 0.2
+
+
+def test_error_bars_stay_sane_where_errors_hardly_forget():
+    of = problem((60,), markers=4)
+    for seed in range(20):
+        fit = some_fit(of, 0.98, seed)
+        (process,) = error_processes(fit, curvature(fit))
+        assert process.degrees_of_freedom > 5
+
+
+def test_rounding_is_no_process():
+    fit = some_fit(PROBLEMS["one"])
+    silent = tuple(replace(block, residual=0 * block.residual) for block in fit.blocks)
+    (process,) = error_processes(replace(fit, blocks=silent), curvature(fit))
+    assert process.order == 0
+    np.testing.assert_array_equal(process.among_channels, 0.0)
