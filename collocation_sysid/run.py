@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from .errors import InputError, SimulationError
 from .methods import METHODS
+from .methods.casadi_nlp import why_not
 from .nlp.collocation import Collocation
 from .problem import Problem
 from .profiling import profile_of
@@ -93,7 +95,10 @@ def solve(
     """
     name = method or problem.file.solver.method
     if name not in METHODS:
-        raise InputError(f"found {name!r}; expected one of {', '.join(METHODS)}", None, "--method")
+        close = difflib.get_close_matches(name, METHODS, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        known = f"found {name!r}; expected one of {', '.join(METHODS)}{hint}"
+        raise InputError(why_not(name) or known, None, "--method")
     chosen = METHODS[name]
     known = {field.name for field in fields(chosen.options)}
     in_file = problem.file.solver.model_dump(exclude_unset=True, exclude={"method", "huber"})

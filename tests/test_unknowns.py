@@ -140,7 +140,9 @@ def test_deviations_must_be_positive():
 # Finding them
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [m for m in METHODS if m != "penalty" and not m.startswith("casadi:")]
+)
 @pytest.mark.parametrize("kind", ONE_OF_EACH)
 def test_unknowns_are_found_beside_the_material(kind: str, method: str, rng):
     cube = replace(cube_with_gaps(14), nuisance=ONE_OF_EACH[kind])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -66,59 +67,149 @@ class TimedFunction(ca.Callback):
         return 0
 
 
+class LagrangianGradient(TimedFunction):
+    """∇ of the Lagrangian, which solvers differentiate once more in a direction."""
+
+    hessian_product: Callable[[list[Array], list[Array | None]], None]
+
+    def has_forward(self, nfwd: int) -> bool:
+        return nfwd == 1
+
+    def get_forward(self, nfwd, name, inames, onames, opts):
+        inputs = [*self._inputs, *self._outputs, *self._inputs]
+        self._forward = TimedFunction(
+            name, inputs, self._outputs, self.hessian_product, self._errors
+        )
+        return self._forward
+
+
 class NlpFunctions:
-    """The NLP's functions as CasADi callbacks over the shared assembly."""
+    """The NLP's functions as CasADi callbacks over the shared assembly.
+
+    Their inputs are z and an empty p, and where an output is one of the Lagrangian
+    w f + yᵀ g, also w and y. Outputs by name:
+
+    =================  =================================================
+    f, g               objective and constraints
+    grad_f, jac_g      their first derivatives
+    grad_l             ∇ of the Lagrangian, with its product with H
+    triu_hess, hess    H = ∇² of it, upper triangle or all
+    =================  =================================================
+
+    Parameters
+    ----------
+    collocation : Collocation
+    hessian : callable
+        Writes the values of the upper triangle: (z, w, y, values).
+    errors : list
+        Takes what goes wrong.
+    """
 
     def __init__(
         self, collocation: Collocation, hessian: HessianValues, errors: list[BaseException]
     ) -> None:
-        self.collocation = collocation
-        variables, rows = collocation.variables, collocation.constraints
-        z, g = ca.Sparsity.dense(variables, 1), ca.Sparsity.dense(rows, 1)
-        p, scalar = ca.Sparsity(0, 1), ca.Sparsity.dense(1, 1)
-        jacobian = ca.Sparsity(rows, variables, *map(_ints, collocation.jacobian_structure))
-        curvature = ca.Sparsity(variables, variables, *map(_ints, collocation.hessian_structure))
-
-        def nlp(inputs: list[Array], outputs: list[Array | None]) -> None:
-            value, values = outputs
-            if value is not None:
-                value[0] = collocation.objective(inputs[0])
-            if values is not None:
-                values[:] = collocation.constraint_values(inputs[0])
-
-        def gradient(inputs: list[Array], outputs: list[Array | None]) -> None:
-            value, slope = outputs
-            if value is not None:
-                value[0] = collocation.objective(inputs[0])
-            if slope is not None:
-                slope[:] = collocation.gradient(inputs[0])
-
-        def jacobian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
-            rows, entries = outputs
-            if entries is not None:
-                values, _ = collocation.constraints_and_jacobian(inputs[0], entries)
-                if rows is not None:
-                    rows[:] = values
-            elif rows is not None:
-                rows[:] = collocation.constraint_values(inputs[0])
-
-        def hessian_values(inputs: list[Array], outputs: list[Array | None]) -> None:
-            point, _, weight, multipliers = inputs
-            (entries,) = outputs
-            if entries is not None:
-                hessian(point, float(weight[0]), multipliers, entries)
-
-        self.nlp = TimedFunction("nlp", [z, p], [scalar, g], nlp, errors)
-        self.gradient = TimedFunction("grad_f", [z, p], [scalar, z], gradient, errors)
-        self.jacobian = TimedFunction("jac_g", [z, p], [g, jacobian], jacobian_values, errors)
-        inputs = [z, p, scalar, g]
-        self.hessian = TimedFunction("hess_lag", inputs, [curvature], hessian_values, errors)
+        self.collocation, self.errors = collocation, errors
+        self._upper_values = hessian
+        self._functions: list[TimedFunction] = []
+        self.nlp = self.function("nlp", "f", "g")
 
     @property
     def seconds(self) -> float:
         """Time spent evaluating."""
-        functions = (self.nlp, self.gradient, self.jacobian, self.hessian)
-        return sum(function.seconds for function in functions)
+        return sum(function.seconds for function in self._functions)
+
+    def function(self, name: str, *outputs: str) -> TimedFunction:
+        """A callback with the outputs named."""
+
+        def evaluate(inputs: list[Array], buffers: list[Array | None]) -> None:
+            wanted = zip(outputs, buffers, strict=True)
+            self._evaluate(inputs, {output: b for output, b in wanted if b is not None})
+
+        of_lagrangian = any(output in ("grad_l", "triu_hess", "hess") for output in outputs)
+        inputs = self._inputs if of_lagrangian else self._inputs[:2]
+        kind = LagrangianGradient if outputs == ("grad_l",) else TimedFunction
+        sparsities = [self._sparsity(output) for output in outputs]
+        made = kind(name, inputs, sparsities, evaluate, self.errors)
+        if isinstance(made, LagrangianGradient):
+            made.hessian_product = self._forward
+        self._functions.append(made)
+        return made
+
+    def _evaluate(self, inputs: list[Array], wanted: dict[str, Array]) -> None:
+        collocation, z = self.collocation, inputs[0]
+        if "f" in wanted:
+            wanted["f"][0] = collocation.objective(z)
+        if "grad_f" in wanted:
+            wanted["grad_f"][:] = collocation.gradient(z)
+        if "jac_g" in wanted:
+            rows, _ = collocation.constraints_and_jacobian(z, wanted["jac_g"])
+            if "g" in wanted:
+                wanted["g"][:] = rows
+        elif "g" in wanted:
+            wanted["g"][:] = collocation.constraint_values(z)
+        if len(inputs) == 2:
+            return
+        weight, multipliers = self._weights(*inputs[2:])
+        if "grad_l" in wanted:
+            wanted["grad_l"][:] = weight * collocation.gradient(z)
+            wanted["grad_l"] += collocation.jacobian(z).T @ multipliers
+        if "triu_hess" in wanted:
+            self._upper_values(z, weight, multipliers, wanted["triu_hess"])
+        if "hess" in wanted:
+            wanted["hess"][:] = self._upper(z, weight, multipliers)[self._full[1]]
+
+    def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
+        """The directional derivative of grad_l, in the order of CasADi's forward functions."""
+        z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = inputs
+        (product,) = outputs
+        if product is None:
+            return
+        product[:] = 0
+        if len(by_z):
+            structure, order = self._full
+            rows, columns = structure.get_triplet()
+            values = self._upper(z, *self._weights(weight, multipliers))[order]
+            np.add.at(product, rows, values * by_z[columns])
+        if by_weight.any():
+            product += by_weight * self.collocation.gradient(z)
+        if by_multipliers.any():
+            product += self.collocation.jacobian(z).T @ by_multipliers
+
+    def _upper(self, z: Array, weight: float, multipliers: Array) -> Array:
+        values = np.empty(len(self.collocation.hessian_structure[1]))
+        self._upper_values(z, weight, multipliers, values)
+        return values
+
+    def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
+        """Return w and y; CasADi leaves out what is zero."""
+        if not len(multipliers):
+            multipliers = np.zeros(self.collocation.constraints)
+        return float(weight[0]) if len(weight) else 0.0, multipliers
+
+    @cached_property
+    def _inputs(self) -> list[ca.Sparsity]:
+        dense = ca.Sparsity.dense
+        variables, rows = self.collocation.variables, self.collocation.constraints
+        return [dense(variables, 1), ca.Sparsity(0, 1), dense(1, 1), dense(rows, 1)]
+
+    @cached_property
+    def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
+        """Structure of both triangles, and where each value stands in the upper one."""
+        upper = self._sparsity("triu_hess")
+        numbered = ca.DM(upper, np.arange(1.0, upper.nnz() + 1))
+        both = ca.triu2symm(numbered)
+        return both.sparsity(), np.array(both.nonzeros(), dtype=np.int64) - 1
+
+    def _sparsity(self, output: str) -> ca.Sparsity:
+        variables, rows = self.collocation.variables, self.collocation.constraints
+        if output == "jac_g":
+            return ca.Sparsity(rows, variables, *map(_ints, self.collocation.jacobian_structure))
+        if output == "triu_hess":
+            structure = self.collocation.hessian_structure
+            return ca.Sparsity(variables, variables, *map(_ints, structure))
+        if output == "hess":
+            return self._full[0]
+        return ca.Sparsity.dense({"f": 1, "g": rows}.get(output, variables), 1)
 
 
 def _ints(values: NDArray[np.int64]) -> list[int]:
@@ -134,12 +225,14 @@ class Monitor(ca.Callback):
         watch: Watch | None,
         began: float,
         errors: list[BaseException],
+        max_time_s: float = np.inf,
     ) -> None:
         ca.Callback.__init__(self)
         self.errors = errors
         self.collocation = collocation
         self.watch = watch
         self.began = began
+        self.max_time_s = max_time_s
         self.stop = False
         self.history: list[Iteration] = []
         self.best: tuple[Array, Array] | None = None
@@ -170,7 +263,12 @@ class Monitor(ca.Callback):
         except BaseException as error:
             self.errors.append(error)
         self.seconds += time.perf_counter() - began
-        return [1 if self.stop or self.errors else 0]
+        return [1 if self.stop or self.late or self.errors else 0]
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is over."""
+        return time.perf_counter() - self.began > self.max_time_s
 
     def _follow(self, arguments) -> None:
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import re
-import signal
-import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -20,6 +15,7 @@ from ..errors import InputError
 from ..nlp.collocation import Collocation
 from ..results.solution import Solution, Status, Timing
 from .callbacks import Monitor, NlpFunctions, Watch
+from .nlpsol import build, interruptible
 from .start import initial_variables
 
 Array = NDArray[np.float64]
@@ -132,7 +128,7 @@ def solve(
     solver = _build_solver(functions, monitor, options)
     lower, upper = collocation.bounds()
     built = time.perf_counter()
-    with _interruptible(monitor):
+    with interruptible(monitor):
         answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
     if errors:
         raise errors[0]
@@ -170,9 +166,6 @@ def solve(
 def _build_solver(
     functions: NlpFunctions, monitor: Monitor, options: InteriorPointOptions
 ) -> ca.Function:
-    collocation = functions.collocation
-    z = ca.MX.sym("z", collocation.variables)
-    value, rows = functions.nlp(z, ca.MX(0, 1))
     settings: dict[str, Any] = {
         "ipopt.linear_solver": options.linear_solver,
         "ipopt.tol": options.tolerance,
@@ -185,8 +178,8 @@ def _build_solver(
         "error_on_fail": False,
         "show_eval_warnings": False,  # a trial step that inverts an element is cut back
         "no_nlp_grad": True,
-        "jac_g": functions.jacobian,
-        "grad_f": functions.gradient,
+        "jac_g": functions.function("jac_g", "g", "jac_g"),
+        "grad_f": functions.function("grad_f", "f", "grad_f"),
         "iteration_callback": monitor,
     }
     if options.linear_solver == "mumps":  # METIS ordering, no scaling: a little faster here
@@ -194,16 +187,9 @@ def _build_solver(
     if options.hessian == "limited-memory":
         settings["ipopt.hessian_approximation"] = "limited-memory"
     else:
-        settings["hess_lag"] = functions.hessian
+        settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
     settings |= {f"ipopt.{name}": value for name, value in options.ipopt.items()}
-    said = io.StringIO()
-    try:
-        with redirect_stdout(said):  # where IPOPT says which setting it refuses
-            return ca.nlpsol("solver", "ipopt", {"x": z, "f": value, "g": rows}, settings)
-    except RuntimeError as error:
-        reason = (said.getvalue().strip() or str(error).strip().splitlines()[-1]).splitlines()[0]
-        reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
-        raise InputError(f"IPOPT cannot be set up: {reason}", None, "solver") from error
+    return build("ipopt", functions, settings, "IPOPT")
 
 
 class _DampedHessian:
@@ -231,22 +217,3 @@ class _DampedHessian:
         moved = np.abs(q - self._last_q).max(initial=0.0)
         self._last_q = q.copy()
         return self.options.warm_up == 0 or bool(moved < self.options.warm_up)
-
-
-@contextmanager
-def _interruptible(monitor: Monitor) -> Iterator[None]:
-    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def request(_number: int, _frame: object) -> None:
-        monitor.stop = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    signal.signal(signal.SIGINT, request)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)

@@ -18,6 +18,7 @@ from pydantic import (
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..methods import METHODS
+from ..methods.casadi_nlp import why_not
 from ..nlp.schemes import SCHEMES
 
 # TOML tells text, numbers and truth values apart, so a "30" or true for a number is a slip.
@@ -31,13 +32,22 @@ Text = Annotated[str, Field(min_length=1)]
 Vector = tuple[Finite, Finite, Finite]
 Corner = tuple[Boundless, Boundless, Boundless]
 Unit = Literal["m", "cm", "mm", "in"]
+
+
+def _offered(name: Any) -> Any:
+    reason = why_not(name) if isinstance(name, str) else None
+    if reason is not None:
+        raise ValueError(reason)
+    return name
+
+
 if TYPE_CHECKING:
     MaterialName = ElementName = SchemeName = MethodName = str
 else:
     MaterialName = Literal[tuple(MATERIALS)]
     ElementName = Literal[tuple(ELEMENTS)]
     SchemeName = Literal[tuple(SCHEMES)]
-    MethodName = Literal[tuple(METHODS)]
+    MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
 
 
 class Section(BaseModel):
@@ -464,6 +474,47 @@ class SolverSection(Section):
     )
     factorisation: Literal["auto", "band", "sparse"] = Field(
         default="auto", description="How reduced-space factorises a timestep's equations."
+    )
+    inner: Literal["cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"] = Field(
+        default="cg-descent",
+        description="What minimises the merit function of penalty and augmented-lagrangian; "
+        "the latter's default is levenberg-marquardt.",
+    )
+    schedule: Literal["geometric", "progress", "constant"] = Field(
+        default="geometric",
+        description="How rho rises: after every stage, where slack is left, or never.",
+    )
+    rho: Positive = Field(
+        default=1e2,
+        description="First weight of the dynamics; augmented-lagrangian's default is 1e5.",
+    )
+    rho_max: Positive = Field(
+        default=1e8, description="Its last; augmented-lagrangian's default is 1e9."
+    )
+    rho_factor: Annotated[float, Field(gt=1)] = Field(
+        default=10.0, description="Factor above 1 between the weights of two stages."
+    )
+    inner_iterations: Annotated[Whole, Field(gt=0)] = Field(
+        default=1000, description="Most iterations of a stage."
+    )
+    violation: Positive = Field(
+        default=1e-3,
+        description="Slack left in the dynamics, over the largest force; "
+        "augmented-lagrangian's default is 1e-7.",
+    )
+    gradient: Literal["forward", "adjoint"] = Field(
+        default="forward", description="How shooting finds the slope of its loss."
+    )
+    shares: list[Positive] = Field(
+        default=[0.25, 0.5, 1.0],
+        description="List of the shares of the samples that continuation solves one after another; "
+        "the last is 1.",
+    )
+    stage: SolverSection | None = Field(
+        default=None, description="A method and its options, for each share of continuation."
+    )
+    casadi: dict[str, Any] = Field(
+        default_factory=dict, description="Further options of a casadi: solver by name."
     )
     tolerance: Positive = 1e-8
     max_iterations: Whole = Field(default=200, ge=0)

@@ -1,0 +1,168 @@
+"""The merit function of the penalty and augmented-Lagrangian methods.
+
+    m(z) = L(z) + yᵀ g(z) + ρ/2 ‖g(z)‖²,   ∇m = ∇L + Jᵀ (y + ρ g),
+
+with loss and rows in the scaling of the NLP and y = 0 for a penalty. Grasped nodes are variables
+too, tied by rows of their own; variables whose bounds are equal, such as a given start, are not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from ..nlp.collocation import Collocation
+from ..nlp.stopwatch import Stopwatch
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Unconstrained:
+    """A collocation NLP whose grasps are rows, not bounds, and how it answers for the given one.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        As given, in either layout; variables are the same in both.
+    stopwatch : Stopwatch, optional
+
+    Attributes
+    ----------
+    nlp : Collocation
+        With explicit grasps.
+    lower, upper : (variables,) bounds
+    free : (variables,) bool, what is not given
+    bounded : (k,) positions of the free variables p that may have bounds: q and φ
+    """
+
+    def __init__(self, collocation: Collocation, stopwatch: Stopwatch | None = None) -> None:
+        self.given = collocation
+        self.stopwatch = stopwatch or Stopwatch()
+        with self.stopwatch.building():
+            explicit = all(segment.explicit_grasps for segment in collocation.segments)
+            self.nlp = collocation if explicit else _with_explicit_grasps(collocation)
+            indptr, indices = self.nlp.jacobian_structure
+            shape = (self.nlp.constraints, self.nlp.variables)
+            self._entries = np.zeros(len(indices))
+            self._jacobian = sp.csc_array((self._entries, indices, indptr), shape=shape)
+        self.lower, self.upper = self.nlp.bounds()
+        self.free = self.lower != self.upper
+        of_p = np.zeros(self.nlp.variables, dtype=bool)
+        of_p[: self.nlp.nq] = True
+        of_p[self.nlp.variables - self.nlp.own :] = True
+        self.bounded: Index = np.flatnonzero(of_p & self.free)
+
+    def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
+        """G and ∂g/∂z; the matrix is overwritten by the next call."""
+        with self.stopwatch.evaluating():
+            rows, _ = self.nlp.constraints_and_jacobian(z, self._entries)
+        return rows, self._jacobian
+
+    def constraint_values(self, z: Array) -> Array:
+        """G, scaled."""
+        with self.stopwatch.evaluating():
+            return self.nlp.constraint_values(z)
+
+    def is_upright(self, z: Array) -> bool:
+        """Whether no element is inverted where the equations of motion are evaluated."""
+        if not np.isfinite(z).all():
+            return False
+        with self.stopwatch.evaluating():
+            for segment, x in zip(self.nlp.segments, self.nlp.unpack(z)[1], strict=True):
+                states, _ = segment.dynamics.evaluation_states(x)
+                if not segment.body.volume_ratios(states).min() > 0:
+                    return False
+        return True
+
+    def projected(self, z: Array, slope: Array) -> Array:
+        """A gradient without what is given, or pushes against a bound."""
+        slope = np.where(self.free, slope, 0.0)
+        slope[(z <= self.lower) & (slope > 0)] = 0
+        slope[(z >= self.upper) & (slope < 0)] = 0
+        return slope
+
+    # Answering for the collocation given ------------------------------------------------------
+
+    def grasped(self, z: Array) -> Array:
+        """The point with all held nodes exactly where their grasps are."""
+        q, positions = self.nlp.unpack(z)
+        moved = [x.copy() for x in positions]
+        for segment, x in zip(self.nlp.segments, moved, strict=True):
+            first = segment.dynamics.first_row
+            x[first:, segment.held_dofs] = segment.held_positions[first:]
+            if segment.dynamics.taken is not None:
+                x[segment.dynamics.taken] = segment.taken_positions
+        there = self.nlp.pack(q, moved, self.nlp.unpack_own(z))
+        there[~self.free] = z[~self.free]
+        return there if self.is_upright(there) else z
+
+    def multipliers(self, explicit: Array) -> Array:
+        """Multipliers of the given collocation's rows from those of all rows."""
+        if self.nlp is self.given:
+            return explicit
+        parts, start = [], 0
+        for segment, given in zip(self.nlp.segments, self.given.segments, strict=True):
+            stop = start + segment.constraints
+            rows = explicit[start:stop].reshape(segment.constraint_times, segment.dofs)
+            parts.append(rows[:, given.row_dofs].ravel())
+            start = stop
+        return np.concatenate(parts)
+
+
+def _with_explicit_grasps(collocation: Collocation) -> Collocation:
+    return Collocation(
+        [segment.experiment for segment in collocation.segments],
+        collocation.parameters,
+        collocation.scheme,
+        collocation.substeps,
+        explicit_grasps=True,
+        huber=collocation.huber,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Merit:
+    """m for one ρ and y.
+
+    Attributes
+    ----------
+    problem : Unconstrained
+    rho : float
+    multipliers : (constraints,) y
+    """
+
+    problem: Unconstrained
+    rho: float
+    multipliers: Array
+
+    def value(self, z: Array) -> float:
+        """m(z); infinite where an element is inverted."""
+        if not self.problem.is_upright(z):
+            return np.inf
+        return self.value_of(z, self.problem.constraint_values(z))
+
+    def value_and_gradient(self, z: Array) -> tuple[float, Array]:
+        """m(z) and ∇m (variables,), which is zero for what is given."""
+        if not self.problem.is_upright(z):
+            return np.inf, np.full(len(z), np.nan)
+        rows, jacobian = self.problem.constraints_and_jacobian(z)
+        return self.value_of(z, rows), self.gradient(z, rows, jacobian)
+
+    def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
+        """∇m from g and J at z."""
+        slope = self.problem.nlp.gradient(z) + jacobian.T @ self.estimate(rows)
+        return np.where(self.problem.free, slope, 0.0)
+
+    def estimate(self, rows: Array) -> Array:
+        """Multipliers y + ρ g that make the Lagrangian stationary where m is."""
+        return self.multipliers + self.rho * rows
+
+    def value_of(self, z: Array, rows: Array) -> float:
+        """M from g at z."""
+        pull = float(self.multipliers @ rows + self.rho / 2 * (rows @ rows))
+        value = self.problem.nlp.objective(z) + pull
+        return value if np.isfinite(value) else np.inf

@@ -1,0 +1,260 @@
+"""CasADi's other solvers by name: the same optimum, honest ends, and refusals that say why."""
+
+from __future__ import annotations
+
+import os
+import signal
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from problem_files import write_problem
+from problems_small import GUESS, TRUTH, hung_cube, measured
+
+from collocation_sysid import solve as solve_problem
+from collocation_sysid.errors import InputError
+from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.callbacks import NlpFunctions
+from collocation_sysid.methods.casadi_nlp import (
+    PLUGINS,
+    REFUSED,
+    CasadiOptions,
+    solve,
+    why_not,
+)
+from collocation_sysid.methods.reduced_space import solve as reduced_space
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.problem import load_problem
+from collocation_sysid.results.solution import Iteration, Solution, Status
+
+
+@cache
+def cube(noise_m: float = 0.0) -> Collocation:
+    made = measured(hung_cube(4))
+    tracks = made.markers.positions_m
+    noise = noise_m * np.random.default_rng(5).normal(size=tracks.shape)
+    return Collocation([with_markers(made, tracks + noise)], GUESS)
+
+
+@cache
+def solved(plugin: str) -> Solution:
+    return METHODS[f"casadi:{plugin}"].solve(cube())
+
+
+def functions() -> NlpFunctions:
+    def hessian(z, weight, multipliers, values) -> None:
+        cube().hessian_values(z, weight, multipliers, values)
+
+    return NlpFunctions(cube(), hessian, [])
+
+
+def point() -> tuple[np.ndarray, np.ndarray]:
+    """Some variables and multipliers."""
+    rng = np.random.default_rng(1)
+    z = cube().pack(GUESS.guess_q, [reduced_space(cube()).positions_m[0].reshape(5, -1)])
+    return z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=cube().constraints)
+
+
+# The answer
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_the_true_parameters_are_recovered(plugin: str):
+    solution = solved(plugin)
+    assert solution.status.converged
+    assert solution.method == f"casadi:{plugin}"
+    # The damping by mass hardly shows in four steps.
+    np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
+    assert solution.theta[3] == pytest.approx(1.0, rel=1e-2)
+    assert solution.max_violation_relative < 1e-5
+    assert solution.kkt_residual < 1e-6
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
+    collocation = cube(1e-4)
+    solution = solve(collocation, plugin=plugin)
+    reference = reduced_space(collocation)
+    assert solution.status.converged
+    np.testing.assert_allclose(solution.q[:3], reference.q[:3], atol=1e-4)
+    np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-6)
+    np.testing.assert_allclose(solution.multipliers, reference.multipliers, atol=1e-3)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_explicit_grasps_lead_to_the_same_answer(plugin: str):
+    collocation = Collocation([measured(hung_cube(4))], GUESS, explicit_grasps=True)
+    solution = METHODS[f"casadi:{plugin}"].solve(collocation)
+    assert solution.status.converged
+    np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
+
+
+def test_the_exact_hessian_leads_sqp_to_the_same_answer_without_noise():
+    solution = solve(cube(), CasadiOptions("exact"), plugin="sqpmethod")
+    assert solution.status is Status.CONVERGED
+    np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
+
+
+def test_options_of_the_plugin_win():
+    options = CasadiOptions(casadi={"qpsol": "qrqp", "max_iter": 1})
+    solution = solve(cube(), options, plugin="sqpmethod")
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.iterations == 1
+
+
+# Functions beyond those of interior point
+
+
+def test_both_triangles_of_the_hessian_are_those_of_the_upper_one():
+    z, multipliers = point()
+    found = functions().function("h", "hess")(z, np.zeros((0, 1)), 0.7, multipliers)
+    expected = cube().hessian(z, 0.7, multipliers)
+    np.testing.assert_allclose(found.full(), expected.toarray(), rtol=1e-12)
+
+
+def test_the_lagrangians_gradient_has_its_forward_derivative(rng):
+    collocation = cube()
+    owner = functions()
+    gradient = owner.function("grad_l", "grad_l")
+    z, multipliers = point()
+    by_z, by_y = rng.normal(size=len(z)), rng.normal(size=len(multipliers))
+    none = np.zeros((0, 1))
+    slope = collocation.gradient(z)
+    jacobian = collocation.jacobian(z)
+    value = gradient(z, none, 0.7, multipliers)
+    np.testing.assert_allclose(value.full().ravel(), 0.7 * slope + jacobian.T @ multipliers)
+    found = gradient.forward(1)(z, none, 0.7, multipliers, value, by_z, none, 0.3, by_y)
+    expected = collocation.hessian(z, 0.7, multipliers) @ by_z + 0.3 * slope + jacobian.T @ by_y
+    np.testing.assert_allclose(found.full().ravel(), expected, atol=1e-10)
+
+
+# Other ends
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_the_iteration_limit_is_a_status(plugin: str):
+    solution = solve(cube(), CasadiOptions(max_iterations=2), plugin=plugin)
+    assert solution.status is Status.ITERATION_LIMIT
+    assert np.isfinite(solution.z).all()
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_the_time_limit_is_a_status(plugin: str):
+    solution = solve(cube(), CasadiOptions(max_time_s=1e-3), plugin=plugin)
+    assert solution.status is Status.TIME_LIMIT
+    assert np.isfinite(solution.z).all()
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_an_interruption_keeps_the_best_iterate(plugin: str):
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    solution = solve(cube(), watch=interrupt, plugin=plugin)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.theta in [line.theta for line in solution.history]
+    assert len(solution.history) <= 5
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_an_error_in_the_callers_function_reaches_the_caller(plugin: str):
+    def broken(iteration: Iteration) -> None:
+        raise ZeroDivisionError("in watch")
+
+    with pytest.raises(ZeroDivisionError, match="in watch"):
+        solve(cube(), watch=broken, plugin=plugin)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_an_error_in_a_function_reaches_the_caller(plugin: str, monkeypatch):
+    def broken(self, z, *rest):
+        raise ZeroDivisionError("in an evaluation")
+
+    monkeypatch.setattr(Collocation, "constraints_and_jacobian", broken)
+    with pytest.raises(ZeroDivisionError, match="in an evaluation"):
+        solve(cube(), plugin=plugin, start=point()[0])
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_the_history_is_what_was_watched(plugin: str):
+    seen: list[Iteration] = []
+    solution = solve(cube(), watch=seen.append, plugin=plugin)
+    assert list(solution.history) == seen
+    assert len(seen) > 3
+    np.testing.assert_allclose(seen[-1].theta, solution.theta, rtol=1e-2)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_nothing_is_printed(plugin: str, capfd):
+    solve(cube(), CasadiOptions(max_iterations=3), plugin=plugin)
+    assert capfd.readouterr() == ("", "")
+
+
+# Names and options
+
+
+def test_every_plugin_of_casadi_is_offered_or_refused_with_a_reason():
+    missing = []
+    for plugin in PLUGINS | REFUSED:
+        if not ca.has_nlpsol(plugin):
+            missing.append(plugin)
+    # Those that need a library fail to load, but are there.
+    assert set(missing) <= {"ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("casadi:snopt", "not offered: it needs a library, and mostly a licence, that CasADi"),
+        ("casadi:uno", "aborts the process"),
+        ("casadi:ipopt", 'its own method is "interior-point"'),
+        ("casadi:sqpmetod", "did you mean 'casadi:sqpmethod'? expected one of casadi:sqpmethod, "),
+        ("casadi:what", "which CasADi does not have; expected one of casadi:sqpmethod, casadi:sl"),
+    ],
+)
+def test_other_names_are_refused_with_a_reason(name: str, message: str):
+    assert message in (why_not(name) or "")
+    with pytest.raises(InputError, match=f"solver.method: found '{name}'"):
+        solve(cube(), plugin=name.removeprefix("casadi:"))
+
+
+def test_offered_names_are_not_refused():
+    assert [name for name in METHODS if why_not(name)] == []
+
+
+def test_an_unknown_hessian_is_refused():
+    with pytest.raises(InputError, match="no hessian 'bfgs'; available: gauss-newton, exact"):
+        solve(cube(), CasadiOptions("bfgs"), plugin="sqpmethod")  # pyright: ignore
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
+    with pytest.raises(InputError, match=f"{plugin} cannot be set up: .*max_itre"):
+        solve(cube(), CasadiOptions(casadi={"max_itre": 3}), plugin=plugin)
+
+
+# From a problem file
+
+
+def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
+    file = write_problem(tmp_path, {"swing": 4})
+    chosen = ["solver.method=casadi:sqpmethod", "solver.casadi.min_iter=1"]
+    solution = solve_problem(load_problem(file, chosen))
+    assert solution.status.converged
+    assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("casadi:knitro", "solver.method: found 'casadi:knitro', which is not offered: it needs a"),
+        ("casadi:sleq", "solver.method: found 'casadi:sleq', which CasADi does not have; did you"),
+    ],
+)
+def test_a_problem_file_is_told_why_a_solver_is_not_offered(tmp_path, name: str, message: str):
+    file = write_problem(tmp_path, {"swing": 4})
+    with pytest.raises(InputError, match=message):
+        load_problem(file, [f"solver.method={name}"])

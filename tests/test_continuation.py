@@ -1,0 +1,221 @@
+"""Horizon continuation: cutting experiments, warm starts, and answers of the whole problem."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from problem_files import write_problem
+from problems_small import (
+    GUESS,
+    SMALL_EXPERIMENTS,
+    TRUTH,
+    bar_let_go,
+    hung_cube,
+    measured,
+)
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment
+from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.continuation import ContinuationOptions, first_part, first_samples
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.problem import load_problem
+from collocation_sysid.results.solution import Iteration, Solution, Status
+from collocation_sysid.run import solve
+
+SHARES = (0.5, 1.0)
+
+
+def continued(collocation: Collocation, watch=None, shares=SHARES, **stage) -> Solution:
+    options = ContinuationOptions(shares, stage)
+    return METHODS["continuation"].solve(collocation, options, watch)
+
+
+def relative_errors(solution: Solution) -> np.ndarray:
+    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
+
+
+def cube(steps: int = 19) -> Collocation:
+    return Collocation([measured(hung_cube(steps))], GUESS)
+
+
+def blind(experiment: Experiment, samples: int) -> Experiment:
+    """No marker is seen at first."""
+    tracks = experiment.markers.positions_m.copy()
+    tracks[:samples] = np.nan
+    return with_markers(experiment, tracks)
+
+
+# Cutting
+
+
+def test_the_first_samples_keep_everything_but_later_measurements():
+    whole = measured(bar_let_go())
+    cut = first_samples(whole, 6)
+    np.testing.assert_array_equal(cut.t_s, whole.t_s[:6])
+    np.testing.assert_array_equal(cut.markers.t_s, whole.t_s[:6])
+    np.testing.assert_array_equal(cut.markers.positions_m, whole.markers.positions_m[:6])
+    for name in ("name", "body", "grasps", "masses", "forces", "nuisance", "start"):
+        assert getattr(cut, name) is getattr(whole, name)
+    assert len(first_samples(whole, 99).t_s) == len(whole.t_s)
+
+
+def test_samples_are_added_until_a_marker_is_seen():
+    assert len(first_samples(blind(measured(hung_cube()), 7), 3).t_s) == 8
+
+
+def test_a_part_has_the_layout_of_the_whole():
+    whole = Collocation(
+        [measured(hung_cube(19)), measured(bar_let_go(30))],
+        GUESS,
+        "bdf2",
+        substeps=2,
+        explicit_grasps=True,
+        huber=3.0,
+    )
+    part = first_part(whole, 0.5, GUESS)
+    assert [segment.grid_rows for segment in part.segments] == [19, 31]
+    assert (part.scheme, part.substeps, part.huber) == ("bdf2", 2, 3.0)
+    assert all(segment.explicit_grasps for segment in part.segments)
+
+
+# The answer
+
+
+@pytest.mark.parametrize("method", ["reduced-space", "shooting"])
+@pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
+def test_the_true_parameters_are_recovered(experiment: str, method: str):
+    made = measured(SMALL_EXPERIMENTS[experiment](14))
+    collocation = Collocation([made], GUESS)
+    solution = continued(collocation, method=method)
+    assert solution.status is Status.CONVERGED
+    assert solution.collocation is collocation
+    assert np.abs(relative_errors(solution)).max() < 1e-6
+    assert solution.rms_m < 1e-9
+    assert solution.kkt_residual < 1e-8
+
+
+def test_interior_point_goes_on_from_the_positions_of_the_stage_before():
+    collocation = cube()
+    solution = METHODS["continuation"].solve(collocation)
+    assert solution.status.converged
+    assert np.abs(relative_errors(solution)).max() < 1e-4
+    assert solution.max_violation_relative < 1e-6
+    cold = METHODS["interior-point"].solve(collocation)
+    assert solution.notes[-1].startswith("100 % of the samples by interior-point: converged")
+    last_stage = int(solution.notes[-1].split("after ")[1].split()[0])
+    assert last_stage < cold.iterations
+
+
+def test_a_parameter_at_its_bound_stays_there_from_stage_to_stage():
+    items = [replace(item, upper=250.0) if item.name == "mu_pa" else item for item in GUESS.items]
+    bounded = Collocation([measured(hung_cube(19))], Parameters(tuple(items)))
+    solution = continued(bounded, method="reduced-space")
+    assert solution.status.converged
+    assert solution.parameters["mu_pa"] == pytest.approx(250.0, rel=1e-9)
+
+
+def test_the_history_goes_on_over_the_stages_and_the_notes_tell_of_them():
+    seen: list[Iteration] = []
+    solution = continued(cube(), seen.append, (0.4, 0.7, 1.0), method="reduced-space")
+    assert list(solution.history) == seen
+    numbers = [line.number for line in seen]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] <= solution.iterations
+    times = [line.time_s for line in seen]
+    assert times == sorted(times)
+    assert [note.split(":")[0] for note in solution.notes[:3]] == [
+        f"{share} % of the samples by reduced-space" for share in (40, 70, 100)
+    ]
+    assert "mu_pa = 300" in solution.notes[2]
+    timing = solution.timing
+    assert timing.evaluations + timing.linear_algebra + timing.build <= timing.total
+
+
+def test_it_starts_from_given_variables():
+    collocation = cube()
+    answer = METHODS["reduced-space"].solve(collocation)
+    options = ContinuationOptions(SHARES, {"method": "shooting"})
+    solution = METHODS["continuation"].solve(collocation, options, None, answer.z)
+    assert solution.iterations < 4
+
+
+# Other ends
+
+
+def test_an_interruption_of_a_short_stage_is_an_answer_of_the_whole():
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number >= 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    collocation = cube()
+    solution = continued(collocation, interrupt, method="shooting")
+    assert solution.status is Status.INTERRUPTED
+    assert solution.collocation is collocation
+    assert len(solution.notes) == 1
+    assert len(solution.positions_m[0]) == 20
+    assert solution.theta == solution.history[-1].theta
+
+
+def test_what_a_stage_does_not_reach_the_last_one_reports():
+    solution = continued(cube(), method="reduced-space", max_iterations=2)
+    assert solution.status is Status.ITERATION_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("shares", "stage", "message"),
+    [
+        ((0.5, 0.25, 1.0), {}, r"shares are \[0.5, 0.25, 1.0\]; expected numbers above 0 that"),
+        ((0.5,), {}, "ascend to 1"),
+        ((), {}, "ascend to 1"),
+        (SHARES, {"method": "shoting"}, "solver.stage.method: found 'shoting'; expected one of"),
+        (SHARES, {"method": "continuation"}, "found 'continuation'; expected one of"),
+        (SHARES, {"hessia": "exact"}, "'interior-point' has no option 'hessia'; it has hessian,"),
+    ],
+)
+def test_what_does_not_make_sense_is_refused(shares, stage, message):
+    with pytest.raises(InputError, match=message):
+        continued(cube(9), shares=shares, **stage)
+
+
+# From a problem file
+
+
+def test_stages_are_chosen_in_a_problem_file(tmp_path):
+    file = write_problem(tmp_path, {"swing": 16})
+    chosen = [
+        "solver.method=continuation",
+        "solver.shares=[0.5, 1.0]",
+        "solver.stage.method=shooting",
+        "solver.stage.gradient=adjoint",
+        "solver.stage.tolerance=1e-9",
+    ]
+    solution = solve(load_problem(file, chosen))
+    assert solution.status.converged
+    assert solution.method == "continuation"
+    assert [note.split(":")[0] for note in solution.notes[:2]] == [
+        f"{share} % of the samples by shooting" for share in (50, 100)
+    ]
+    assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ("solver.stage.metod=shooting", "solver.stage.metod: unknown key; did you mean method?"),
+        ("solver.stage.method=shoting", "solver.stage.method: found 'shoting'; did you mean"),
+        ("solver.stage.gradient=forward", "'interior-point' has no option 'gradient'"),
+        ("solver.shares=[1.0, 0.5]", "expected numbers above 0 that ascend to 1"),
+    ],
+)
+def test_wrong_stages_of_a_problem_file_are_refused(tmp_path, chosen: str, message: str):
+    file = write_problem(tmp_path, {"swing": 8})
+    with pytest.raises(InputError, match=re.escape(message)):
+        solve(load_problem(file, ["solver.method=continuation", chosen]))

@@ -1,0 +1,257 @@
+"""The penalty method: its merit function, inner solvers, schedules, and what slack they leave."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from checks import assert_derivative
+from problems_small import (
+    GUESS,
+    SMALL_EXPERIMENTS,
+    TRUTH,
+    cube_with_unknowns,
+    hung_cube,
+    measured,
+    released_cube,
+)
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment
+from collocation_sysid.methods.inner import FIRST_ORDER
+from collocation_sysid.methods.merit import Merit, Unconstrained
+from collocation_sysid.methods.penalty import PenaltyOptions, solve
+from collocation_sysid.methods.start import initial_variables
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.results.solution import Iteration, Solution, Status
+
+NEWTON = PenaltyOptions(inner="levenberg-marquardt")
+
+
+@cache
+def collocation_of(name: str, noise_m: float = 0.0, steps: int = 10) -> Collocation:
+    made = measured(SMALL_EXPERIMENTS[name](steps))
+    return Collocation([noisy(made, noise_m)], GUESS)
+
+
+def noisy(experiment: Experiment, noise_m: float) -> Experiment:
+    tracks = experiment.markers.positions_m
+    noise = noise_m * np.random.default_rng(7).normal(size=tracks.shape)
+    return with_markers(experiment, tracks + noise)
+
+
+def errors(solution: Solution) -> np.ndarray:
+    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
+
+
+def disturbed(problem: Unconstrained, rng: np.random.Generator) -> np.ndarray:
+    z, _ = initial_variables(problem.given)
+    return z + np.where(problem.free, 0.01 * rng.standard_normal(len(z)), 0.0)
+
+
+# The merit function
+
+
+@pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
+def test_the_gradient_of_the_merit_is_that_of_differences(name: str, rng):
+    problem = Unconstrained(collocation_of(name))
+    merit = Merit(problem, 30.0, rng.standard_normal(problem.nlp.constraints))
+    z = disturbed(problem, rng)
+    _, gradient = merit.value_and_gradient(z)
+    assert not gradient[~problem.free].any()
+    scale = 0.1 * problem.free
+    assert_derivative(merit.value, lambda d: gradient @ d, z, rng, tolerance=1e-6, scale=scale)
+
+
+def test_grasps_are_paid_for_and_given_starts_are_not():
+    hung, released = (
+        Unconstrained(Collocation([measured(make())], GUESS)) for make in (hung_cube, released_cube)
+    )
+    assert hung.free.all()
+    (start,) = released.nlp.segments
+    assert np.count_nonzero(~released.free) == start.dofs
+    assert hung.nlp.constraints > hung.given.constraints
+
+
+def test_an_inverted_element_costs_infinitely_much():
+    problem = Unconstrained(collocation_of("hung-cube"))
+    merit = Merit(problem, 1.0, np.zeros(problem.nlp.constraints))
+    z, _ = initial_variables(problem.given)
+    q, (x,) = problem.nlp.unpack(z)
+    inverted = problem.nlp.pack(q, [-x])
+    assert np.isfinite(merit.value(z))
+    assert merit.value(inverted) == np.inf
+    assert merit.value_and_gradient(inverted)[0] == np.inf
+
+
+def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
+    problem = Unconstrained(collocation_of("bar-let-go"))
+    answer = problem.grasped(disturbed(problem, rng))
+    rows = problem.nlp.constraint_values(answer).reshape(-1, problem.nlp.segments[0].dofs)
+    (segment,) = problem.nlp.segments
+    assert segment.dynamics.taken is not None
+    np.testing.assert_allclose(rows[:, segment.held_dofs], 0, atol=1e-12)
+    np.testing.assert_allclose(rows[segment.dynamics.taken], 0, atol=1e-12)
+
+
+# The answer
+
+
+@pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
+def test_newton_steps_at_large_rho_find_the_truth(name: str):
+    solution = solve(collocation_of(name), replace(NEWTON, rho=1e5, violation=1e-6))
+    assert solution.status is Status.CONVERGED
+    assert np.abs(errors(solution)).max() < 1e-3
+    assert solution.max_violation_relative < 1e-6
+    assert solution.kkt_residual < 1e-4
+
+
+def test_the_slack_falls_as_one_over_rho_and_the_bias_with_it():
+    collocation = collocation_of("hung-cube", noise_m=1e-4)
+    weights, slacks, thetas = [1e5, 1e6, 1e7, 1e8], [], []
+    start = None
+    for rho in weights:
+        options = replace(NEWTON, schedule="constant", rho=rho, violation=1.0)
+        solution = solve(collocation, options, start=start)
+        assert solution.status is Status.CONVERGED
+        start = solution.z
+        slacks.append(solution.max_violation_n)
+        thetas.append(solution.q)
+    slope = np.polyfit(np.log(weights[1:]), np.log(slacks[1:]), 1)[0]
+    assert slope == pytest.approx(-1.0, abs=0.15)
+    moves = np.abs(np.diff(thetas, axis=0)).max(axis=1)
+    assert (np.diff(moves) < 0).all()
+
+
+@pytest.mark.parametrize("inner", FIRST_ORDER)
+def test_methods_of_first_order_lower_the_merit_and_stay_upright(inner):
+    collocation = collocation_of("hung-cube", 0.0, 5)
+    problem = Unconstrained(collocation)
+    options = PenaltyOptions(inner, "constant", rho=1e3, max_iterations=120)
+    lines: list[Iteration] = []
+    solution = solve(collocation, options, lines.append)
+    merit = Merit(problem, 1e3, np.zeros(problem.nlp.constraints))
+    start, _ = initial_variables(collocation)
+    assert merit.value(solution.z) < 1e-3 * merit.value(start)
+    assert problem.is_upright(solution.z)
+    assert [line.number for line in lines] == sorted({line.number for line in lines})
+    lower, upper = problem.lower, problem.upper
+    assert ((solution.z >= lower) & (solution.z <= upper)).all()
+
+
+def test_conjugate_gradients_lower_the_merit_in_every_step(monkeypatch):
+    values = []
+    from collocation_sysid.methods import inner
+
+    class Following(inner._Follower):
+        def __call__(self, s):
+            values.append(self.scaled.at(s)[1])
+            return super().__call__(s)
+
+    monkeypatch.setattr(inner, "_Follower", Following)
+    collocation = collocation_of("hung-cube", 0.0, 5)
+    solve(collocation, PenaltyOptions(schedule="constant", rho=1e3, max_iterations=150))
+    changes = np.diff(values)
+    assert len(changes) > 50
+    assert (changes <= 1e-6 * np.abs(values[:-1])).all()  # what the approximate conditions allow
+
+
+def test_conjugate_gradients_find_the_truth_in_the_end():
+    collocation = collocation_of("released-cube", 0.0, 6)
+    solution = solve(collocation, PenaltyOptions(rho=1e2, violation=1e-4, max_time_s=60))
+    assert solution.status is Status.CONVERGED
+    assert np.abs(errors(solution)[:2]).max() < 0.05
+
+
+# Schedules, budgets, and what is said
+
+
+def test_slack_left_is_not_convergence():
+    collocation = collocation_of("hung-cube", noise_m=1e-3)
+    solution = solve(collocation, replace(NEWTON, schedule="constant", rho=1e3))
+    assert solution.status is Status.STALLED
+    assert "raise rho_max" in solution.message
+    assert "N (" in solution.message
+    assert "of the largest force) is left" in solution.message
+
+
+@pytest.mark.parametrize("schedule", ["geometric", "progress"])
+def test_rising_schedules_end_within_the_violation(schedule):
+    collocation = collocation_of("hung-cube", noise_m=1e-4)
+    solution = solve(collocation, replace(NEWTON, schedule=schedule, rho=1e4))
+    assert solution.status is Status.CONVERGED
+    assert solution.max_violation_relative <= 1e-3
+    assert solution.history[-1].violation_n == pytest.approx(solution.max_violation_n)
+
+
+def test_budgets_end_it():
+    collocation = collocation_of("hung-cube")
+    few = solve(collocation, PenaltyOptions(max_iterations=7))
+    assert few.status is Status.ITERATION_LIMIT
+    assert few.iterations == 7
+    assert few.history[-1].number <= 7
+    short = solve(collocation, PenaltyOptions(max_time_s=1e-9))
+    assert short.status is Status.TIME_LIMIT
+    stage = solve(collocation, PenaltyOptions(schedule="constant", inner_iterations=5))
+    assert stage.status is Status.ITERATION_LIMIT
+    assert "raise inner_iterations" in stage.message
+
+
+def test_an_interruption_keeps_the_last_and_best_iterate():
+    collocation = collocation_of("hung-cube")
+
+    def interrupt(line: Iteration) -> None:
+        if line.number >= 3:
+            raise KeyboardInterrupt
+
+    solution = solve(collocation, NEWTON, interrupt)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.history[-1].number == 3
+    assert solution.rms_m == pytest.approx(solution.history[-1].rms_m)
+    assert solution.rms_m < 0.01 * solution.history[0].rms_m
+
+
+def test_both_layouts_of_grasps_give_the_same_answer():
+    made = noisy(measured(hung_cube()), 1e-4)
+    bounds, rows = (Collocation([made], GUESS, explicit_grasps=e) for e in (False, True))
+    options = replace(NEWTON, rho=1e6)
+    solution, explicit = solve(bounds, options), solve(rows, options)
+    np.testing.assert_allclose(solution.z, explicit.z, atol=1e-6)
+    assert len(solution.multipliers) == bounds.constraints
+    assert len(explicit.multipliers) == rows.constraints
+    low, high = bounds.bounds()
+    assert ((solution.z >= low) & (solution.z <= high)).all()
+
+
+def test_own_unknowns_may_be_estimated_by_gradients_alone():
+    collocation = Collocation([measured(cube_with_unknowns(5))], GUESS)
+    options = PenaltyOptions("l-bfgs-b", "constant", rho=1e3, max_iterations=60)
+    solution = solve(collocation, options)
+    assert solution.rms_m < 0.1 * solution.history[0].rms_m
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"inner": "simplex"}, "inner = 'simplex'; expected one of cg-descent"),
+        ({"schedule": "slow"}, "schedule = 'slow'; expected one of constant, geometric"),
+        ({"rho": 0.0}, "rho = 0; expected a positive number"),
+        ({"rho_factor": 1.0}, "rho_factor = 1; expected above 1"),
+        ({"rho": 1e9}, r"rho_max = 1e\+08 with rho = 1e\+09; expected rho_max to be no less"),
+        ({"violation": -1.0}, "violation = -1; expected a positive number"),
+    ],
+)
+def test_bad_options_are_refused(options: dict, said: str):
+    with pytest.raises(InputError, match=said):
+        solve(collocation_of("hung-cube"), PenaltyOptions(**options))
+
+
+def test_a_start_with_inverted_elements_is_refused():
+    collocation = collocation_of("hung-cube")
+    z, _ = initial_variables(collocation)
+    q, (x,) = collocation.unpack(z)
+    with pytest.raises(InputError, match="elements are inverted at the start"):
+        solve(collocation, NEWTON, start=collocation.pack(q, [-x]))
