@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -15,9 +15,14 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from .check.motion import motion_of
+from .errors import SimulationError
+from .experiment import Experiment
+from .nlp.schemes import scheme_named
 from .results.estimates import Estimate
+from .results.fields import ElementFields
 from .results.identifiability import verdicts
-from .results.plots import save_plots, solution_plots
+from .results.replay import Replay
 from .results.solution import Solution
 from .results.writers import run_folder, write_frames
 from .rollout import Rollout
@@ -31,7 +36,7 @@ SCHEMA_VERSION = 1
 def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
     """Write the run folder, whole or not at all, and return it.
 
-    ``result.json``, ``problem.toml`` as run, ``trajectory.npz``, PNG plots, and ``frames/`` with
+    ``result.json``, ``problem.toml`` as run, ``trajectory.npz``, pictures, and ``frames/`` with
     ``trajectory.pvd`` for ParaView. With several experiments the arrays' names and the frames'
     folders have the experiment's name in front.
     """
@@ -39,49 +44,90 @@ def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
     with run_folder(folder) as place:
         (place / "problem.toml").write_text(finished.problem.text, encoding="utf-8")
         (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
-        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(finished))
-        rolled_out = {
-            name: rollout.readings_m
-            for name, rollout in finished.rollouts.items()
-            if isinstance(rollout, Rollout)
-        }
-        save_plots(place, solution_plots(solution, rolled_out))
+        seen = replays(finished)
+        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
+        _write_pictures(finished, seen, place)
         if frames:
             _write_all_frames(solution, place)
     return Path(folder)
 
 
+def _write_pictures(finished: Run, seen: Sequence[Replay], place: Path) -> None:
+    # matplotlib takes a while to import, and nothing else needs it.
+    from .results.pictures import Confidence, album, jacobian_sparsity, save_pictures
+
+    solution = finished.solution
+    free = [item.name for item in solution.collocation.parameters.free]
+    found = finished.uncertainty
+    confidence = Confidence.of(found) if found is not None else None
+    pictures = album(seen, solution.history, free, confidence)
+    pictures["jacobian"] = jacobian_sparsity(solution.collocation, solution.z)
+    save_pictures(place, pictures)
+
+
 def _write_all_frames(solution: Solution, place: Path) -> None:
-    segments = solution.collocation.segments
-    for segment, positions in zip(segments, solution.positions_m, strict=True):
+    collocation, theta = solution.collocation, solution.theta
+    segments = collocation.segments
+    for segment, positions, violations in zip(
+        segments, solution.positions_m, collocation.violations_n(solution.z), strict=True
+    ):
         here = place if len(segments) == 1 else place / segment.experiment.name
         here.mkdir(exist_ok=True)
         body = segment.body
-        write_frames(here, segment.dynamics.t_s, positions, body.cells, body.element, body.nodes_m)
+        residual = np.zeros((len(positions), segment.dofs))
+        residual[:, segment.free_dofs] = violations
+        write_frames(
+            here,
+            segment.dynamics.t_s,
+            positions,
+            body.cells,
+            body.element,
+            body.nodes_m,
+            {"residual_force_n": residual.reshape(positions.shape)},
+            fields=ElementFields.of(body, theta.lambda_pa, theta.mu_pa),
+        )
 
 
-def _arrays(finished: Run) -> dict[str, Array]:
-    """Arrays of trajectory.npz at the samples of each fitted experiment."""
+def replays(finished: Run) -> list[Replay]:
+    """The experiments as they are looked at: those fitted, then those for validation."""
     solution = finished.solution
-    segments = solution.collocation.segments
-    arrays = {}
-    for segment, positions, fitted in zip(
-        segments, solution.positions_m, solution.readings_m, strict=True
-    ):
-        experiment = segment.experiment
-        prefix = "" if len(segments) == 1 else f"{experiment.name}/"
-        at_samples = positions[segment.observation.grid_rows]
+    fitted = {
+        segment.experiment.name: (positions[segment.observation.grid_rows], readings)
+        for segment, positions, readings in zip(
+            solution.collocation.segments, solution.positions_m, solution.readings_m, strict=True
+        )
+    }
+    found = []
+    for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
         rollout = finished.rollouts[experiment.name]
-        arrays |= {
-            f"{prefix}t_s": experiment.t_s,
-            f"{prefix}positions_m": at_samples,
-            f"{prefix}markers_m": fitted,
-            f"{prefix}measured_m": experiment.markers.positions_m,
-            f"{prefix}residuals_m": fitted - experiment.markers.positions_m,
-            f"{prefix}marker_names": np.array(experiment.markers.names),
-        }
+        rolled_out = None
         if isinstance(rollout, Rollout):
-            arrays[f"{prefix}rolled_out_m"] = rollout.readings_m
+            rolled_out = rollout.trajectory.positions_m, rollout.readings_m
+        fit = fitted.get(experiment.name)
+        if fit is not None or rolled_out is not None:
+            found.append(Replay.of(experiment, fit, rolled_out, _natural_hz(experiment, solution)))
+    return found
+
+
+def _natural_hz(experiment: Experiment, solution: Solution) -> Array | None:
+    """Natural frequencies with the answer; a method that failed has none worth the search."""
+    if not solution.status.converged:
+        return None
+    scheme = scheme_named(solution.collocation.scheme)
+    try:
+        motion = motion_of(experiment, scheme, experiment.timestep_s, solution.theta)
+    except SimulationError:
+        return None
+    return np.array([mode.frequency_hz for mode in motion.modes])
+
+
+def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
+    """Arrays of trajectory.npz at the samples; a lone fitted experiment has no prefix."""
+    alone = sum(replay.positions_m is not None for replay in seen) == 1
+    arrays = {}
+    for replay in seen:
+        bare = alone and replay.positions_m is not None
+        arrays |= replay.arrays("" if bare else f"{replay.name}/")
     return arrays
 
 
@@ -240,6 +286,8 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
         "autocorrelation": found.dependence.lag1,
         "names": list(found.names),
         "correlation": found.correlation.tolist(),
+        "covariance": found.covariance.tolist(),
+        "quantiles": found.quantiles.tolist(),
         "verdicts": list(verdicts(found)),
         "profiles": {
             profile.parameter: {

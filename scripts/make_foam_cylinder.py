@@ -8,42 +8,32 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-from synthetic import measure, swing
+from synthetic import Swing, measure, unmeasured
 
-from collocation_sysid.experiment import write_markers_csv, write_poses_csv
+from collocation_sysid.experiment import write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.nlp.parameters import Theta
-from collocation_sysid.problem import load_problem
 
 FOLDER = Path(__file__).parents[1] / "problems" / "foam_cylinder"
 TRUTH = Theta(lambda_pa=800.0, mu_pa=600.0, gamma_r_s=0.006, gamma_m_1_s=1.5)
 NOISE_M = 0.0005
+SWING = Swing(
+    duration_s=0.4,
+    amplitude_m=(0.05, 0.04, 0.03),
+    amplitude_rad=(0.35, 0.4, 0.6),
+    frequency_hz=(1.6, 2.0, 2.4),
+    rise_s=0.1,
+)
 # Cameras at 100 Hz; the robot logs its poses at 200 Hz.
-STEPS, STEP_S, POSE_STEP_S, FINE_S = 41, 0.01, 0.005, 0.001
+STEP_S, POSE_STEP_S, FINE_S = 0.01, 0.005, 0.001
 
 
 def main() -> None:
     cylinder_mesh(radius_m=0.03, height_m=0.16, rings=1, layers=11).write(
         FOLDER / "foam_cylinder.vtu"
     )
-
-    def poses(step_s: float):
-        count = round((STEPS - 1) * STEP_S / step_s) + 1
-        return swing(
-            np.arange(count) * step_s,
-            amplitude_m=(0.05, 0.04, 0.03),
-            amplitude_rad=(0.35, 0.4, 0.6),
-            frequency_hz=(1.6, 2.0, 2.4),
-            rise_s=0.1,
-            start=Rotation.from_rotvec([np.pi, 0, 0]),  # it hangs
-        )
-
-    write_poses_csv(FOLDER / "swing_poses.csv", poses(POSE_STEP_S))
-    (FOLDER / "swing_markers.csv").unlink(missing_ok=True)
-    experiment = load_problem(FOLDER / "problem.toml", simulation=True).experiments[0]
-    tracks = measure(experiment, poses(FINE_S), TRUTH, NOISE_M, seed=1)
+    experiment = unmeasured(FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S))
+    tracks = measure(experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1)
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     write_markers_csv(
         FOLDER / "swing_markers.csv",

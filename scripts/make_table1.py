@@ -8,41 +8,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-from synthetic import measure, swing
+from synthetic import Swing, measure, unmeasured
 
-from collocation_sysid.experiment import write_markers_csv, write_poses_csv
+from collocation_sysid.experiment import write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.problem import load_problem
 
 FOLDER = Path(__file__).parents[1] / "problems" / "table1"
 TRUTH = Theta(lambda_pa=200.0, mu_pa=300.0, gamma_r_s=0.009, gamma_m_1_s=1.0)
-STEPS, STEP_S, FINE_S = 100, 0.01, 0.001
+SWING = Swing(
+    duration_s=0.99,
+    amplitude_m=(0.05, 0.04, 0.03),
+    amplitude_rad=(0.1, 0.1, 0.6),
+    frequency_hz=(0.9, 1.1, 1.3),
+    rise_s=0.3,
+)
+STEP_S, FINE_S = 0.01, 0.001
 
 
 def main() -> None:
     cylinder_mesh(radius_m=0.04, height_m=0.16, rings=2, layers=8).write(FOLDER / "cylinder.vtu")
-
-    def poses(step_s: float):
-        count = round((STEPS - 1) * STEP_S / step_s) + 1
-        return swing(
-            np.arange(count) * step_s,
-            amplitude_m=(0.05, 0.04, 0.03),
-            amplitude_rad=(0.1, 0.1, 0.6),
-            frequency_hz=(0.9, 1.1, 1.3),
-            rise_s=0.3,
-            start=Rotation.from_rotvec([np.pi, 0, 0]),  # it hangs
-        )
-
-    write_poses_csv(FOLDER / "poses.csv", poses(STEP_S))
-    for data in ("newmark", "scheme"):
-        (FOLDER / f"{data}_markers.csv").unlink(missing_ok=True)
-    experiment = load_problem(FOLDER / "problem.toml", simulation=True).experiments[0]
+    experiment = unmeasured(FOLDER / "problem.toml", "poses.csv", SWING.poses(STEP_S))
     tracks = {
-        "newmark": measure(experiment, poses(FINE_S), TRUTH, noise_m=0.0, seed=0),
+        "newmark": measure(experiment, SWING.poses(FINE_S), TRUTH, noise_m=0.0, seed=0),
         "scheme": simulate(experiment, TRUTH, "backward-euler").markers_m,
     }
     for data, positions in tracks.items():

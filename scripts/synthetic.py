@@ -1,22 +1,52 @@
-"""Shared by the scripts that make synthetic problems: a swing in all six degrees of freedom."""
+"""Shared by the scripts that make synthetic problems: a body swung by a robot, seen by cameras."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
+from collocation_sysid.experiment import Experiment, Grasp, PoseSequence, write_poses_csv
 from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.problem import load_problem
+
+HANGING = Rotation.from_rotvec([np.pi, 0, 0])
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A motion from rest in all six degrees of freedom, of a body that hangs at first."""
+
+    duration_s: float
+    amplitude_m: Triple
+    amplitude_rad: Triple
+    frequency_hz: Triple
+    rise_s: float
+    start: Rotation = HANGING
+
+    def poses(self, step_s: float) -> PoseSequence:
+        """Poses every `step_s`."""
+        return swing(
+            np.arange(round(self.duration_s / step_s) + 1) * step_s,
+            self.amplitude_m,
+            self.amplitude_rad,
+            self.frequency_hz,
+            self.rise_s,
+            self.start,
+        )
 
 
 def swing(
     t_s: np.ndarray,
-    amplitude_m: tuple[float, float, float],
-    amplitude_rad: tuple[float, float, float],
-    frequency_hz: tuple[float, float, float],
+    amplitude_m: Triple,
+    amplitude_rad: Triple,
+    frequency_hz: Triple,
     rise_s: float,
     start: Rotation,
 ) -> PoseSequence:
@@ -31,6 +61,14 @@ def swing(
     return PoseSequence(np.asarray(t_s), positions, rotations.as_quat())
 
 
+def unmeasured(problem: Path, poses: str, logged: PoseSequence) -> Experiment:
+    """Write the robot's poses, remove old tracks, and load the experiment at the poses' times."""
+    write_poses_csv(problem.parent / poses, logged)
+    for tracks in problem.parent.glob("*_markers.csv"):
+        tracks.unlink()
+    return load_problem(problem, simulation=True).experiments[0]
+
+
 def measure(
     experiment: Experiment, fine: PoseSequence, truth: Theta, noise_m: float, seed: int
 ) -> np.ndarray:
@@ -40,3 +78,20 @@ def measure(
     step_s = float(fine.t_s[1] - fine.t_s[0])
     tracks = simulate(moved, truth, timestep_s=step_s).markers_m
     return tracks + np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
+
+
+def exchanged(tracks: np.ndarray, pair: Sequence[int], frames: slice) -> np.ndarray:
+    """Tracks in which two markers have each other's label for some frames."""
+    swapped = tracks.copy()
+    swapped[frames, list(pair)] = tracks[frames, list(pair)[::-1]]
+    return swapped
+
+
+def occluded(
+    tracks: np.ndarray, blocks: Sequence[tuple[int, slice]], share: float, seed: int
+) -> np.ndarray:
+    """Tracks without some markers' blocks of frames, and without a share of all samples."""
+    lost = np.random.default_rng(seed).random(tracks.shape[:2]) < share
+    for marker, frames in blocks:
+        lost[frames, marker] = True
+    return np.where(lost[..., None], np.nan, tracks)

@@ -163,5 +163,5 @@ def test_it_says_why_it_ended():
     assert minimise(rosenbrock, np.ones(2), OPTIONS).ending == "converged"
     nowhere = minimise(lambda x: (np.inf, x), np.ones(2), OPTIONS)
     assert nowhere.ending == "not-finite"
-    wrong = minimise(lambda x: (x @ x, -2 * x), np.ones(2), OPTIONS)
+    wrong = minimise(lambda x: (float(x @ x), -2 * x), np.ones(2), OPTIONS)
     assert wrong.ending == "line-search"

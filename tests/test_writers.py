@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.results.fields import ElementFields
 from collocation_sysid.results.writers import run_folder, write_frames, write_pvd, write_vtu
 
 MESH = box_mesh((0.1, 0.2, 0.3), (1, 2, 1))
@@ -48,9 +50,20 @@ def test_quadratic_tetrahedra_keep_their_type(tmp_path, rng):
     np.testing.assert_array_equal(meshio.read(tmp_path / "a.vtu").cells_dict["tetra10"], cells)
 
 
-def test_point_data_of_another_length_is_refused(tmp_path):
-    with pytest.raises(InputError, match="'speed' has shape"):
-        write_vtu(tmp_path / "a.vtu", MESH.points_m, MESH.tetrahedra, "tetra", {"speed": [1, 2]})
+def test_cell_data_belong_to_the_elements(tmp_path, rng):
+    data = {"stress_pa": rng.normal(size=len(MESH.tetrahedra)).astype(np.float32)}
+    data["flow"] = rng.normal(size=(len(MESH.tetrahedra), 3))
+    write_vtu(tmp_path / "a.vtu", MESH.points_m, MESH.tetrahedra, "tetra", cell_data=data)
+    read = meshio.read(tmp_path / "a.vtu")
+    for name, values in data.items():
+        np.testing.assert_array_equal(read.cell_data[name][0], values)
+
+
+@pytest.mark.parametrize("where", ["point", "cell"])
+def test_data_of_another_length_are_refused(tmp_path, where):
+    data = {f"{where}_data": {"speed": [1, 2]}}
+    with pytest.raises(InputError, match=f"{where} data 'speed' has shape"):
+        write_vtu(tmp_path / "a.vtu", MESH.points_m, MESH.tetrahedra, "tetra", **data)
     assert not (tmp_path / "a.vtu").exists()
 
 
@@ -87,6 +100,20 @@ def test_long_trajectories_are_thinned_evenly(tmp_path):
     )
     np.testing.assert_allclose([time for time, _ in frames_of(listing)], t_s[::3])
     assert len(list((tmp_path / "frames").iterdir())) == 9
+
+
+def test_frames_hold_what_the_material_feels(tmp_path):
+    body = Body(MESH, density_kg_m3=30.0)
+    fields = ElementFields.of(body, 200.0, 300.0)
+    stretch = np.linspace(1.0, 1.2, 3)[:, None, None]
+    listing = write_frames(
+        tmp_path, [0, 1, 2], stretch * MESH.points_m, body.cells, TET4, MESH.points_m, fields=fields
+    )
+    read = [meshio.read(file).cell_data for _, file in frames_of(listing)]
+    assert set(read[0]) == {"det_f", "energy_density_j_m3", "von_mises_pa"}
+    volumes = [cells["det_f"][0].mean() for cells in read]
+    np.testing.assert_allclose(volumes, [1.0, 1.1**3, 1.2**3])
+    assert read[0]["energy_density_j_m3"][0].max() < 1e-12 < read[2]["energy_density_j_m3"][0].min()
 
 
 def test_frames_follow_the_element(tmp_path):

@@ -17,7 +17,7 @@ from scipy.optimize import Bounds, OptimizeResult
 from scipy.optimize import minimize as scipy_minimise
 
 from ..errors import InputError
-from .cg_descent import CgDescentOptions, CgState
+from .cg_descent import CgDescentOptions
 from .cg_descent import minimise as cg_descent
 from .levenberg_marquardt import minimise as levenberg_marquardt
 from .merit import Merit
@@ -86,7 +86,7 @@ def minimise(
             scaled.value_and_gradient,
             scaled.start,
             options,
-            lambda state: state.iteration > 0 and follow(_of(state)),
+            lambda state: state.iteration > 0 and follow(state.x),
             scaled.value,
         )
         return follow.converged
@@ -109,10 +109,6 @@ def minimise(
         options=settings,
     )
     return follow.converged
-
-
-def _of(state: CgState) -> Array:
-    return state.x
 
 
 class _Follower:

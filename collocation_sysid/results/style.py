@@ -21,10 +21,13 @@ VERMILION = "#D55E00"
 PURPLE = "#CC79A7"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
-TEXT_PT = 7.5
-SMALL_PT = 6.5
+# What is read in a journal's column of 85 mm, or over the whole page, without being scaled.
+TEXT_PT = 8.0
+SMALL_PT = 7.0
 LINE_PT = 1.1
-PAGE_MM = 180.0
+COLUMN_MM = 85.0
+PAGE_MM = 178.0
+RESOLUTION_DPI = 200
 
 # Symbol and unit of every parameter.
 SYMBOLS = {
@@ -43,6 +46,25 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
     """An empty figure that arranges itself."""
     figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr]
+    return figure
+
+
+def framed_figure(
+    width_mm: float,
+    height_mm: float,
+    left_mm: float,
+    right_mm: float,
+    foot_mm: float,
+    top_mm: float,
+) -> Figure:
+    """An empty figure with margins around its axes; it draws in half the time of a `new_figure`."""
+    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure.subplots_adjust(
+        left_mm / width_mm,
+        foot_mm / height_mm,
+        1 - right_mm / width_mm,
+        1 - top_mm / height_mm,
+    )
     return figure
 
 
@@ -68,6 +90,15 @@ def legend(axes: Axes, title: str = "") -> None:
     box.get_frame().set(edgecolor="none", facecolor="white")
 
 
+def legend_above(axes: Axes, columns: int) -> None:
+    """A legend over the axes, where it hides nothing."""
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize=SMALL_PT,
+        frameon=False, borderaxespad=0.1, borderpad=0.1, columnspacing=1.2, handlelength=1.6,
+        labelspacing=0.2,
+    )  # fmt: skip
+
+
 def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     """Make the y axis logarithmic, with plain numbers where they are short.
 
@@ -78,7 +109,8 @@ def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     widen = max(1.0, least_ratio / (high / low)) ** 0.5
     axes.set_ylim(low / widen, high * widen)
     few = high / low < 1e3
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
+    subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10 else (1.0, 2.0, 5.0)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
     if few and low > 1e-3 and high < 1e5:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..fem.elements import Element
+from .fields import ElementFields
+from .replay import RESULT_FILE
 
 Array = NDArray[np.float64]
 
@@ -23,8 +25,6 @@ Array = NDArray[np.float64]
 VTK_CELL_TYPES = {"tetra": 10, "tetra10": 24}
 VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 MAX_FRAMES = 200
-# What tells a run folder from any other.
-RESULT_FILE = "result.json"
 
 
 # Frames ---------------------------------------------------------------------------------------
@@ -36,6 +36,7 @@ def write_vtu(
     cells: ArrayLike,
     meshio_type: str,
     point_data: Mapping[str, ArrayLike] | None = None,
+    cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
     """Write an unstructured grid of one cell type as VTK XML with base64 data.
 
@@ -46,11 +47,12 @@ def write_vtu(
     cells : (E, nodes per cell) node numbers
     meshio_type : {"tetra", "tetra10"}
     point_data : mapping of name to (n,) or (n, k) numbers
+    cell_data : mapping of name to (E,) or (E, k) numbers
 
     Raises
     ------
     InputError
-        For an unknown cell type, or point data of another length.
+        For an unknown cell type, or data of another length.
     """
     if meshio_type not in VTK_CELL_TYPES:
         raise InputError(
@@ -60,18 +62,9 @@ def write_vtu(
     nodes = np.asarray(cells, dtype=np.int64)
     offsets = nodes.shape[1] * np.arange(1, len(nodes) + 1)
     types = np.full(len(nodes), VTK_CELL_TYPES[meshio_type], dtype=np.uint8)
-    data = []
-    for name, values in (point_data or {}).items():
-        array = np.asarray(values)
-        if array.ndim not in (1, 2) or len(array) != len(points):
-            raise InputError(
-                f"point data '{name}' has shape {array.shape}, expected one row for each of "
-                f"{len(points)} points",
-                path,
-            )
-        data.append(_data_array(name, array))
     sections = (
-        ("PointData", data),
+        ("PointData", _data_arrays("point", point_data or {}, len(points), path)),
+        ("CellData", _data_arrays("cell", cell_data or {}, len(nodes), path)),
         ("Points", [_data_array("Points", points)]),
         (
             "Cells",
@@ -91,6 +84,20 @@ def write_vtu(
         f"{body}</Piece>\n</UnstructuredGrid>\n</VTKFile>\n",
         encoding="utf-8",
     )
+
+
+def _data_arrays(
+    kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
+) -> list[str]:
+    arrays = {name: np.asarray(values) for name, values in data.items()}
+    for name, array in arrays.items():
+        if array.ndim not in (1, 2) or len(array) != count:
+            raise InputError(
+                f"{kind} data '{name}' has shape {array.shape}, expected one row for each of "
+                f"{count} {kind}s",
+                path,
+            )
+    return [_data_array(name, array) for name, array in arrays.items()]
 
 
 def _data_array(name: str, values: NDArray) -> str:
@@ -132,11 +139,12 @@ def write_frames(
     undeformed_m: ArrayLike,
     point_series: Mapping[str, ArrayLike] | None = None,
     max_frames: int = MAX_FRAMES,
+    fields: ElementFields | None = None,
 ) -> Path:
     """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
 
-    Every frame has `displacement_m` and `velocity_m_s`. Of more than `max_frames` samples every
-    second, third, … is written.
+    Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
+    cells. Of more than `max_frames` samples every second, third, … is written.
 
     Parameters
     ----------
@@ -148,6 +156,7 @@ def write_frames(
     element : Element
     undeformed_m : (n, 3)
     point_series : mapping of name to (T, n) or (T, n, k) numbers
+    fields : ElementFields, optional
     """
     times, positions = np.asarray(t_s, dtype=float), np.asarray(positions_m, dtype=float)
     velocities = np.gradient(positions, times, axis=0, edge_order=1)
@@ -162,7 +171,8 @@ def write_frames(
             "velocity_m_s": velocities[k],
             **{name: values[k] for name, values in series.items()},
         }
-        write_vtu(file, positions[k], cells, element.meshio_type, data)
+        in_cells = {n: v[0] for n, v in fields.at(positions[k]).items()} if fields else {}
+        write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
         written.append((float(times[k]), file))
     listing = Path(folder) / "trajectory.pvd"
     write_pvd(listing, written)

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from ..nlp.collocation import Collocation
-from .style import PAGE_MM, SMALL_PT, SYMBOLS, dress, new_figure
+from ...nlp.collocation import Collocation
+from ..style import PAGE_MM, SMALL_PT, SYMBOLS, dress, framed_figure
 
 Array = NDArray[np.float64]
 
@@ -46,8 +46,10 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     largest = float(np.nan_to_num(matrix.data).max(initial=1e-300))
     norm = LogNorm(largest * 10.0**-DECADES, largest, clip=True)
 
-    figure = new_figure(PAGE_MM, 88)
-    left, middle, right = figure.subplots(1, 3, width_ratios=(0.05 * max(1, nq), 1, 0.9))
+    figure = framed_figure(PAGE_MM, 88, 12, 13, 10.5, 6)
+    widths = (0.05 * max(1, nq), 1, 0.2, 0.95, 0.01, 0.03)
+    grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
+    left, middle, right, beside = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
     if nq:
         _draw(left, matrix[:, :nq], norm)
     _draw(middle, band, norm)
@@ -66,9 +68,10 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     for axes in (left, middle, right):
         axes.grid(False)
         axes.spines[:].set_visible(True)
-    bar = figure.colorbar(image, ax=right, shrink=0.6, pad=0.02)
+    bar = figure.colorbar(image, cax=beside)
     bar.set_label("|entry|, scaled", fontsize=SMALL_PT)
-    bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
+    bar.ax.tick_params(which="both", labelsize=SMALL_PT, width=0.6)
+    bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     return figure
 
 

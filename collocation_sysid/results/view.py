@@ -1,0 +1,169 @@
+"""A run in an interactive window, through pyvista: turn it, step through time, colour by a field.
+
+The fields are those of the run's frames for ParaView.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from .animation import chosen
+from .page import write_page
+from .pictures.camera import Camera
+from .replay import Replay, read_run
+from .style import BLACK, VERMILION
+
+FRAMES_FILE = "trajectory.pvd"
+WINDOW = (1100, 800)
+FIELD = "von_mises_pa"
+
+
+def export_page(run: str | Path, file: str | Path, experiment: str | None = None) -> Path:
+    """Write an experiment of a run as a stand-alone web page; needs no pyvista.
+
+    Raises
+    ------
+    InputError
+        If `run` is not a run folder, or has no such experiment.
+    """
+    _, replays = read_run(run)
+    return write_page(chosen(replays, experiment, run), file)
+
+
+def view(
+    run: str | Path,
+    field: str = FIELD,
+    experiment: str | None = None,
+    screenshot: str | Path | None = None,
+) -> None:
+    """Show an experiment of a run in a window, and return when that is closed.
+
+    Parameters
+    ----------
+    run : str or Path
+    field : str
+        Which of the frames' point or cell data colours the body.
+    experiment : str, optional
+        By default the first.
+    screenshot : str or Path, optional
+        Draw the middle of the motion into this file instead, without a window.
+
+    Raises
+    ------
+    InputError
+        If pyvista is missing, `run` is not a run folder or has no frames, no such experiment, or
+        no such field.
+    """
+    if find_spec("pyvista") is None:
+        raise InputError(
+            "the 3-D view needs pyvista: pip install 'collocation-sysid[view]', or write a web "
+            "page with --html, which needs nothing"
+        )
+    _, replays = read_run(run)
+    replay = chosen(replays, experiment, run)
+    frames = frame_files(Path(run), replay.name)
+    scene = _Scene(frames, field, replay, off_screen=screenshot is not None)
+    if screenshot is None:
+        scene.plotter.show()
+    else:
+        scene.show(frames[len(frames) // 2][0])
+        scene.plotter.screenshot(str(screenshot))
+        scene.plotter.close()
+
+
+def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
+    """Times and files of an experiment's frames.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    listings = (run / experiment / FRAMES_FILE, run / FRAMES_FILE)
+    listing = next((each for each in listings if each.is_file()), None)
+    if listing is None:
+        raise InputError(
+            f"experiment '{experiment}' of this run has no {FRAMES_FILE}: only fitted experiments "
+            "have frames; use --html to look at others",
+            run,
+        )
+    sets = ElementTree.parse(listing).getroot().iter("DataSet")
+    return [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
+
+
+class _Scene:
+    """The window: the body of one frame with the markers measured nearest to its time."""
+
+    def __init__(
+        self, frames: list[tuple[float, Path]], field: str, replay: Replay, off_screen: bool
+    ) -> None:
+        pv: Any = import_module("pyvista")
+        self.pv, self.replay, self.field = pv, replay, field
+        self.times = np.array([time for time, _ in frames])
+        self.meshes: list[Any] = [pv.read(file) for _, file in frames]
+        known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
+        if field not in known:
+            raise InputError(
+                f"found {field!r}; expected one of {', '.join(known)}", None, "--field"
+            )
+        self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW))
+        self.plotter.set_background("white")
+        self.range = self._range()
+        self.plotter.add_axes(color="black")
+        self.show(self.times[0])
+        positions = np.array([mesh.points for mesh in self.meshes])
+        self.plotter.view_vector(Camera.facing(positions, replay.up).axes[2], viewup=replay.up)
+        self._fit()
+        if not off_screen:
+            self.plotter.add_slider_widget(
+                self.show, (self.times[0], self.times[-1]), title="time [s]", color=BLACK,
+                pointa=(0.3, 0.08), pointb=(0.7, 0.08), interaction_event="always",
+            )  # fmt: skip
+
+    def _range(self) -> tuple[float, float]:
+        """Limits of the colours, the same for all frames."""
+        values = [self._values(mesh) for mesh in self.meshes]
+        return min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
+
+    def _values(self, mesh: Any) -> np.ndarray:
+        values = np.asarray(mesh[self.field])
+        return np.linalg.norm(values, axis=1) if values.ndim == 2 else values
+
+    def _fit(self) -> None:
+        """Let the camera see all of the motion."""
+        bounds = np.array([mesh.bounds for mesh in self.meshes])
+        whole = np.empty(6)
+        whole[::2], whole[1::2] = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
+        self.plotter.reset_camera(bounds=whole)
+        self.plotter.camera.zoom(1.4)  # the box is seen through its sphere
+
+    def show(self, time_s: float) -> None:
+        """Show the frame nearest to a time."""
+        mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
+        sample = int(np.abs(self.replay.t_s - time_s).argmin())
+        bar = {"title": self.field, "color": "black", "vertical": True, "fmt": "%.3g"}
+        bar |= {"title_font_size": 16, "label_font_size": 16, "position_x": 0.86}
+        self.plotter.add_mesh(
+            mesh, scalars=self.field, clim=self.range, cmap="cividis", show_edges=True, name="body",
+            edge_color="#5A6B7B", line_width=1, scalar_bar_args=bar, reset_camera=False,
+            ambient=0.45, diffuse=0.6,
+        )  # fmt: skip
+        balls = {"render_points_as_spheres": True, "point_size": 12, "reset_camera": False}
+        measured = self.replay.measured_m[sample]
+        measured = measured[np.isfinite(measured).all(axis=1)]
+        if len(measured):
+            self.plotter.add_mesh(
+                self.pv.PolyData(measured), color=VERMILION, name="measured", **balls
+            )
+        shapes = self.replay.shapes_m
+        held = np.flatnonzero(self.replay.held[sample])
+        if shapes is not None and len(held):
+            nodes = self.pv.PolyData(np.asarray(shapes[sample][held], dtype=float))
+            self.plotter.add_mesh(nodes, color=BLACK, name="grasped", **{**balls, "point_size": 8})

@@ -1,0 +1,241 @@
+"""What the measured beam says: the joint fit, refinement, cross-validation, and Poisson's ratio.
+
+The problem is problems/srl_beam/problem.toml; every part changes a few of its keys and solves it
+again in the reduced space.
+
+    python scripts/study_srl_beam.py --from FOLDER                        # all, some minutes
+    python scripts/study_srl_beam.py --from FOLDER --parts joint poisson
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from get_srl_beam import FOLDER, ORIGIN_M, SIZE_M
+from numpy.typing import NDArray
+
+from collocation_sysid import Collocation, Problem, Solution, load_problem, solve
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods import METHODS
+from collocation_sysid.nlp.segment import Segment
+from collocation_sysid.results.diagnostics import diagnose
+from collocation_sysid.results.estimates import Estimate
+from collocation_sysid.results.identifiability import verdicts
+from collocation_sysid.results.linearised import LinearisedFit, linearised_fit
+from collocation_sysid.results.uncertainty import Uncertainty, uncertainty_of
+
+TRIALS = ("gravity", "load52", "load101")
+# Element and bricks along x, y and z.
+MESHES = (
+    ("tet4", (5, 2, 2)),
+    ("tet4", (10, 4, 4)),
+    ("tet10", (3, 1, 1)),
+    ("tet10", (5, 2, 2)),
+    ("tet10", (8, 3, 3)),
+)
+SUBSTEPS = (1, 2, 4)
+SCHEMES = ("midpoint", "bdf2", "backward-euler")
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A solved problem with its error bars."""
+
+    solution: Solution
+    linearised: LinearisedFit
+    uncertainty: Uncertainty
+
+
+def main() -> None:
+    parts = {"joint": joint, "refinement": refinement, "validation": validation, "poisson": poisson}
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--from", dest="source", type=Path, default=FOLDER, help="the recordings")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
+    arguments = parser.parse_args()
+    for part in arguments.parts:
+        print(f"\n== {part} ==\n", flush=True)
+        parts[part](arguments.source.resolve())
+
+
+def load(source: Path, *overrides: str) -> Problem:
+    """The shipped problem with the recordings of a folder, and other values for some keys."""
+    files = [f"experiment.{t}.markers.file={source / f'beam_{t}_V2_a.c3d'}" for t in TRIALS]
+    return load_problem(FOLDER / "problem.toml", [*files, *overrides])
+
+
+@cache
+def shipped(source: Path) -> Solution:
+    """The problem as it is shipped, solved from its own guess."""
+    return solve(load(source))
+
+
+def fit(problem: Problem, solution: Solution | None = None) -> Fit:
+    """Solve a problem, where that is not done yet, and find the error bars."""
+    solution = solution or solve(problem)
+    if not solution.status.converged:
+        print(f"NOT CONVERGED: {solution.message}")
+    linearised = linearised_fit(solution.collocation, solution.z)
+    return Fit(solution, linearised, uncertainty_of(linearised, problem.parameters, solution.q))
+
+
+# Parts ----------------------------------------------------------------------------------------
+
+
+def joint(source: Path) -> None:
+    """One material for the three trials, and everything the report has to say of it."""
+    found = fit(load(source), shipped(source))
+    solution, uncertainty = found.solution, found.uncertainty
+    print(f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s")
+    print(f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)")
+    for name, estimate in uncertainty.estimates.items():
+        print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
+    print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
+    print("\nown unknowns, and their standard deviations")
+    for segment, phi in unknowns(solution):
+        local = segment.local
+        for name, value, scale in zip(local.names, phi, local.scales, strict=True):
+            deviation = uncertainty.local[name] * scale
+            print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
+    print(f"\nRMS distance [mm]: {rms_line(solution)}")
+    said = dict.fromkeys((*solution.notes, *uncertainty.notes, *verdicts(uncertainty)))
+    sentences = [diagnosis.sentence for diagnosis in diagnose(found.linearised)]
+    print("\n" + "\n".join(f"- {sentence}" for sentence in (*said, *sentences)))
+
+
+def refinement(source: Path) -> None:
+    """The same fit on other meshes, other steps, and with other schemes."""
+    print(f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]")
+    near = guesses(shipped(source))
+    for substeps in SUBSTEPS:
+        for scheme in SCHEMES:
+            steps = f"transcription.substeps={substeps}"
+            here = load(source, *near, f"transcription.scheme={scheme}", steps)
+            report(f"{scheme}, {10 / substeps:g} ms", fit(here))
+    with tempfile.TemporaryDirectory() as folder:
+        for element, divisions in MESHES:
+            mesh = Path(folder) / "beam.vtu"
+            box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
+            here = load(source, *near, f"object.mesh={mesh}", f"object.element={element}")
+            bricks = " x ".join(map(str, divisions))
+            report(f"{element} {bricks}, {len(here.body.nodes_m)} nodes", fit(here))
+
+
+def validation(source: Path) -> None:
+    """Each trial predicted with the material of the other two."""
+    print(f"{'predicted':12}{'E [kPa]':>9}{'γ_r [ms]':>10}{'γ_m [1/s]':>11}", end="")
+    print(f"{'RMS [mm] with own unknowns':>30}{'without':>10}{'fitted':>9}")
+    together = shipped(source)
+    all_three = dict(zip(TRIALS, rms_mm(together), strict=True))
+    for trial in TRIALS:
+        problem = load(source, *guesses(together), f"experiment.{trial}.validation=true")
+        solution = solve(problem)
+        with_own, without = predicted_rms_mm(problem, trial, solution)
+        print(f"{trial:12}{material(solution)}", end="")
+        print(f"{with_own:30.3f}{without:10.3f}{all_three[trial]:9.3f}", flush=True)
+
+
+def poisson(source: Path) -> None:
+    """Poisson's ratio estimated too, and fixed at other values."""
+    near = guesses(shipped(source))
+    free = "parameters.poisson={ guess = 0.45, lower = 0.05, upper = 0.495 }"
+    found = fit(load(source, *near, free))
+    report("estimated", found)
+    ratio = found.uncertainty.estimates["poisson"]
+    print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
+    said = dict.fromkeys((*found.uncertainty.notes, *verdicts(found.uncertainty)))
+    print("\n".join(f"- {sentence}" for sentence in said))
+    for value in (0.3, 0.4, 0.45, 0.48, 0.49):
+        here = fit(load(source, *near, f"parameters.poisson={{ fixed = {value} }}"))
+        report(f"fixed at {value}", here)
+
+
+def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
+    """RMS distance of a trial at a solution's material: its own unknowns fitted, and all zero."""
+    experiment = next(e for e in problem.experiments if e.name == trial)
+    fixed = tuple(
+        replace(item, guess=solution.parameters[item.name], fixed=True)
+        for item in problem.parameters.items
+    )
+    collocation = Collocation(
+        [replace(experiment, validation=False)],
+        replace(problem.parameters, items=fixed),
+        solution.collocation.scheme,
+        solution.collocation.substeps,
+    )
+    predicted = METHODS["reduced-space"].solve(collocation)
+    ((segment, phi),) = unknowns(predicted)
+    (x,) = predicted.positions_m
+    return rms_of(segment, x, phi), rms_of(segment, x, np.zeros_like(phi))
+
+
+# Tables ---------------------------------------------------------------------------------------
+
+
+def report(label: str, found: Fit) -> None:
+    young = found.uncertainty.estimates["young_pa"]
+    low, high = young.ci95 or (np.nan, np.nan)
+    theta = found.solution.theta
+    print(
+        f"{label:34}{1e-3 * young.value:8.1f}  {1e-3 * low:.1f} to {1e-3 * high:.1f}"
+        f"{1e3 * theta.gamma_r_s:12.2f}{theta.gamma_m_1_s:11.2f}  {rms_line(found.solution)}",
+        flush=True,
+    )
+
+
+def material(solution: Solution) -> str:
+    theta = solution.theta
+    return f"{1e-3 * theta.young_pa:9.1f}{1e3 * theta.gamma_r_s:10.2f}{theta.gamma_m_1_s:11.2f}"
+
+
+def interval(estimate: Estimate) -> str:
+    if estimate.ci95 is None:
+        return estimate.reason or "fixed"
+    low, high = estimate.ci95
+    reason = f" ({estimate.reason})" if estimate.reason else ""
+    return f"{low:.4g} to {high:.4g}{reason}"
+
+
+def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
+    rows = (
+        f"{name:14}" + "".join(f"{value:13.3f}" for value in row)
+        for name, row in zip(names, values, strict=True)
+    )
+    return "\n".join([" " * 14 + "".join(f"{name:>13}" for name in names), *rows])
+
+
+def guesses(solution: Solution) -> list[str]:
+    """Overrides that start from an answer."""
+    free = {item.name for item in solution.collocation.parameters.free}
+    values = solution.parameters
+    return [f"parameters.{name}.guess={values[name]:.6g}" for name in values if name in free]
+
+
+def unknowns(solution: Solution) -> list[tuple[Segment, NDArray[np.float64]]]:
+    collocation = solution.collocation
+    return list(zip(collocation.segments, collocation.unpack_own(solution.z), strict=True))
+
+
+def rms_mm(solution: Solution) -> list[float]:
+    parts = zip(unknowns(solution), solution.positions_m, strict=True)
+    return [rms_of(segment, x, phi) for (segment, phi), x in parts]
+
+
+def rms_of(segment: Segment, x: NDArray[np.float64], phi: NDArray[np.float64]) -> float:
+    squares = segment.observation.squared_distances_m2(x.reshape(len(x), -1), phi)
+    return 1e3 * float(np.sqrt(squares.mean()))
+
+
+def rms_line(solution: Solution) -> str:
+    return " / ".join(f"{rms:.3f}" for rms in rms_mm(solution))
+
+
+if __name__ == "__main__":
+    main()

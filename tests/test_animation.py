@@ -1,0 +1,203 @@
+"""Films, the web page and the 3-D view of a run, from its files."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from base64 import b64decode
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from problem_files import TRUTH, run_command, settings, write_problem
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.results import animation
+from collocation_sysid.results.animation import Film, animate, film_samples
+from collocation_sysid.results.replay import read_run
+from collocation_sysid.results.view import frame_files, view
+
+NODES = 36
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run of a fitted experiment and one for validation, solved at the truth."""
+    folder = tmp_path_factory.mktemp("seen")
+    file = write_problem(folder, {"swing": 8, "nod": 6}, validation="nod")
+    at_truth = settings(*(f"parameters.{name}={{fixed={value}}}" for name, value in TRUTH.items()))
+    reduced = settings("solver.method=reduced-space")
+    outcome = run_command("solve", file, *reduced, *at_truth, "-q", "--out", folder / "run")
+    assert outcome.code == 0, outcome.err
+    return folder / "run"
+
+
+def frames_in(file: Path) -> list[np.ndarray]:
+    with Image.open(file) as film:
+        frames = []
+        for number in range(getattr(film, "n_frames", 1)):
+            film.seek(number)
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+        return frames
+
+
+# What is stored
+
+
+def test_a_run_stores_what_is_needed_to_look_at_it(run):
+    _, (swing, nod) = read_run(run)
+    assert (swing.name, nod.name) == ("swing", "nod")
+    assert swing.positions_m.shape == swing.rolled_out_positions_m.shape == (9, NODES, 3)
+    assert swing.rolled_out_positions_m.dtype == np.float32
+    np.testing.assert_allclose(swing.rolled_out_positions_m, swing.positions_m, atol=1e-6)
+    assert nod.positions_m is None
+    assert nod.rolled_out_positions_m.shape == (7, NODES, 3)
+    assert swing.surface.max() < NODES
+    assert swing.held.sum(axis=1).tolist() == [9] * 9
+    assert (np.diff(swing.natural_hz) >= 0).all()
+    np.testing.assert_allclose(swing.up, [0, 0, 1])
+
+
+# Films
+
+
+def test_a_film_has_its_length_and_moves(run, tmp_path):
+    file = animate(run, tmp_path / "deep" / "film.gif", fps=20, slow=2)
+    frames = frames_in(file)
+    assert len(frames) == 4  # 0.08 s, twice as long, 20 a second
+    assert np.abs(frames[-1] - frames[0]).max() > 100
+    with Image.open(file) as film:
+        assert film.info["duration"] == 50
+
+
+def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    outcome = run_command("animate", copy, "--experiment", "nod", "--fps", "50")
+    assert outcome.out.strip() == str(copy / "nod.gif")
+    assert len(frames_in(copy / "nod.gif")) == 4
+
+
+def test_fitted_and_rolled_out_stand_side_by_side(run):
+    _, (swing, nod) = read_run(run)
+    assert [name for name, *_ in Film(swing).panels] == ["fitted", "rolled out"]
+    assert [name for name, *_ in Film(nod).panels] == ["rolled out"]
+
+
+def test_the_film_says_how_far_the_markers_are_off(run):
+    _, (swing, _) = read_run(run)
+    film = Film(swing)
+    film.show(8)
+    *_, title = film.panels[0]
+    assert title.get_text() == "fitted: 0.00 mm"
+    assert film.clock.get_text() == "0.08 s"
+
+
+def test_frames_show_the_nearest_samples():
+    times = 0.01 * np.arange(11)
+    assert film_samples(times, 100.0, 1.0).tolist() == list(range(11))
+    assert film_samples(times, 25.0, 1.0).tolist() == [0, 4, 8]
+    assert film_samples(times, 100.0, 2.0).tolist()[:5] == [0, 0, 1, 2, 2]
+
+
+@pytest.mark.skipif(not find_spec("imageio_ffmpeg"), reason="needs imageio-ffmpeg")
+def test_mp4_is_written_where_ffmpeg_is(run, tmp_path):
+    file = animate(run, tmp_path / "film.mp4")
+    assert file.read_bytes()[4:8] == b"ftyp"
+
+
+def test_without_ffmpeg_the_remedy_is_named(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(animation.shutil, "which", lambda name: None)
+    monkeypatch.setattr(animation, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'collocation-sysid\[film\]'.*\.gif"):
+        animate(run, tmp_path / "film.mp4")
+    assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--to", "film.avi"], "found '.avi'; expected .mp4 or .gif"),
+        (["--fps", "0"], "--fps: found 0"),
+        (["--slow", "-1"], "--slow: found -1"),
+        (["--slow", "1e6"], "lower --fps or --slow"),
+        (["--experiment", "jump"], "found 'jump'; expected one of swing, nod"),
+    ],
+)
+def test_a_film_that_cannot_be_is_refused(run, arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = run_command("animate", run, *arguments)
+    assert outcome.code == 2
+    assert said in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", [["animate"], ["view", "--html", "a.html"], ["plot"]])
+def test_other_folders_are_refused(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = run_command(command[0], tmp_path, *command[1:])
+    assert (outcome.code, "not a run folder" in outcome.err) == (2, True)
+
+
+# The web page
+
+
+def content(page: Path) -> dict:
+    text = re.search(r"const DATA = (\{.*\});", page.read_text(encoding="utf-8"))
+    assert text is not None
+    return json.loads(text[1])
+
+
+def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
+    outcome = run_command("view", run, "--html", tmp_path / "page.html")
+    assert outcome.out.strip() == str(tmp_path / "page.html")
+    assert "http" not in (tmp_path / "page.html").read_text(encoding="utf-8")
+    data, (_, (swing, _)) = content(tmp_path / "page.html"), read_run(run)
+    outer = np.unique(swing.surface)
+    for name, positions in (
+        ("fitted", swing.positions_m),
+        ("rolled out", swing.rolled_out_positions_m),
+    ):
+        shapes = np.frombuffer(b64decode(data["shapes"][name]), "<f4").reshape(9, -1, 3)
+        np.testing.assert_allclose(shapes, positions[:, outer], atol=1e-6)
+    faces = np.frombuffer(b64decode(data["faces"]), "<i4").reshape(-1, 3)
+    np.testing.assert_array_equal(outer[faces], swing.surface)
+
+
+@pytest.mark.skipif(not shutil.which("node"), reason="needs node")
+def test_the_page_has_no_syntax_error(run, tmp_path):
+    run_command("view", run, "--html", tmp_path / "page.html")
+    script = re.search(r"<script>(.*)</script>", (tmp_path / "page.html").read_text(), re.DOTALL)
+    assert script is not None
+    (tmp_path / "page.js").write_text(script[1], encoding="utf-8")
+    subprocess.run(["node", "--check", tmp_path / "page.js"], check=True)
+
+
+# The 3-D view
+
+
+def test_without_pyvista_the_remedy_is_named(run, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.results.view.find_spec", lambda name: None)
+    outcome = run_command("view", run)
+    assert outcome.code == 2
+    assert "pip install 'collocation-sysid[view]'" in outcome.err
+
+
+def test_the_view_finds_the_frames(run):
+    frames = frame_files(run, "swing")
+    assert len(frames) == 9
+    assert all(file.is_file() for _, file in frames)
+
+
+@pytest.mark.slow  # starting VTK takes longer than everything else here
+def test_the_view_colours_the_body_by_a_field(run, tmp_path):
+    pytest.importorskip("pyvista")
+    view(run, "det_f", screenshot=tmp_path / "view.png")
+    (picture,) = frames_in(tmp_path / "view.png")
+    assert picture.std() > 5
+    with pytest.raises(InputError, match="expected one of det_f, energy_density_j_m3"):
+        view(run, "colour", screenshot=tmp_path / "view.png")
