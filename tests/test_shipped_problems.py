@@ -91,6 +91,95 @@ def test_the_measured_beam_swings_as_an_elastic_one_would():
     assert 1e-3 < finished.solution.parameters["gamma_r_s"] < 3e-3
 
 
+# What motion capture does to markers ----------------------------------------------------------
+
+
+@cache
+def noisy_run() -> Run:
+    """The noisy cylinder as its problem file has it, with both remedies."""
+    return run(load_problem(PROBLEMS / "noisy_cylinder" / "problem.toml"))
+
+
+@cache
+def noisy_fit(huber: bool, offsets: bool) -> Solution:
+    """The noisy cylinder with or without each of its two remedies."""
+    if huber and offsets:
+        return noisy_run().solution
+    problem = noisy_run().problem
+    (experiment,), transcription = problem.experiments, problem.file.transcription
+    collocation = Collocation(
+        [experiment if offsets else replace(experiment, nuisance=Nuisance())],
+        problem.parameters,
+        transcription.scheme,
+        transcription.substeps,
+        huber=problem.file.solver.huber if huber else None,
+    )
+    return METHODS["reduced-space"].solve(collocation)
+
+
+@cache
+def attainable() -> Uncertainty:
+    """Error bars of the fit with both remedies for white noise of the sigma_m given."""
+    solution = noisy_fit(huber=True, offsets=True)
+    return covariance(solution.collocation, solution.z, errors="independent")
+
+
+def standard_errors_off(solution: Solution) -> np.ndarray:
+    """Errors of ln θ over the standard deviations that these data allow."""
+    errors = np.log([solution.parameters[name] / NOISY[name] for name in NOISY])
+    return np.abs(errors) / np.sqrt(np.diag(attainable().covariance))
+
+
+def test_huber_and_offsets_together_recover_the_truth_from_the_noisy_cylinder():
+    solution = noisy_fit(huber=True, offsets=True)
+    assert solution.status.converged
+    assert solution.kkt_residual < 1e-6  # of the whole program, as interior point would leave it
+    assert standard_errors_off(solution).max() < 3.0
+
+
+@pytest.mark.parametrize(
+    ("huber", "offsets"),
+    [
+        pytest.param(False, False, id="plain-least-squares"),
+        pytest.param(True, False, id="huber-alone"),
+        pytest.param(False, True, id="offsets-alone"),
+    ],
+)
+def test_neither_remedy_is_enough_for_the_noisy_cylinder(huber: bool, offsets: bool):
+    solution = noisy_fit(huber, offsets)
+    assert solution.status.converged
+    assert standard_errors_off(solution).max() > 4.5
+
+
+def test_the_misplaced_marker_is_found_where_it_is_glued():
+    solution = noisy_fit(huber=True, offsets=True)
+    (segment,) = solution.collocation.segments
+    (phi,) = solution.collocation.unpack_own(solution.z)
+    markers, body = segment.experiment.markers, segment.body
+    k, local = markers.names.index(MISPLACED), segment.local
+    glued = place_markers([GLUED_M], body.nodes_m, body)
+    shapes_m = solution.positions_m[0][segment.observation.grid_rows][markers.present[:, k]]
+    around_m = shapes_m[:, glued.nodes[0]]
+    # The marker turns with the body, its offset does not: the mean is what can be found.
+    true_m = (glued.weights[0] @ around_m - markers.observe(shapes_m)[:, k]).mean(axis=0)
+    found_m = (phi * local.scales).reshape(-1, 3)
+    deviations_m = np.array([attainable().local[name] for name in local.names]) * local.scales
+    assert np.linalg.norm(true_m) > 0.005
+    assert np.abs((found_m[k] - true_m) / deviations_m.reshape(-1, 3)[k]).max() < 3.0
+    others_m = np.linalg.norm(np.delete(found_m, k, axis=0), axis=1)
+    assert others_m.max() < 0.001 < np.linalg.norm(found_m[k])
+
+
+def test_the_noisy_cylinders_gaps_and_swaps_are_reported(tmp_path: Path):
+    folder = write_run(noisy_run(), tmp_path / "run", frames=False)
+    result = json.loads((folder / "result.json").read_text())
+    assert result["fit"]["experiments"]["swing"]["missing"] == 58
+    assert any("tip_1: 20 of 81 samples missing" in note for note in result["notes"])
+    distances_m = {line["marker"]: line["rms_m"] for line in result["residuals"]}
+    worst = sorted(distances_m, key=lambda name: distances_m[name])[-len(SWAPPED) :]
+    assert set(worst) == SWAPPED
+
+
 @pytest.mark.slow
 def test_interior_point_agrees_on_the_noisy_cylinder():
     # From the file's guess, a factor of three off, IPOPT loses its way in Huber's flat slopes.
