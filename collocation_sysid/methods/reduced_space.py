@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
+from ..nlp.lapack import one_blas_thread
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..results.solution import Solution, Status, Timing
@@ -37,6 +38,7 @@ Array = NDArray[np.float64]
 MISFIT = 3.0
 
 
+@one_blas_thread()
 def solve(
     collocation: Collocation,
     options: ReducedSpaceOptions | None = None,

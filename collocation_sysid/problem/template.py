@@ -31,7 +31,7 @@ gravity_m_s2 = [0.0, 0.0, -9.81]
 [experiment.grasp]             # which nodes the gripper holds, and how it moves
 nodes = {{ box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }}   # or ball_m, indices, a point array's name
 poses = "poses.csv"            # t_s,x_m,y_m,z_m,qx,qy,qz,qw: undeformed to current position
-# markers = {{ base1 = [0, 0, 0], base2 = [0.1, 0, 0], base3 = [0, 0.1, 0] }}   # or from these tracks
+# markers = {{ base1 = [0, 0, 0], base2 = [0.1, 0, 0], base3 = [0, 0.1, 0] }}  # or from tracks
 # until_s = 1.2                # let go then; several grasps: a list of such tables
 
 [experiment.markers]

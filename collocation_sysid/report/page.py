@@ -37,7 +37,7 @@ def rendered(template: str, **values: Any) -> str:
 
 
 def _template(name: str) -> str:
-    return files(__package__).joinpath("templates", name).read_text(encoding="utf-8")
+    return files("collocation_sysid.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def number(value: float | None, digits: int = 5) -> str:

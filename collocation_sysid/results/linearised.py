@@ -155,7 +155,11 @@ def linearised_fit(
 
 
 def _reweighted(residual: Array, slope: Array, threshold: float) -> tuple[Array, Array]:
-    """Samples beyond Huber's threshold with the weight they have in the fit's normal equations."""
+    """Samples beyond Huber's threshold as it sees them.
+
+    Slopes have the weight of the fit's normal equations; residuals end at the threshold, so that a
+    few wild samples tell nothing of the others' noise.
+    """
     length = np.linalg.norm(residual, axis=2)
-    weight = np.sqrt(threshold / np.maximum(length, threshold))[..., None]
-    return residual * weight, slope * weight[..., None]
+    weight = (threshold / np.maximum(length, threshold))[..., None]
+    return residual * weight, slope * np.sqrt(weight)[..., None]

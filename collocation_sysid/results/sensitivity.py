@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..nlp.collocation import Collocation
+from ..nlp.lapack import one_blas_thread
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 
@@ -31,6 +32,7 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     return [np.stack(list(rows)) for _, rows in _by_experiment(collocation, z)]
 
 
+@one_blas_thread()
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     """d(markers)/dp of each experiment at its samples, (T, 3M, m); column 3 m + axis.
 

@@ -24,6 +24,7 @@ from scipy.stats import norm, t
 
 from ..errors import InputError
 from ..nlp.collocation import Collocation
+from ..nlp.lapack import one_blas_thread
 from ..nlp.parameters import Parameters
 from .autocorrelation import Dependence, dependence, error_processes, score_covariance
 from .curvature import Curvature, curvature
@@ -139,6 +140,7 @@ def covariance(
     return uncertainty_of(fit, collocation.parameters, z[: collocation.nq], noise, errors)
 
 
+@one_blas_thread()
 def uncertainty_of(
     fit: LinearisedFit,
     parameters: Parameters,

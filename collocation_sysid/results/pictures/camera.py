@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Triangles = NDArray[np.integer]
@@ -61,8 +62,6 @@ class Camera:
 
     def turned(self, angle_deg: float, up: ArrayLike) -> Camera:
         """Walk around the body, about `up`."""
-        from scipy.spatial.transform import Rotation
-
         turn = Rotation.from_rotvec(np.radians(angle_deg) * np.asarray(up, dtype=float))
         return Camera(turn.apply(self.axes))
 

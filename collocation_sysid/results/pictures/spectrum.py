@@ -76,7 +76,7 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     kept = np.flatnonzero(present.mean(axis=0) >= SEEN)
     padded = PADDING * len(tracks_m)
     if not len(kept):
-        hertz = np.fft.rfftfreq(padded, 1 / rate_hz)
+        hertz = np.arange(padded // 2 + 1) * rate_hz / padded
         return hertz[1:], np.full(len(hertz) - 1, np.nan)
     t = np.arange(len(tracks_m))
     filled = np.zeros((len(t), len(kept), 3))

@@ -1,0 +1,158 @@
+"""What the integrator's own error does to the parameters: schemes × time steps, exact data.
+
+A swung cylinder is simulated by Newmark at a step so fine that it counts as the truth, sampled
+every 20 ms, and identified with each scheme at 20, 10, 5 and 2.5 ms. Errors are those of the
+logarithms, and the order is the slope of log |error| against log Δt. An estimate at a bound is
+marked with a star and left out of the order.
+
+    python scripts/study_mismatch.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from studies import HEADS, TRUTH, markdown, save
+from study_starts import BOUNDS, hanging_cylinder
+from synthetic import Swing
+
+from collocation_sysid.experiment import Experiment, Grasp
+from collocation_sysid.methods.reduced_space import solve
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameter, Parameters
+from collocation_sysid.nlp.simulation import simulate, with_markers
+
+Array = NDArray[np.float64]
+
+SCHEMES = ("backward-euler", "midpoint", "bdf2")
+SAMPLE_S = 0.02
+GUESS = (400.0, 150.0, 0.02, 0.5)
+# Within this of its bound an estimate is at it.
+AT_BOUND = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """One identification.
+
+    Attributes
+    ----------
+    errors : (4,) of the logarithms
+    at_bound : (4,)
+    """
+
+    scheme: str
+    step_s: float
+    converged: bool
+    errors: Array
+    at_bound: Array
+    rms_m: float
+    time_s: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--schemes", nargs="*", choices=SCHEMES, default=list(SCHEMES))
+    parser.add_argument("--substeps", nargs="*", type=int, default=[1, 2, 4, 8])
+    parser.add_argument("--layers", type=int, default=7, help="7 (layers + 1) nodes")
+    parser.add_argument("--samples", type=int, default=50)
+    parser.add_argument("--fine-s", type=float, default=2.5e-4, help="Newmark's step")
+    parser.add_argument("--out", type=Path, default=Path("results/study_mismatch"))
+    arguments = parser.parse_args()
+    experiment = measured(arguments.layers, arguments.samples, arguments.fine_s)
+    fits = [
+        identify(experiment, scheme, substeps)
+        for scheme in arguments.schemes
+        for substeps in arguments.substeps
+    ]
+    save(arguments.out, "study_mismatch", f"{table(fits)}\n\n{order_table(fits)}")
+
+
+def measured(layers: int, samples: int, fine_s: float) -> Experiment:
+    """The cylinder with Newmark's tracks; poses are known at Newmark's own step."""
+    experiment = hanging_cylinder(layers, samples, "midpoint")
+    t_s = SAMPLE_S * np.arange(samples, dtype=np.float64)
+    motion = Swing(
+        duration_s=float(t_s[-1]),
+        amplitude_m=(0.05, 0.04, 0.03),
+        amplitude_rad=(0.1, 0.1, 0.6),
+        frequency_hz=(0.9, 1.1, 1.3),
+        rise_s=0.3,
+    )
+    grasp = Grasp(experiment.grasps[0].nodes, motion.poses(fine_s))
+    markers = replace(experiment.markers, t_s=t_s)
+    experiment = replace(experiment, t_s=t_s, grasps=(grasp,), markers=markers)
+    return with_markers(experiment, simulate(experiment, TRUTH, timestep_s=fine_s).markers_m)
+
+
+def identify(experiment: Experiment, scheme: str, substeps: int) -> Fit:
+    """The parameters that a scheme takes for the truth."""
+    parameters = Parameters(
+        tuple(
+            Parameter(name, guess, *BOUNDS[name]) for name, guess in zip(TRUTH, GUESS, strict=True)
+        )
+    )
+    began = time.perf_counter()
+    solution = solve(Collocation([experiment], parameters, scheme, substeps))
+    found = np.array(solution.theta)
+    walls = np.array([BOUNDS[name] for name in TRUTH])
+    return Fit(
+        scheme,
+        experiment.timestep_s / substeps,
+        solution.status.converged,
+        np.log(found / list(TRUTH.values())),
+        (np.abs(np.log(found[:, None] / walls)) < AT_BOUND).any(axis=1),
+        solution.rms_m,
+        time.perf_counter() - began,
+    )
+
+
+def orders(fits: Sequence[Fit]) -> Array:
+    """(4,) slopes of log |error| against log Δt; NaN where fewer than two steps tell."""
+    steps = np.log([fit.step_s for fit in fits])
+    errors = np.log(np.abs([fit.errors for fit in fits]))
+    usable = np.array([~fit.at_bound & fit.converged for fit in fits])
+    return np.array(
+        [
+            np.polyfit(steps[use], errors[use, k], 1)[0] if use.sum() > 1 else np.nan
+            for k, use in enumerate(usable.T)
+        ]
+    )
+
+
+def table(fits: Sequence[Fit]) -> str:
+    """Relative errors as Markdown."""
+    heads = ("scheme", "Δt [ms]", *(f"{name} [%]" for name in HEADS), "rms [mm]", "time [s]")
+    lines = []
+    for fit in fits:
+        cells = [
+            f"{100 * np.expm1(error):+.3g}{'*' if bound else ''}"
+            for error, bound in zip(fit.errors, fit.at_bound, strict=True)
+        ]
+        name = fit.scheme if fit.converged else f"{fit.scheme} (not converged)"
+        rest = (f"{1e3 * fit.rms_m:.2g}", f"{fit.time_s:.1f}")
+        lines.append((name, f"{1e3 * fit.step_s:g}", *cells, *rest))
+    return markdown(heads, lines)
+
+
+def order_table(fits: Sequence[Fit]) -> str:
+    """Orders over all steps, and over the two finest, as Markdown."""
+    lines = []
+    for scheme in dict.fromkeys(fit.scheme for fit in fits):
+        common = sorted((f for f in fits if f.scheme == scheme), key=lambda fit: fit.step_s)
+        for name, chosen in (("all steps", common), ("two finest", common[:2])):
+            cells = ["–" if np.isnan(o) else f"{o:.2f}" for o in orders(chosen)]
+            lines.append((f"{scheme}, {name}", *cells))
+    return markdown(("order", *HEADS), lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""What 1 mm of marker noise does to the parameters, by method: bias and spread over many seeds.
+
+The swung cylinder of study_coverage.py, seen by the scheme that also fits it, so that nothing but
+noise is wrong; every method gets the same noise and the same guess. Bias and spread are those of
+the logarithms in percent, the bias with its standard error; predicted is the standard error at
+the truth.
+
+    python scripts/study_noise.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from studies import HEADS, TRUTH, markdown, save
+from study_coverage import SCHEME, reference
+from study_starts import BOUNDS
+
+from collocation_sysid.methods import METHODS
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameter, Parameters
+from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.results.uncertainty import covariance
+
+Array = NDArray[np.float64]
+
+GUESS = (400.0, 150.0, 0.02, 0.5)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A method, and the share of the seeds that it gets."""
+
+    name: str
+    method: str
+    options: Mapping[str, Any]
+    share: float = 1.0
+
+
+CASES = (
+    Case("reduced-space", "reduced-space", {}),
+    Case("shooting", "shooting", {}),
+    Case("augmented-lagrangian, LM", "augmented-lagrangian", {"max_time_s": 60.0}, 0.2),
+    Case("penalty, LM", "penalty", {"inner": "levenberg-marquardt", "max_time_s": 60.0}, 0.2),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One seed: errors (4,) of the logarithms."""
+
+    converged: bool
+    errors: Array
+    time_s: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--sigma-m", type=float, default=1e-3)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--out", type=Path, default=Path("results/study_noise"))
+    arguments = parser.parse_args()
+    # Workers start afresh and find one thread each.
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
+    start = multiprocessing.get_context("spawn")
+    outcomes = {}
+    with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
+        for case in CASES:
+            count = max(2, round(case.share * arguments.seeds))
+            jobs = [(case, arguments.sigma_m, seed) for seed in range(count)]
+            outcomes[case.name] = list(pool.map(run, *zip(*jobs, strict=True)))
+    text = table(outcomes, predicted(arguments.sigma_m))
+    save(arguments.out, "study_noise", text)
+
+
+def run(case: Case, sigma_m: float, seed: int) -> Outcome:
+    """Identify one noisy twin from the guess."""
+    collocation = noisy(sigma_m, seed, GUESS)
+    method = METHODS[case.method]
+    began = time.perf_counter()
+    solution = method.solve(collocation, method.options(**case.options))
+    return Outcome(
+        solution.status.converged,
+        np.log(np.array(solution.theta) / list(TRUTH.values())),
+        time.perf_counter() - began,
+    )
+
+
+def noisy(sigma_m: float, seed: int | None, guess: Sequence[float]) -> Collocation:
+    """The twin with noise of its seed; without noise where there is none."""
+    experiment, x = reference(sigma_m)
+    tracks = experiment.markers.observe(x.reshape(len(x), -1, 3))
+    if seed is not None:
+        tracks = tracks + sigma_m * np.random.default_rng(seed).standard_normal(tracks.shape)
+    parameters = Parameters(
+        tuple(Parameter(n, g, *BOUNDS[n]) for n, g in zip(TRUTH, guess, strict=True))
+    )
+    return Collocation([with_markers(experiment, tracks)], parameters, SCHEME)
+
+
+@cache
+def predicted(sigma_m: float) -> tuple[float, ...]:
+    """Standard errors of the four logarithms at the truth."""
+    truth = tuple(TRUTH.values())
+    collocation = noisy(sigma_m, None, truth)
+    _, x = reference(sigma_m)
+    z = collocation.pack(np.log(truth), [x], [np.zeros(0)])
+    variances = covariance(collocation, z, errors="independent").covariance.diagonal()
+    return tuple(np.sqrt(variances).tolist())
+
+
+def table(outcomes: Mapping[str, Sequence[Outcome]], expected: Sequence[float]) -> str:
+    """Bias and spread of every method as Markdown."""
+    heads = (
+        *("method", "seeds", "converged"),
+        *(f"{name} {what} [%]" for name in HEADS for what in ("bias", "spread")),
+        "median [s]",
+    )
+    spreads = [cell for each in expected for cell in ("0", f"{100 * each:.3g}")]
+    lines = [("predicted", "–", "–", *spreads, "–")]
+    for name, each in outcomes.items():
+        errors = 100 * np.array([outcome.errors for outcome in each if outcome.converged])
+        cells = []
+        for bias, spread in zip(errors.mean(axis=0), errors.std(axis=0, ddof=1), strict=True):
+            doubt = spread / np.sqrt(len(errors))
+            cells += [f"{bias:+.2g} ± {doubt:.1g}", f"{spread:.3g}"]
+        time_s = float(np.median([outcome.time_s for outcome in each]))
+        lines.append((name, str(len(each)), str(len(errors)), *cells, f"{time_s:.2g}"))
+    return markdown(heads, lines)
+
+
+if __name__ == "__main__":
+    main()
