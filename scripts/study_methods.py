@@ -36,9 +36,10 @@ VARIANTS = (
     Variant("shooting", "shooting"),
     Variant("shooting, growing horizon", "continuation", SHOOT),
     Variant("penalty, LM", "penalty", LM),
-    Variant("augmented-lagrangian, LM", "augmented-lagrangian"),
-    Variant("interior-point", "interior-point", share=0.5),
-    Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.5),
+    Variant("augmented-lagrangian, LM", "augmented-lagrangian", share=0.5),
+    Variant("augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}),
+    Variant("interior-point", "interior-point", share=0.25),
+    Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )
 
 PROBLEM = """\
@@ -102,10 +103,10 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=40)
     parser.add_argument("--spread", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--layers", type=int, default=11, help="7 (layers + 1) nodes")
+    parser.add_argument("--layers", type=int, default=7, help="7 (layers + 1) nodes")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--step-s", type=float, default=0.02)
-    parser.add_argument("--time-s", type=float, default=45.0, help="limit of a run")
+    parser.add_argument("--time-s", type=float, default=40.0, help="limit of a run")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--methods", nargs="*", choices=[v.name for v in VARIANTS])
     parser.add_argument("--out", type=Path, default=Path("results/study_methods"))

@@ -3,7 +3,7 @@
 The problem is problems/srl_beam/problem.toml; every part changes a few of its keys and solves it
 again in the reduced space.
 
-    python scripts/study_srl_beam.py --from FOLDER                        # all, some minutes
+    python scripts/study_srl_beam.py --from FOLDER              # all: a quarter of an hour
     python scripts/study_srl_beam.py --from FOLDER --parts joint poisson
 """
 

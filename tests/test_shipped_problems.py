@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collocation_sysid import Problem, load_problem, run, write_run
+from collocation_sysid import Problem, load_problem, run, solve, write_run
 from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.collocation import Collocation
@@ -89,6 +89,28 @@ def test_the_measured_beam_swings_as_an_elastic_one_would():
     # Without a load, beam theory puts E at 277 kPa; this mesh is somewhat too stiff.
     assert 2.5e5 < finished.solution.parameters["young_pa"] < 2.8e5
     assert 1e-3 < finished.solution.parameters["gamma_r_s"] < 3e-3
+
+
+@pytest.mark.slow
+def test_interior_point_agrees_on_the_measured_beam():
+    problem = measured_beam("gravity.toml")
+    reduced, interior = solve(problem, "reduced-space"), solve(problem, "interior-point")
+    assert reduced.status.converged
+    assert interior.status.converged
+    found, expected = (s.collocation.parameters_of(s.z) for s in (interior, reduced))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_one_material_fits_the_measured_beam_under_three_loads():
+    solution = solve(measured_beam("problem.toml"))
+    assert solution.status.converged
+    assert 2.7e5 < solution.parameters["young_pa"] < 3.1e5
+    limits_m = {"gravity": 0.00030, "load52": 0.00075, "load101": 0.00115}
+    for segment, readings_m in zip(solution.collocation.segments, solution.readings_m, strict=True):
+        measured_m = segment.experiment.markers.positions_m
+        rms_m = np.sqrt(np.mean(np.sum((readings_m - measured_m) ** 2, axis=2)))
+        assert rms_m < limits_m[segment.experiment.name]
 
 
 # What motion capture does to markers ----------------------------------------------------------
