@@ -36,8 +36,10 @@ VARIANTS = (
     Variant("shooting", "shooting"),
     Variant("shooting, growing horizon", "continuation", SHOOT),
     Variant("penalty, LM", "penalty", LM),
-    Variant("augmented-lagrangian, LM", "augmented-lagrangian", share=0.5),
-    Variant("augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}),
+    Variant(
+        "augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}, share=0.5
+    ),
+    Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian", share=0.5),
     Variant("interior-point", "interior-point", share=0.25),
     Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )

@@ -22,7 +22,7 @@ LM = {"inner": "levenberg-marquardt"}
 VARIANTS = (
     Variant("reduced-space", "reduced-space"),
     Variant("shooting", "shooting"),
-    Variant("augmented-lagrangian, LM", "augmented-lagrangian"),
+    Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian"),
     Variant("augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}),
     Variant("penalty, CG", "penalty"),
     # Without the schedule, the weight that the first stage has, and a large one.

@@ -247,7 +247,7 @@ class RecordingReader:
         return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
 
     def _fitted(self, table: MarkerTable) -> MarkerTable:
-        """The tracks without the gripper's markers and those of weight 0."""
+        """The tracks asked for, without the gripper's markers and those of weight 0."""
         markers = self.section.markers
         for key in ("reference_m", "sigma_m", "weights"):
             given = getattr(markers, key)
@@ -255,8 +255,9 @@ class RecordingReader:
         unweighted = [name for name in table.names if markers.weights.get(name) == 0]
         if unweighted:
             self._note(f"left out, with the weight 0: {', '.join(unweighted)}")
-        gripper = gripper_markers(self.section) - set(markers.names or ())
-        kept = [k for k, n in enumerate(table.names) if n not in gripper and n not in unweighted]
+        # Markers that only the gripper or the template needs are read, and not fitted.
+        wanted = set(markers.names or set(table.names) - gripper_markers(self.section))
+        kept = [k for k, n in enumerate(table.names) if n in wanted and n not in unweighted]
         if not kept:
             raise InputError(
                 f"none is left of {', '.join(table.names)}: all are the gripper's or have the "

@@ -22,6 +22,8 @@ PEAK_BINS = 2
 FEWEST_PERIODS = 3
 SAME_FREQUENCY = 0.2
 ROUNDING_M = 1e-9
+# Share of the samples beyond Huber's threshold that noise alone may explain.
+MOST_WILD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class MarkerDiagnosis:
     experiment, marker : str
     samples : int
     rms_m : float
-        Of the distance between fitted and measured marker.
+        Of the distance between fitted and measured marker, wild samples included.
     offset_m : (3,) mean of h(x) − ŷ
     constant_share : float
         Power of the mean.
@@ -65,13 +67,21 @@ class MarkerDiagnosis:
 def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     """Diagnose every marker that was seen, experiment by experiment."""
     return tuple(
-        _diagnose(block, marker, fit.shared)
+        _diagnose(block, marker, fit.shared, _estimated(fit, block))
         for block in fit.blocks
         for marker in np.flatnonzero(block.present.any(axis=0)).tolist()
     )
 
 
-def _diagnose(block: FitBlock, marker: int, shared: int) -> MarkerDiagnosis:
+def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
+    """Whether marker offsets and a time shift of the experiment are estimated already."""
+    own = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared :]]
+    return any(n.startswith("offset") for n in own), any(n.startswith("time") for n in own)
+
+
+def _diagnose(
+    block: FitBlock, marker: int, shared: int, estimated: tuple[bool, bool]
+) -> MarkerDiagnosis:
     present = block.present[:, marker]
     residual = block.residual[:, marker] * block.sigma_m[marker]
     samples = int(present.sum())
@@ -85,7 +95,7 @@ def _diagnose(block: FitBlock, marker: int, shared: int) -> MarkerDiagnosis:
         experiment=block.name,
         marker=block.marker_names[marker],
         samples=samples,
-        rms_m=float(np.sqrt(power / samples)),
+        rms_m=_rms_m(block, marker),
         offset_m=mean,
         constant_share=float(samples * mean @ mean / total),
         lag1=_lag1(varying, present),
@@ -96,7 +106,20 @@ def _diagnose(block: FitBlock, marker: int, shared: int) -> MarkerDiagnosis:
     )
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
-    return replace(found, sentence=_suggestion(found, pairs, block.t_s, motion))
+    said = _suggestion(found, pairs, block.t_s, motion, estimated)
+    wild = int(block.wild[:, marker].sum())
+    if wild > MOST_WILD * samples:
+        said += (
+            f"; {wild} samples are beyond Huber's threshold: exchanged labels, or reflections "
+            "taken for the marker"
+        )
+    return replace(found, sentence=said)
+
+
+def _rms_m(block: FitBlock, marker: int) -> float:
+    misfit = block.residual if block.misfit is None else block.misfit
+    squares = np.sum(misfit[:, marker] ** 2) / block.present[:, marker].sum()
+    return float(block.sigma_m[marker] * np.sqrt(squares))
 
 
 def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
@@ -126,7 +149,9 @@ def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
     return centre / record_s, float(weights.sum() / total)
 
 
-def _suggestion(found: MarkerDiagnosis, pairs: int, t_s: Array, motion: Array) -> str:
+def _suggestion(
+    found: MarkerDiagnosis, pairs: int, t_s: Array, motion: Array, estimated: tuple[bool, bool]
+) -> str:
     name = f"{found.experiment}/{found.marker}"
     size = f"{1e3 * found.rms_m:.2g} mm RMS"
     if found.rms_m < ROUNDING_M:
@@ -139,14 +164,16 @@ def _suggestion(found: MarkerDiagnosis, pairs: int, t_s: Array, motion: Array) -
         offset = 1e3 * np.linalg.norm(found.offset_m)
         said = (
             f"{100 * found.constant_share:.0f} % of its power is constant: its place on the body "
-            f"is off by {offset:.2g} mm; estimate marker_offsets"
+            f"is off by {offset:.2g} mm; {'widen the prior of' if estimated[0] else 'estimate'} "
+            "marker_offsets"
         )
     elif found.early_share > DOMINANT:
         end_s = EARLY_TIME * (t_s[-1] - t_s[0])
         said = (
             f"{100 * found.early_share:.0f} % of its power is in the first {end_s:.2g} s: the "
-            "start state or the release time is off; estimate time_shift"
+            "start state or the release time is off"
         )
+        said += "" if estimated[1] else "; estimate time_shift"
     elif found.oscillating_share > DOMINANT:
         said = _oscillation(found, t_s, motion)
     elif persistent and found.lag1 > DOMINANT:

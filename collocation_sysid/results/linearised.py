@@ -37,6 +37,8 @@ class FitBlock:
     residual : (T, M, 3) (h(x) − ŷ) / σ, zero where missing
     slope : (T, M, 3, p) derivative of the residual by all p parameters, zero where missing
     sigma_m : (M,) standard deviations given
+    misfit : (T, M, 3), optional
+        Residuals as they are, where Huber's loss has shortened those in `residual`.
     """
 
     name: str
@@ -46,6 +48,14 @@ class FitBlock:
     residual: Array
     slope: Array
     sigma_m: Array
+    misfit: Array | None = None
+
+    @property
+    def wild(self) -> Mask:
+        """(T, M) samples beyond Huber's threshold."""
+        if self.misfit is None:
+            return np.zeros(self.present.shape, dtype=bool)
+        return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
 
     @property
     def measurements(self) -> int:
@@ -129,6 +139,7 @@ def linearised_fit(
         )
         slope = np.zeros((*residual.shape, len(p)))
         slope[..., places] = here
+        misfit = residual
         if collocation.huber is not None:
             residual, slope = _reweighted(residual, slope, collocation.huber)
         blocks.append(
@@ -140,6 +151,7 @@ def linearised_fit(
                 residual=residual,
                 slope=slope,
                 sigma_m=markers.sigma_m,
+                misfit=misfit,
             )
         )
     prior_residual, prior_slope = collocation.prior(p)
