@@ -33,7 +33,7 @@ from ..fem.selection import Ball, Box, Indices, Named, Selection
 from ..nlp.newton import Solver
 from ..nlp.parameters import Parameters
 from ..nlp.rest import start_state
-from .schema import (
+from .recording_schema import (
     EstimateSection,
     ExperimentSection,
     ForceSection,

@@ -17,7 +17,7 @@ from ..experiment import (
     read_markers,
 )
 from ..experiment.rigid import loosest_marker
-from .schema import ExperimentSection, GraspSection, MarkersSection
+from .recording_schema import ExperimentSection, GraspSection, MarkersSection
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,341 @@
+"""The keys of one recording: grasps, markers, loads, and what is not known of it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+
+from .section import (
+    Boundless,
+    Corner,
+    Finite,
+    Flag,
+    NotNegative,
+    Positive,
+    Section,
+    Text,
+    Unit,
+    Vector,
+    Whole,
+    given_keys,
+    require_one,
+)
+
+
+class NodesSection(Section):
+    """A selection of mesh nodes, by exactly one of these."""
+
+    box_m: tuple[Corner, Corner] | None = Field(
+        None, description="Lowest and highest corner [[x, y, z], [x, y, z]]."
+    )
+    ball_m: tuple[Vector, Positive] | None = Field(
+        None, description="Centre and radius [[x, y, z], radius]."
+    )
+    indices: list[Whole] | None = Field(
+        None, description="List of node numbers as in the mesh file, counted from 0."
+    )
+    name: Text | None = Field(None, description="A point array of the mesh, 1 where selected.")
+
+    @model_validator(mode="after")
+    def _one(self) -> NodesSection:
+        require_one(self, *type(self).model_fields)
+        return self
+
+
+# Where a key takes one of two forms, a tag in <> tells them apart; messages leave the tag out.
+
+
+def _nodes_form(value: Any) -> str:
+    return "<name>" if isinstance(value, str) else "<table>"
+
+
+Nodes = Annotated[
+    Annotated[NodesSection, Tag("<table>")] | Annotated[Text, Tag("<name>")],
+    Discriminator(_nodes_form),
+]
+
+
+class GraspSection(Section):
+    """Nodes held by a gripper, and how it moves."""
+
+    nodes: Nodes = Field(
+        description="Selection: a table of box_m, ball_m or indices, or the name of a point array."
+    )
+    poses: Text | None = Field(
+        None, description="Poses, CSV or .npz; held where they are without poses or markers."
+    )
+    quaternion: Literal["xyzw", "wxyz"] | None = Field(
+        None, description="Order of a quaternion whose columns in poses do not name it."
+    )
+    length_unit: Unit | None = Field(
+        None, description="Unit of the positions in poses, where they do not state it."
+    )
+    markers: dict[str, Vector] | None = Field(
+        None,
+        description="Place [x, y, z] on the undeformed body for each marker that is tied to the "
+        "gripper, by name; poses are fitted to their tracks.",
+    )
+    weights: dict[str, NotNegative] = Field(
+        default_factory=dict, description="Weight in that fit by marker name, 1 by default."
+    )
+    max_residual_m: Positive | None = Field(
+        None, description="Residual of that fit above which a frame is reported."
+    )
+    interpolation: Literal["linear", "hold"] = "linear"
+    from_s: Finite | None = Field(None, description="First time at which it holds.")
+    until_s: Finite | None = Field(
+        None,
+        description="Last time at which it holds; at the start's, the body is let go from its "
+        "equilibrium in this grasp.",
+    )
+
+    @model_validator(mode="after")
+    def _window(self) -> GraspSection:
+        if self.from_s is not None and self.until_s is not None and self.from_s > self.until_s:
+            raise ValueError(
+                f"found from_s = {self.from_s:g} and until_s = {self.until_s:g}; "
+                "expected from_s <= until_s"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_source_of_poses(self) -> GraspSection:
+        if self.poses is not None and self.markers is not None:
+            raise ValueError("found poses and markers; expected one of them")
+        for owner, keys in (
+            ("poses", given_keys(self, "quaternion", "length_unit")),
+            (
+                "markers",
+                [*given_keys(self, "max_residual_m"), *(["weights"] if self.weights else [])],
+            ),
+        ):
+            if keys and getattr(self, owner) is None:
+                raise ValueError(f"found {keys[0]} without {owner}; it belongs to {owner}")
+        if self.markers is not None:
+            _at_least_three(self.markers, "markers")
+            _all_among(self.weights, self.markers, "weights")
+        return self
+
+
+def _sigma_form(value: Any) -> str:
+    return "<by marker>" if isinstance(value, dict) else "<for all>"
+
+
+Sigma = Annotated[
+    Annotated[Positive, Tag("<for all>")] | Annotated[dict[str, Positive], Tag("<by marker>")],
+    Discriminator(_sigma_form),
+]
+
+
+class MarkersSection(Section):
+    """Tracked points."""
+
+    file: Text | None = Field(
+        None,
+        description="Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; only "
+        "`simulate` can do without.",
+    )
+    sigma_m: Sigma = Field(
+        1e-3, description="Standard deviation of a coordinate, for all or by marker name."
+    )
+    names: list[str] | None = Field(
+        None, description="List of the names of markers to use; all by default."
+    )
+    labels: dict[str, Text] = Field(
+        default_factory=dict, description="Name here for a label in the file, by label."
+    )
+    weights: dict[str, NotNegative] = Field(
+        default_factory=dict,
+        description="Weight in the loss by marker name, 1 by default; 0 leaves the marker out.",
+    )
+    length_unit: Unit | None = Field(
+        None, description="Unit of the coordinates, where the file does not state it."
+    )
+    rate_hz: Positive | None = Field(
+        None, description="Frame rate, where the file states neither it nor times."
+    )
+    template_m: dict[str, Vector] | None = Field(
+        None,
+        description="Place [x, y, z] in the body's frame for at least three markers, by name; all "
+        "tracks are moved rigidly so that these fit.",
+    )
+    template_window_s: tuple[Finite, Finite] | None = Field(
+        None, description="First and last time [start, end] to average for the template."
+    )
+    max_template_residual_m: Positive | None = Field(
+        None, description="Farthest a marker may be from its place in the template."
+    )
+    reference_m: dict[str, Vector] = Field(
+        default_factory=dict,
+        description="Place [x, y, z] on the undeformed body for each marker, by name.",
+    )
+    attach: Literal["auto", "vertex", "embedded"] = "auto"
+    max_distance_m: Positive | None = Field(
+        None, description="Farthest a marker may be from the body; the mean edge length by default."
+    )
+
+    @model_validator(mode="after")
+    def _template(self) -> MarkersSection:
+        given = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
+        if given and not {"template_m", "template_window_s"} <= set(given):
+            raise ValueError(
+                f"found {', '.join(given)}; expected template_m and template_window_s, both or "
+                "neither"
+            )
+        if self.template_m is not None:
+            _at_least_three(self.template_m, "template_m")
+        if (window := self.template_window_s) is not None and not window[0] <= window[1]:
+            raise ValueError(
+                f"found template_window_s = {list(window)}; expected [start, end] with start <= end"
+            )
+        return self
+
+
+def _file_name(name: str) -> str:
+    if not name or name.startswith(".") or any(mark in name for mark in '/\\:*?"<>|\n'):
+        raise ValueError(
+            f"found {name!r}; expected a name that files can have: not empty, no dot in front, "
+            'none of / \\ : * ? " < > |'
+        )
+    return name
+
+
+class MassSection(Section):
+    """A rigid point mass tied to nodes: inertia and weight."""
+
+    nodes: Nodes = Field(description="Nodes that carry it in equal parts, selected as in a grasp.")
+    mass_kg: Positive
+    from_s: Finite | None = Field(None, description="When it joins the body; always by default.")
+
+
+class ForceSection(Section):
+    """A force on nodes besides gravity."""
+
+    nodes: Nodes = Field(
+        description="Nodes that it acts on in equal parts, selected as in a grasp."
+    )
+    force_n: Vector | None = Field(None, description="Constant force [x, y, z].")
+    file: Text | None = Field(None, description="CSV with the columns t_s, fx_n, fy_n, fz_n.")
+
+    @model_validator(mode="after")
+    def _one(self) -> ForceSection:
+        require_one(self, "force_n", "file")
+        return self
+
+
+class LengthPrior(Section):
+    """How well a length is known."""
+
+    prior_m: Positive = Field(description="Standard deviation [m].")
+
+
+class TimePrior(Section):
+    """How well a time is known."""
+
+    prior_s: Positive = Field(description="Standard deviation [s].")
+
+
+class AnglePrior(Section):
+    """How well a direction is known."""
+
+    prior_rad: Positive = Field(description="Standard deviation [rad].")
+
+
+class PosePrior(Section):
+    """How well a pose is known; what is left out is taken as exact."""
+
+    prior_rad: Positive | None = Field(None, description="Standard deviation of a turn [rad].")
+    prior_m: Positive | None = Field(None, description="Standard deviation of a shift [m].")
+
+    @model_validator(mode="after")
+    def _some(self) -> PosePrior:
+        if not given_keys(self, "prior_rad", "prior_m"):
+            raise ValueError("found neither prior_rad nor prior_m; expected one or both")
+        return self
+
+
+class EstimateSection(Section):
+    """What is estimated of this recording alone, each with a prior around zero."""
+
+    marker_offsets: LengthPrior | None = Field(
+        None, description="A constant offset of every marker from its place: prior_m."
+    )
+    time_shift: TimePrior | None = Field(
+        None, description="Delay of the markers' clock against the grasps': prior_s."
+    )
+    pose: PosePrior | None = Field(
+        None, description="A constant rigid correction of the grasps: prior_rad, prior_m."
+    )
+    gravity: AnglePrior | None = Field(
+        None, description="A tilt of the direction of gravity: prior_rad."
+    )
+
+
+def _grasp_form(value: Any) -> str:
+    return "<several>" if isinstance(value, list) else "<one>"
+
+
+Grasps = Annotated[
+    Annotated[GraspSection, Tag("<one>")] | Annotated[list[GraspSection], Tag("<several>")],
+    Discriminator(_grasp_form),
+]
+
+
+class ExperimentSection(Section):
+    """One recording."""
+
+    name: Annotated[str, AfterValidator(_file_name)]
+    grasp: Grasps = Field(
+        default_factory=list, description="A table of nodes and poses, or a list of them."
+    )
+    markers: MarkersSection
+    start: Literal["equilibrium", "undeformed"] = "equilibrium"
+    start_rule: Literal["standard", "paper"] = "standard"
+    gravity_m_s2: Vector = Field(
+        (0.0, 0.0, -9.81), description="Acceleration of gravity [x, y, z]."
+    )
+    window_s: tuple[Boundless, Boundless] | None = Field(
+        None, description="First and last time to use [start, end]."
+    )
+    resample_hz: Positive | None = Field(None, description="Put poses and markers on this rate.")
+    every: Annotated[int, Field(strict=True, ge=1)] = Field(
+        1, description="Use every so-manieth sample of the markers."
+    )
+    mass: list[MassSection] = Field(
+        default_factory=list,
+        description="[[experiment.mass]] tables: point masses tied to the body.",
+    )
+    force: list[ForceSection] = Field(
+        default_factory=list, description="[[experiment.force]] tables: forces besides gravity."
+    )
+    estimate: EstimateSection | None = Field(
+        None, description="What is estimated of this recording alone."
+    )
+    validation: Flag = Field(False, description="Not fitted, only predicted.")
+
+    @property
+    def grasps(self) -> list[GraspSection]:
+        """The grasps, however they are written."""
+        return self.grasp if isinstance(self.grasp, list) else [self.grasp]
+
+    @model_validator(mode="after")
+    def _window(self) -> ExperimentSection:
+        if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
+            raise ValueError(
+                f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
+            )
+        return self
+
+
+def _at_least_three(places: dict[str, Any], key: str) -> None:
+    if len(places) < 3:
+        raise ValueError(
+            f"found {len(places)} in {key}; expected at least three, to fix a rotation"
+        )
+
+
+def _all_among(given: dict[str, Any], names: dict[str, Any], key: str) -> None:
+    for name in given:
+        if name not in names:
+            raise ValueError(f"found {name!r} in {key}; expected names among {', '.join(names)}")
