@@ -174,6 +174,7 @@ def result(finished: Run) -> dict[str, Any]:
             },
         },
         "iterations": solution.iterations,
+        "evaluations": solution.evaluations,
         "timing_s": {
             field.name: getattr(solution.timing, field.name) for field in fields(solution.timing)
         },

@@ -35,6 +35,7 @@ class TimedFunction(ca.Callback):
         ca.Callback.__init__(self)
         self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
         self._errors = errors
+        self.calls = 0
         self.seconds = 0.0
         self.construct(name)
 
@@ -55,6 +56,7 @@ class TimedFunction(ca.Callback):
 
     def eval_buffer(self, arguments, results) -> int:
         began = time.perf_counter()
+        self.calls += 1
         try:
             self._evaluate(
                 [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
@@ -117,6 +119,11 @@ class NlpFunctions:
     def seconds(self) -> float:
         """Time spent evaluating."""
         return sum(function.seconds for function in self._functions)
+
+    @property
+    def calls(self) -> int:
+        """Evaluations of any of the functions."""
+        return sum(function.calls for function in self._functions)
 
     def function(self, name: str, *outputs: str) -> TimedFunction:
         """A callback with the outputs named."""

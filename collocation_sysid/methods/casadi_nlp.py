@@ -258,6 +258,7 @@ def solve(
             total=total,
         ),
         notes=tuple(notes),
+        evaluations=functions.calls,
     )
 
 

@@ -137,7 +137,7 @@ class _Climb:
         # q, positions as far as they were solved, and each experiment's own unknowns.
         self.known: tuple[Array, list[Array], list[Array]] | None = None
         self.last: Solution | None = None
-        self.iterations = 0
+        self.iterations = self.evaluations = 0
         self.history: list[Iteration] = []
         self.timing = Timing()
         self.notes: list[str] = []
@@ -179,6 +179,7 @@ class _Climb:
             history=tuple(self.history),
             timing=replace(self.timing, total=self._elapsed()),
             notes=(*self.notes, *last.notes),
+            evaluations=self.evaluations,
         )
 
     def _learn(self, found: Solution, share: float) -> None:
@@ -186,6 +187,7 @@ class _Climb:
         _, positions = found.collocation.unpack(found.z)
         self.known = (found.q, positions, found.collocation.unpack_own(found.z))
         self.iterations += found.iterations
+        self.evaluations += found.evaluations
         spent, more = self.timing, found.timing
         self.timing = Timing(
             spent.build + more.build,

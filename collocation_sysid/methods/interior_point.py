@@ -160,6 +160,7 @@ def solve(
             total=total,
         ),
         notes=tuple(notes),
+        evaluations=functions.calls,
     )
 
 

@@ -49,6 +49,7 @@ class Unconstrained:
             shape = (self.nlp.constraints, self.nlp.variables)
             self._entries = np.zeros(len(indices))
             self._jacobian = sp.csc_array((self._entries, indices, indptr), shape=shape)
+        self.evaluations = 0
         self.lower, self.upper = self.nlp.bounds()
         self.free = self.lower != self.upper
         of_p = np.zeros(self.nlp.variables, dtype=bool)
@@ -58,12 +59,14 @@ class Unconstrained:
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
         """G and ∂g/∂z; the matrix is overwritten by the next call."""
+        self.evaluations += 1
         with self.stopwatch.evaluating():
             rows, _ = self.nlp.constraints_and_jacobian(z, self._entries)
         return rows, self._jacobian
 
     def constraint_values(self, z: Array) -> Array:
         """G, scaled."""
+        self.evaluations += 1
         with self.stopwatch.evaluating():
             return self.nlp.constraint_values(z)
 

@@ -86,6 +86,7 @@ def solve(
             time.perf_counter() - search.began,
         ),
         notes=tuple(search.notes),
+        evaluations=search.sweeps,
     )
 
 

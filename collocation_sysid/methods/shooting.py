@@ -131,6 +131,7 @@ def solve(
             time.perf_counter() - search.began,
         ),
         notes=search.notes,
+        evaluations=search.shots,
     )
 
 

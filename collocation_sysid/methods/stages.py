@@ -185,6 +185,7 @@ class Stages:
                 time.perf_counter() - self.began,
             ),
             notes=tuple(self.notes),
+            evaluations=self.problem.evaluations,
         )
 
 

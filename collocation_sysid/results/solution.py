@@ -103,6 +103,9 @@ class Solution:
     timing : Timing
     notes : sequence of str
         What the user should know, such as how the solve was started.
+    evaluations : int
+        How often the method asked for residuals or derivatives of whole trajectories; a sweep
+        and a simulation count as one.
     """
 
     status: Status
@@ -115,6 +118,7 @@ class Solution:
     history: Sequence[Iteration]
     timing: Timing
     notes: Sequence[str] = field(default=())
+    evaluations: int = 0
 
     @property
     def q(self) -> Array:
