@@ -27,7 +27,11 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="collocation-sysid",
     help="Identify the material parameters of a soft object from motion capture.\n\n"
-    "Start with: collocation-sysid new my_object",
+    "\b\nStart with\n"
+    "  collocation-sysid new my_object                    a commented problem file\n"
+    "  collocation-sysid check my_object/problem.toml     what will go wrong\n"
+    "  collocation-sysid solve my_object/problem.toml     parameters with error bars\n"
+    "  collocation-sysid report runs/my_object            everything found, as a page",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
@@ -65,7 +69,19 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list the runs.")]
 EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
-@app.command()
+def _examples(*commands: str) -> str:
+    """Lines below a command's help, kept as they are."""
+    lines = "".join(f"\n  collocation-sysid {command}" for command in commands)
+    return f"\b\nExamples:{lines}"
+
+
+@app.command(
+    epilog=_examples(
+        "solve problem.toml",
+        "solve problem.toml --method interior-point --out runs/ip",
+        "solve problem.toml --set parameters.mu_pa.guess=200",
+    )
+)
 def solve(
     problem: ProblemPath,
     method: Annotated[str | None, typer.Option(help="Method, instead of the problem's.")] = None,
@@ -102,7 +118,12 @@ def solve(
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "simulate problem.toml --out data --noise-m 0.001 --seed 1",
+        "simulate problem.toml --out data --set parameters.mu_pa.guess=300",
+    )
+)
 def simulate(
     problem: ProblemPath,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to write.")],
@@ -117,7 +138,7 @@ def simulate(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate the experiments at the guesses and write markers and poses as CSV.
+    """Simulate at the guesses and write markers and poses as CSV.
 
     The markers' places are their reference_m, or follow from their file. The parameters are the
     guesses or fixed values: set others with --set.
@@ -139,7 +160,12 @@ def simulate(
             typer.echo(file)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "compare problem.toml --methods reduced-space,shooting --starts 40",
+        "compare problem.toml --methods penalty --truth mu_pa=300,lambda_pa=200",
+    )
+)
 def compare(
     problem: ProblemPath,
     methods: Annotated[str, typer.Option(metavar="A,B,…", help="Methods, separated by commas.")],
@@ -160,7 +186,10 @@ def compare(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run methods side by side from many starts; finished runs are kept and not done again."""
+    """Run methods side by side from many starts.
+
+    Finished runs are kept in the output folder: the same command resumes.
+    """
     from .problem import load_problem
     from .study import Limits, plan_comparison
     from .study.arguments import parse_methods, read_truth
@@ -175,7 +204,12 @@ def compare(
     _study(study, limits, dry_run, as_json, quiet)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "sweep problem.toml --over transcription.substeps=1,2,4",
+        "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
+    )
+)
 def sweep(
     problem: ProblemPath,
     over: Annotated[
@@ -195,7 +229,7 @@ def sweep(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Solve for every combination of values of the problem file's keys."""
+    """Solve for every combination of values of some keys."""
     from .problem import load_problem
     from .study import Limits, plan_sweep
     from .study.arguments import parse_methods, parse_over
@@ -269,9 +303,13 @@ def _dry_run(planned: Sequence[PlannedRun], finished: Sequence[str], as_json: bo
         _show(plan_table(planned, finished))
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "check problem.toml", "check problem.toml --set transcription.scheme=backward-euler"
+    )
+)
 def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False) -> None:
-    """Validate a problem, print its sizes, and check the derivatives."""
+    """Tell what is wrong with a problem before solving it."""
     from .check import check_problem
     from .problem import load_problem
     from .terminal import check_table
@@ -284,7 +322,7 @@ def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False)
     raise typer.Exit(0 if findings.derivatives_agree else EXIT_NOT_CONVERGED)
 
 
-@app.command()
+@app.command(epilog=_examples("plot runs/swing"))
 def plot(
     run_folder: RunFolder,
     out: Out = None,
@@ -297,7 +335,7 @@ def plot(
         typer.echo(file)
 
 
-@app.command()
+@app.command(epilog=_examples("report runs/swing", "report runs/compare --to comparison.html"))
 def report(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="A run folder, or one of compare or sweep.")
@@ -306,7 +344,10 @@ def report(
         Path | None, typer.Option(metavar="FILE", help="Where to write; report.html in the folder.")
     ] = None,
 ) -> None:
-    """Write one HTML page with everything a run or a study found, pictures inside."""
+    """Write one HTML page about a run or a study.
+
+    Everything it found, pictures inside.
+    """
     from .report import comparison_page, run_page
 
     file = to or folder / "report.html"
@@ -317,7 +358,7 @@ def report(
     typer.echo(file)
 
 
-@app.command()
+@app.command(epilog=_examples("animate runs/swing --to swing.mp4", "animate runs/swing --slow 4"))
 def animate(
     run_folder: RunFolder,
     to: Annotated[
@@ -328,7 +369,7 @@ def animate(
     experiment: OneExperiment = None,
     quiet: Quiet = False,
 ) -> None:
-    """Film a run from its files: the body as fitted beside the body as rolled out."""
+    """Film a run: the body as fitted beside the body as rolled out."""
     from rich.progress import Progress
 
     from .results.animation import animate as film
@@ -342,7 +383,7 @@ def animate(
     typer.echo(file)
 
 
-@app.command()
+@app.command(epilog=_examples("view runs/swing", "view runs/swing --html swing.html"))
 def view(
     run_folder: RunFolder,
     field: Annotated[
@@ -353,7 +394,10 @@ def view(
     ] = None,
     experiment: OneExperiment = None,
 ) -> None:
-    """Look at a run in 3-D: in a window (needs pyvista), or as a web page that needs nothing."""
+    """Look at a run in 3-D.
+
+    In a window (needs pyvista), or as a web page that needs nothing.
+    """
     from .results.view import export_page
     from .results.view import view as show
 
@@ -372,7 +416,7 @@ def schema() -> None:
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
 
 
-@app.command()
+@app.command(epilog=_examples("new my_object", "check my_object/problem.toml"))
 def new(name: Annotated[str, typer.Argument(help="Name of the new folder.")]) -> None:
     """Write a commented problem file to start from."""
     from .problem.template import TEMPLATE

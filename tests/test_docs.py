@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 import tomllib
 from pathlib import Path
 
 import pytest
+from problem_files import run_command
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
@@ -39,6 +41,23 @@ def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: P
     names: dict[str, object] = {"__name__": "docs"}
     for code in blocks(page, "python"):
         exec(compile(code, name_of(page), "exec"), names)
+
+
+# What keeps a command of the pages short here.
+SHORT = {
+    "compare": ["--dry-run"],
+    "sweep": ["--dry-run"],
+    "solve": ["--method", "reduced-space"],
+}
+
+
+@pytest.mark.parametrize("page", pages_with("console"))
+def test_commands_of_a_page_run(page: Path, checkout: Path):
+    for block in blocks(page, "console"):
+        for line in re.findall(r"^\$ collocation-sysid (.*)$", block, re.MULTILINE):
+            words = shlex.split(line)
+            outcome = run_command(*words, *SHORT.get(words[0], []))
+            assert outcome.code == 0, f"{line}: {outcome.err}"
 
 
 @pytest.mark.parametrize("page", pages_with("toml"))
