@@ -62,7 +62,9 @@ def _combinations(uncertainty: Uncertainty) -> list[str]:
         if value > 1 - CONFOUNDED:
             break
         members = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
-        if len(members) > 1:
+        # Three or more that are well known each need no word about their company.
+        widths = (uncertainty.quantiles * deviations)[known[members]]
+        if len(members) == 2 or (len(members) > 2 and widths.max() > np.log(WELL_FIXED)):
             sentences.append(
                 _combination(uncertainty, known[members], max(value, 0.0), vector[members])
             )
