@@ -90,9 +90,13 @@ class Motion:
 
 
 def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Theta) -> Motion:
-    """Modes of one experiment at θ while it is held least, and what the scheme does to them."""
+    """Modes of one experiment at θ while it is held least, and what the scheme does to them.
+
+    Of those times the last counts, when all point masses have joined.
+    """
     held = experiment.grasped(experiment.t_s)[0]
-    least = int(held.sum(axis=1).argmin())
+    count = held.sum(axis=1)
+    least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
     x, about = _state(experiment, held[least], time_s, theta)
     free = dofs_of(np.flatnonzero(~held[least]))
