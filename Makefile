@@ -27,7 +27,7 @@ bench: $(CORE) ## time the constraint Jacobian
 
 docs: $(CORE) ## build the documentation's pages
 	@$(PIP) -e '.[docs]'
-	@$(BIN)/sphinx-build -q -W -b html docs docs/_build/html
+	@$(BIN)/sphinx-build -q -b html docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
 clean: ## remove the environment and caches; runs stay
