@@ -163,7 +163,7 @@ def simulate(
 @app.command(
     epilog=_examples(
         "compare problem.toml --methods reduced-space,shooting --starts 40",
-        "compare problem.toml --methods penalty --truth mu_pa=300,lambda_pa=200",
+        "compare problem.toml --methods penalty,shooting --truth truth.toml",
     )
 )
 def compare(
