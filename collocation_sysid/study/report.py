@@ -187,15 +187,15 @@ def comparison_views(summaries: Sequence[Row]) -> list[View]:
         "tip mm": _number("tip_max_m", 1e3),
     }
     cost = {
-        "iterations": _number("iterations", 1, ".4g"),
-        "evaluations": _number("evaluations", 1, ".4g"),
+        "iter.": _number("iterations", 1, ".4g"),
+        "evals": _number("evaluations", 1, ".4g"),
         "build s": _number("build_s"),
         "evaluate s": _number("evaluations_s"),
-        "lin. alg. s": _number("linear_algebra_s"),
+        "solve s": _number("linear_algebra_s"),
         "total s": _number("total_s"),
     }
     if all(row["evaluations"] is None for row in summaries):
-        del cost["evaluations"]
+        del cost["evals"]
     return [
         _view("Success", {"method": _text("method")}, success, summaries),
         _view("Quality", {"method": _text("method")}, quality, summaries),
