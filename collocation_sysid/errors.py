@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
+
+
+def hint_at(name: str, known: Iterable[str]) -> str:
+    """What to add to a message about a misspelt name: the known one nearest to it, if any is."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 class InputError(ValueError):

@@ -102,7 +102,7 @@ def replays(finished: Run) -> list[Replay]:
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
         if isinstance(rollout, Rollout):
-            rolled_out = rollout.trajectory.positions_m, rollout.readings_m
+            rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
         fit = fitted.get(experiment.name)
         if fit is not None or rolled_out is not None:
             found.append(Replay.of(experiment, fit, rolled_out, _natural_hz(experiment, solution)))

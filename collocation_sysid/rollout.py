@@ -27,9 +27,9 @@ class Rollout:
 
     Attributes
     ----------
-    rms_m, max_m : distance of the readings from the measurements; the tip error is in `max_m`
+    rms_m, max_m : distance of the markers from the measurements; the tip error is in `max_m`
     trajectory : Trajectory
-    readings_m : (T, M, 3) markers of the simulation, with the experiment's own unknowns
+        Its markers are read with the experiment's own unknowns.
     unknowns : mapping of name to value
         Own unknowns of an experiment for validation, fitted with the material as found.
     """
@@ -37,7 +37,6 @@ class Rollout:
     rms_m: float
     max_m: float
     trajectory: Trajectory
-    readings_m: Array
     unknowns: Mapping[str, float]
 
 
@@ -66,7 +65,6 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         float(np.sqrt(np.mean(present**2))),
         float(present.max()),
         replace(trajectory, markers_m=readings),
-        readings,
         dict(zip(local.names, (phi * local.scales).tolist(), strict=True))
         if experiment.validation
         else {},

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from .errors import InputError, SimulationError
+from .errors import InputError, SimulationError, hint_at
 from .methods import METHODS
 from .methods.casadi_nlp import why_not
 from .nlp.collocation import Collocation
@@ -95,10 +94,8 @@ def solve(
     """
     name = method or problem.file.solver.method
     if name not in METHODS:
-        close = difflib.get_close_matches(name, METHODS, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        known = f"found {name!r}; expected one of {', '.join(METHODS)}{hint}"
-        raise InputError(why_not(name) or known, None, "--method")
+        unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
+        raise InputError(why_not(name) or unknown, None, "--method")
     chosen = METHODS[name]
     known = {field.name for field in fields(chosen.options)}
     in_file = problem.file.solver.model_dump(exclude_unset=True, exclude={"method", "huber"})

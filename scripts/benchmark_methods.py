@@ -40,6 +40,7 @@ from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.simulation import with_markers
 
+BOTH = ["interior-point", "reduced-space"]
 TRUTH = Theta(200.0, 300.0, 0.009, 1.0)
 PARAMETERS = Parameters(
     (
@@ -192,7 +193,7 @@ def main() -> None:
     )
     parser.add_argument("--mesh", nargs="*", default=[PAPER_SIZE[0]], help="rings x layers")
     parser.add_argument("--steps", nargs="*", type=int, default=[PAPER_SIZE[1]])
-    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--methods", nargs="*", default=BOTH, choices=list(METHODS))
     parser.add_argument("--scaling", action="store_true", help="reduced space over T and meshes")
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--json", action="store_true")

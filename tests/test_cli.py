@@ -29,7 +29,7 @@ from rich.console import Console
 
 import collocation_sysid as cs
 from collocation_sysid import terminal
-from collocation_sysid.experiment import read_markers_csv, read_poses_csv
+from collocation_sysid.experiment import read_markers, read_poses
 from collocation_sysid.problem import ProblemFile, read_problem_file
 from collocation_sysid.results.solution import Iteration
 
@@ -285,10 +285,10 @@ def test_simulation_writes_what_a_laboratory_would(tiny):
     assert (outcome.code, outcome.err) == (0, "")
     files = ["data/swing_markers.csv", "data/swing_poses.csv", "data/swing/trajectory.pvd"]
     assert outcome.out.split() == files
-    table = read_markers_csv(tiny / files[0])
+    table = read_markers(tiny / files[0])
     assert table.names == ("low", "mid", "side")
     np.testing.assert_allclose(table.positions_m, expected.markers_m, atol=1e-11)
-    poses, given = read_poses_csv(tiny / files[1]), read_poses_csv(tiny / "swing_motion.csv")
+    poses, given = read_poses(tiny / files[1]), read_poses(tiny / "swing_motion.csv")
     np.testing.assert_allclose(poses.quaternions_xyzw, given.quaternions_xyzw, atol=1e-10)
     assert len(frames_in(tiny / files[2])) == 9
 
@@ -297,7 +297,7 @@ def test_noise_follows_the_seed(tiny):
     def tracks(name: str, *options: str) -> np.ndarray:
         outcome = run_command("simulate", "problem.toml", "--out", name, "--json", *options)
         file, _ = json.loads(outcome.out)
-        return read_markers_csv(file).positions_m
+        return read_markers(file).positions_m
 
     exact = tracks("exact")
     noisy = tracks("a", "--noise-m", "0.001", "--seed", "3")
@@ -310,9 +310,9 @@ def test_the_integrator_is_chosen(tiny):
     options = ["--quiet", *settings(*AT_TRUTH)]
     run_command("simulate", "problem.toml", "--out", "a", "--integrator", "midpoint", *options)
     run_command("simulate", "problem.toml", "--out", "b", "--timestep-s", "0.0005", *options)
-    measured = read_markers_csv(tiny / "swing_markers.csv").positions_m
-    exact = read_markers_csv(tiny / "a" / "swing_markers.csv").positions_m
-    other = read_markers_csv(tiny / "b" / "swing_markers.csv").positions_m
+    measured = read_markers(tiny / "swing_markers.csv").positions_m
+    exact = read_markers(tiny / "a" / "swing_markers.csv").positions_m
+    other = read_markers(tiny / "b" / "swing_markers.csv").positions_m
     np.testing.assert_allclose(exact, measured, atol=1e-10)
     assert 1e-6 < np.abs(other - measured).max() < 5e-3
 

@@ -24,7 +24,7 @@ from problem_files import (
 
 from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import read_markers_csv, read_poses_csv
+from collocation_sysid.experiment import read_markers, read_poses
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.problem import ProblemFile, load_problem, read_problem_file
@@ -243,7 +243,7 @@ def test_lengths_of_a_marker_file_have_a_unit(tiny):
 def test_a_window_cuts_poses_and_markers(tiny):
     experiment = experiment_of(tiny, "experiment.0.window_s=[0.02, 0.06]")
     np.testing.assert_allclose(experiment.t_s, [0.02, 0.03, 0.04, 0.05, 0.06])
-    whole = read_markers_csv(tiny / MARKERS).positions_m
+    whole = read_markers(tiny / MARKERS).positions_m
     np.testing.assert_array_equal(experiment.markers.positions_m, whole[2:7])
     np.testing.assert_allclose(experiment.grasps[0].poses.t_s, experiment.t_s)
 
@@ -262,7 +262,7 @@ def test_resampling_above_the_measured_rate_is_noted(tiny):
 
 
 def test_poses_may_be_faster_than_markers(tiny):
-    poses = read_poses_csv(tiny / POSES)
+    poses = read_poses(tiny / POSES)
     every = experiment_of(tiny)
     head, *rows = (tiny / MARKERS).read_text().splitlines()
     write(MARKERS, "\n".join([head, *rows[::2]]))(tiny)
@@ -293,7 +293,7 @@ def test_experiments_for_validation_are_loaded_but_not_fitted(tiny):
 def test_before_anything_is_measured_markers_are_sampled_at_the_poses_times(tiny):
     remove(MARKERS)(tiny)
     experiment = load(tiny, simulation=True).experiments[0]
-    np.testing.assert_allclose(experiment.t_s, read_poses_csv(tiny / POSES).t_s)
+    np.testing.assert_allclose(experiment.t_s, read_poses(tiny / POSES).t_s)
     assert experiment.markers.names == ("low", "mid", "side")
     with pytest.raises(InputError, match=r"swing_markers\.csv does not exist"):
         load(tiny)

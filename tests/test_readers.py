@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import (
     PoseSequence,
-    read_markers_csv,
-    read_poses_csv,
+    read_markers,
+    read_poses,
     sample_interval_s,
     write_markers_csv,
     write_poses_csv,
@@ -48,18 +48,18 @@ def refusal(read, path, **options):
 
 
 def test_pose_columns_are_told_apart_by_name(file):
-    poses = read_poses_csv(file(POSES))
+    poses = read_poses(file(POSES))
     np.testing.assert_allclose(poses.positions_m, [[0, 0, 1], [0.5, 0, 1]])
     np.testing.assert_allclose(np.abs(poses.quaternions_xyzw), [[0, 0, 0, 1], [0, 0, 1, 0]])
     scalar_first = "t_s,qw,qx,qy,qz,x_m,y_m,z_m\n0,1,0,0,0,0,0,1\n0.1,0,0,0,1,0.5,0,1\n"
-    same = read_poses_csv(file(scalar_first))
+    same = read_poses(file(scalar_first))
     np.testing.assert_allclose(same.quaternions_xyzw, poses.quaternions_xyzw)
     np.testing.assert_allclose(same.positions_m, poses.positions_m)
 
 
 def test_spreadsheet_habits_are_tolerated(file):
     text = "\ufeff" + POSES.replace(",", " , ").replace("\n", "\r\n") + "\r\n,,,,,,,\r\n"
-    assert len(read_poses_csv(file(text)).t_s) == 2
+    assert len(read_poses(file(text)).t_s) == 2
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_spreadsheet_habits_are_tolerated(file):
 )
 def test_wrong_pose_columns_list_found_and_expected(file, header):
     row = ",".join(["0"] * (header.count(",") + 1))
-    message = refusal(read_poses_csv, file(f"{header}\n{row}\n"))
+    message = refusal(read_poses, file(f"{header}\n{row}\n"))
     assert "line 1" in message
     assert header.replace(",", ", ") in message
     assert "expected t_s, x_m, y_m, z_m, qx, qy, qz, qw" in message
@@ -92,7 +92,7 @@ def test_wrong_pose_columns_list_found_and_expected(file, header):
 )
 def test_a_bad_pose_is_named_by_its_line(file, found, replacement, words):
     assert found in POSES
-    message = refusal(read_poses_csv, file(POSES.replace(found, replacement)))
+    message = refusal(read_poses, file(POSES.replace(found, replacement)))
     assert all(word in message for word in words), message
 
 
@@ -100,7 +100,7 @@ def test_a_bad_pose_is_named_by_its_line(file, found, replacement, words):
 
 
 def test_missing_samples_become_nan_as_a_whole(file):
-    table = read_markers_csv(file(MARKERS))
+    table = read_markers(file(MARKERS))
     assert table.names == ("tip", "base")
     np.testing.assert_array_equal(table.t_s, [0.0, 0.1, 0.2])
     nan = [np.nan] * 3
@@ -110,33 +110,33 @@ def test_missing_samples_become_nan_as_a_whole(file):
 
 
 def test_markers_asked_for_come_in_the_order_asked(file):
-    table = read_markers_csv(file(MARKERS), names=["base", "tip"])
+    table = read_markers(file(MARKERS), names=["base", "tip"])
     assert table.names == ("base", "tip")
     np.testing.assert_array_equal(table.positions_m[0], [[4, 5, 6], [1, 2, 3]])
 
 
 def test_lengths_are_converted_to_metres(file):
-    table = read_markers_csv(file(MARKERS), length_unit="mm")
+    table = read_markers(file(MARKERS), length_unit="mm")
     np.testing.assert_allclose(table.positions_m[0, 0], [0.001, 0.002, 0.003])
 
 
 def test_an_unknown_length_unit_is_refused(file):
     with pytest.raises(InputError, match="'feet'; expected one of m, cm, mm"):
-        read_markers_csv(file(MARKERS), length_unit="feet")
+        read_markers(file(MARKERS), length_unit="feet")
 
 
 def test_an_unknown_marker_is_answered_with_a_suggestion(file):
-    message = refusal(read_markers_csv, file(MARKERS), names=["tpi"])
+    message = refusal(read_markers, file(MARKERS), names=["tpi"])
     assert "no marker 'tpi'; the file has tip, base; did you mean 'tip'?" in message
 
 
 def test_a_marker_may_be_asked_for_once(file):
-    assert "more than once" in refusal(read_markers_csv, file(MARKERS), names=["tip", "tip"])
+    assert "more than once" in refusal(read_markers, file(MARKERS), names=["tip", "tip"])
 
 
 def test_columns_of_markers_not_asked_for_may_hold_anything(file):
     text = MARKERS.replace("4,5,6", "?,?,?")
-    assert read_markers_csv(file(text), names=["tip"]).names == ("tip",)
+    assert read_markers(file(text), names=["tip"]).names == ("tip",)
 
 
 @pytest.mark.parametrize(
@@ -153,22 +153,22 @@ def test_columns_of_markers_not_asked_for_may_hold_anything(file):
 )
 def test_a_bad_marker_file_is_named_by_its_line(file, found, replacement, words):
     assert found in MARKERS
-    message = refusal(read_markers_csv, file(MARKERS.replace(found, replacement)))
+    message = refusal(read_markers, file(MARKERS.replace(found, replacement)))
     assert all(word in message for word in words), message
 
 
 def test_lines_are_counted_over_blank_ones(file):
-    message = refusal(read_markers_csv, file(MARKERS.replace("0.1,1.5", "\n\n0.1,x")))
+    message = refusal(read_markers, file(MARKERS.replace("0.1,1.5", "\n\n0.1,x")))
     assert "line 5" in message
 
 
-@pytest.mark.parametrize("read", [read_poses_csv, read_markers_csv])
+@pytest.mark.parametrize("read", [read_poses, read_markers])
 @pytest.mark.parametrize("text", ["", "\n\n", "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n", "t_s\n0\n"])
 def test_files_without_data_are_refused(file, read, text):
     refusal(read, file(text))
 
 
-@pytest.mark.parametrize("read", [read_poses_csv, read_markers_csv])
+@pytest.mark.parametrize("read", [read_poses, read_markers])
 def test_files_that_cannot_be_read_are_refused(tmp_path, read):
     assert "No such file" in refusal(read, tmp_path / "absent.csv")
     refusal(read, tmp_path)
@@ -185,7 +185,7 @@ def test_poses_survive_writing_and_reading(tmp_path):
     t = np.arange(20) / 30.0
     poses = PoseSequence(t, rng.normal(size=(20, 3)), Rotation.random(20, rng=rng).as_quat())
     write_poses_csv(tmp_path / "poses.csv", poses)
-    again = read_poses_csv(tmp_path / "poses.csv")
+    again = read_poses(tmp_path / "poses.csv")
     np.testing.assert_allclose(again.t_s, poses.t_s, rtol=1e-11)
     np.testing.assert_allclose(again.positions_m, poses.positions_m, rtol=1e-11)
     np.testing.assert_allclose(again.quaternions_xyzw, poses.quaternions_xyzw, atol=1e-11)
@@ -197,7 +197,7 @@ def test_markers_survive_writing_and_reading(tmp_path):
     positions[2, 1] = np.nan
     names = ["a", "b, with comma", "c"]
     write_markers_csv(tmp_path / "markers.csv", np.arange(7) / 30.0, names, positions)
-    again = read_markers_csv(tmp_path / "markers.csv")
+    again = read_markers(tmp_path / "markers.csv")
     assert again.names == tuple(names)
     np.testing.assert_allclose(again.positions_m, positions, rtol=1e-11)
     assert ",,,," in (tmp_path / "markers.csv").read_text().splitlines()[3]

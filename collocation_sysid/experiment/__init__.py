@@ -8,8 +8,8 @@ from .grasp import Grasp, PoseSequence, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance
-from .pose_files import read_poses, read_poses_csv
-from .readers import MarkerTable, read_markers, read_markers_csv
+from .pose_files import read_poses
+from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
 from .writers import write_markers_csv, write_poses_csv
 
@@ -32,9 +32,7 @@ __all__ = [
     "place_markers",
     "read_forces",
     "read_markers",
-    "read_markers_csv",
     "read_poses",
-    "read_poses_csv",
     "sample_interval_s",
     "write_markers_csv",
     "write_poses_csv",

@@ -76,11 +76,6 @@ def read_poses(
     return _sequence(path, t_s, positions_m, quaternions, lines)
 
 
-def read_poses_csv(path: str | Path) -> PoseSequence:
-    """Read poses with the columns t_s, x_m, y_m, z_m, qx, qy, qz, qw; see `read_poses`."""
-    return read_poses(path)
-
-
 def _sequence(
     path: str | Path,
     t_s: FloatArray,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, hint_at
 from .arrays import FloatArray, read_only_floats, read_only_tracks
 from .clock import first_time_fault
 from .formats import Choose, RawTracks, read_tracks
@@ -102,13 +101,6 @@ def read_markers(
     return MarkerTable(t_s, tuple(taken), coordinates * metres, (*raw.notes, *notes))
 
 
-def read_markers_csv(
-    path: str | Path, names: Sequence[str] | None = None, length_unit: str = "m"
-) -> MarkerTable:
-    """Read marker tracks from a plain wide CSV; see `read_markers`."""
-    return read_markers(path, names=names, length_unit=length_unit)
-
-
 def _choice(path: str | Path, names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
     """What picks the markers asked for from the labels in a file."""
 
@@ -149,8 +141,7 @@ def _refuse_repeated(path: str | Path, names: Sequence[str], message: str) -> No
 
 def _require_one_of(path: str | Path, name: str, there: Sequence[str], what: str) -> None:
     if name not in there:
-        close = difflib.get_close_matches(name, there, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
+        hint = hint_at(name, there)
         raise InputError(f"no {what} '{name}'; the file has {listed(there)}{hint}", path)
 
 

@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from .elements import Element
-    from .mesh import TetMesh
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+class _Mesh(Protocol):
+    """What is needed of a `TetMesh`, which describes it."""
+
+    @property
+    def points_m(self) -> np.ndarray: ...
+    @property
+    def tetrahedra(self) -> np.ndarray: ...
+    @cached_property
+    def edges(self) -> np.ndarray: ...
+    @property
+    def bounds_m(self) -> np.ndarray: ...
+    @property
+    def point_arrays(self) -> Mapping[str, np.ndarray]: ...
+    @property
+    def file_index(self) -> np.ndarray: ...
+    @property
+    def file_node_count(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,18 +49,18 @@ class Nodes:
     ends : (k, 2) the corners at the ends of each mid node's edge: rows of `mesh.edges`, or none
     """
 
-    mesh: TetMesh
+    mesh: _Mesh
     points_m: Array
     cells: Index
     ends: Index
 
     @classmethod
-    def corners(cls, mesh: TetMesh) -> Nodes:
+    def corners(cls, mesh: _Mesh) -> Nodes:
         """Only the mesh's own."""
         return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
 
     @classmethod
-    def of_element(cls, mesh: TetMesh, element: Element) -> Nodes:
+    def of_element(cls, mesh: _Mesh, element: Element) -> Nodes:
         """All that the element has."""
         if not element.edges:
             return cls.corners(mesh)

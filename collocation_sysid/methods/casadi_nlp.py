@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..results.solution import Solution, Status, Timing
+from ..results.solution import Solution, Status
 from .callbacks import HessianValues, Monitor, NlpFunctions, Watch
 from .method import Method
-from .nlpsol import build, interruptible
+from .nlpsol import build, interruptible, timing
 from .start import initial_variables
 
 Array = NDArray[np.float64]
@@ -240,8 +240,7 @@ def solve(
     if not (status.converged and np.isfinite(z).all()):
         z, multipliers = monitor.best or (start, np.zeros(collocation.constraints))
     status = _judged(status, collocation, z, multipliers)
-    total = time.perf_counter() - began
-    spent = functions.seconds + monitor.seconds
+    spent = timing(functions, monitor, began, built)
     return Solution(
         status=status,
         message=f"{status.sentence} ({plugin}: {said})",
@@ -251,12 +250,7 @@ def solve(
         multipliers=multipliers,
         iterations=count or max(0, len(monitor.history) - 1),
         history=tuple(monitor.history),
-        timing=Timing(
-            build=built - began,
-            evaluations=functions.seconds,
-            linear_algebra=max(0.0, total - (built - began) - spent),
-            total=total,
-        ),
+        timing=spent,
         notes=tuple(notes),
         evaluations=functions.calls,
     )

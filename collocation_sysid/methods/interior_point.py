@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..results.solution import Solution, Status, Timing
+from ..results.solution import Solution, Status
 from .callbacks import Monitor, NlpFunctions, Watch
-from .nlpsol import build, interruptible
+from .nlpsol import build, interruptible, timing
 from .start import initial_variables
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ def solve(
     if errors:
         raise errors[0]
     stats = solver.stats()
-    total = time.perf_counter() - began
+    spent = timing(functions, monitor, began, built)
     if stats["return_status"] == "Invalid_Option":
         notes.append(
             f"linear_solver = '{options.linear_solver}' needs a library that is not installed; "
@@ -143,7 +143,6 @@ def solve(
     z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
     if not status.converged and monitor.best is not None:
         z, multipliers = monitor.best
-    spent = functions.seconds + monitor.seconds
     return Solution(
         status=status,
         message=f"{status.sentence} (IPOPT: {stats['return_status']})",
@@ -153,12 +152,7 @@ def solve(
         multipliers=multipliers,
         iterations=int(stats.get("iter_count", len(monitor.history))),
         history=tuple(monitor.history),
-        timing=Timing(
-            build=built - began,
-            evaluations=functions.seconds,
-            linear_algebra=max(0.0, total - (built - began) - spent),
-            total=total,
-        ),
+        timing=spent,
         notes=tuple(notes),
         evaluations=functions.calls,
     )

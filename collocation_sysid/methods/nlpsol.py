@@ -6,6 +6,7 @@ import io
 import re
 import signal
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import casadi as ca
 
 from ..errors import InputError
+from ..results.solution import Timing
 from .callbacks import Monitor, NlpFunctions
 
 
@@ -38,6 +40,13 @@ def build(
         reason = (said.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
         reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
         raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
+
+
+def timing(functions: NlpFunctions, monitor: Monitor, began: float, built: float) -> Timing:
+    """Where the time went since `began`; what is neither set-up nor callback is linear algebra."""
+    total = time.perf_counter() - began
+    spent = (built - began) + functions.seconds + monitor.seconds
+    return Timing(built - began, functions.seconds, max(0.0, total - spent), total)
 
 
 @contextmanager

@@ -18,8 +18,6 @@ even a rung cannot be simulated as a whole, the rows that can be are solved firs
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,7 +67,6 @@ def solve(
         status = Status.INTERRUPTED
     z, multipliers = _whole(collocation, search)
     search.notes += _notes(collocation, search, z, status)
-    watch_s = search.stopwatch
     return Solution(
         status=status,
         message=f"{status.sentence}{why}",
@@ -79,12 +76,7 @@ def solve(
         multipliers=multipliers,
         iterations=search.sweeps,
         history=tuple(search.history),
-        timing=Timing(
-            watch_s.build,
-            watch_s.evaluations,
-            watch_s.linear_algebra,
-            time.perf_counter() - search.began,
-        ),
+        timing=Timing.of(search.stopwatch, search.began),
         notes=tuple(search.notes),
         evaluations=search.sweeps,
     )

@@ -336,17 +336,17 @@ class Search:
         """Make it the answer so far; markers are those after the feasibility step of a point."""
         self.p, self.x = p, x
         q, own = self.collocation.split(p)
-        settings = self.collocation.settings(p)
         squares, violation_n = [], 0.0
+        settings = [] if point is not None else self.collocation.settings(p)
         for k, segment in enumerate(self.collocation.segments):
-            tangent = point.tangents[k] if point else None
-            projected = x[k] + tangent.step if tangent else x[k]
-            squares.append(segment.observation.squared_distances_m2(projected, own[k]))
-            if tangent:
-                violation_n = max(violation_n, tangent.violation_n)
+            if point is not None:
+                tangent = point.tangents[k]
+                projected, here = x[k] + tangent.step, tangent.violation_n
             else:
                 residual = segment.residual_n(x[k], settings[k])
-                violation_n = max(violation_n, float(np.abs(residual).max()))
+                projected, here = x[k], float(np.abs(residual).max())
+            squares.append(segment.observation.squared_distances_m2(projected, own[k]))
+            violation_n = max(violation_n, here)
         distances = np.concatenate(squares)
         line = Iteration(
             number=self.sweeps,

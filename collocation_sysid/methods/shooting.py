@@ -114,7 +114,6 @@ def solve(
     except KeyboardInterrupt:
         status, why = Status.INTERRUPTED, ""
     z, multipliers = search.answer()
-    spent = search.stopwatch
     return Solution(
         status=status,
         message=f"{status.sentence}{why}",
@@ -124,12 +123,7 @@ def solve(
         multipliers=multipliers,
         iterations=search.shots,
         history=tuple(search.history),
-        timing=Timing(
-            spent.build,
-            spent.evaluations,
-            spent.linear_algebra,
-            time.perf_counter() - search.began,
-        ),
+        timing=Timing.of(search.stopwatch, search.began),
         notes=search.notes,
         evaluations=search.shots,
     )

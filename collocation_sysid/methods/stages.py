@@ -178,12 +178,7 @@ class Stages:
             multipliers=self.problem.multipliers(estimate),
             iterations=self.iterations,
             history=tuple(self.history),
-            timing=Timing(
-                self.stopwatch.build,
-                self.stopwatch.evaluations,
-                self.stopwatch.linear_algebra,
-                time.perf_counter() - self.began,
-            ),
+            timing=Timing.of(self.stopwatch, self.began),
             notes=tuple(self.notes),
             evaluations=self.problem.evaluations,
         )

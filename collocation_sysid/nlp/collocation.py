@@ -220,35 +220,32 @@ class Collocation:
 
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z; equal for what is given."""
-        lower, upper = self.parameters.bounds_q
+        (lower, own_lower), (upper, own_upper) = map(self.split, self.bounds_p)
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        limits = [segment.local.limits for segment in self.segments]
-        return (
-            self.pack(lower, lows, [-limit for limit in limits]),
-            self.pack(upper, highs, limits),
-        )
+        return self.pack(lower, lows, own_lower), self.pack(upper, highs, own_upper)
 
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
         """L divided by the number of measurements."""
-        q, positions = self.unpack(z)
-        residuals, _ = self.parameters.prior(q)
+        _, positions = self.unpack(z)
+        residuals, _ = self.prior(self.parameters_of(z))
         loss = float(residuals @ residuals)
         for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
-            loss += segment.observation.loss(x, phi) + float(phi @ phi)
+            loss += segment.observation.loss(x, phi)
         return self.loss_scale * loss
 
     def gradient(self, z: Array) -> Array:
         """∂objective/∂z."""
-        q, positions = self.unpack(z)
-        residuals, slopes = self.parameters.prior(q)
-        by_x, by_phi = [], []
-        for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
+        _, positions = self.unpack(z)
+        residuals, slopes = self.prior(self.parameters_of(z))
+        by_p, by_x = 2 * residuals * slopes, []
+        parts = zip(self.segments, positions, self.unpack_own(z), self.places, strict=True)
+        for segment, x, phi, places in parts:
             of_x, of_phi = segment.observation.gradient(x, phi)
             by_x.append(of_x.ravel() * segment.length_m)
-            by_phi.append(of_phi + 2 * phi)
-        return self.loss_scale * np.concatenate([2 * residuals * slopes, *by_x, *by_phi])
+            by_p[places[self.nq :]] += of_phi
+        return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :]])
 
     # Constraints ------------------------------------------------------------------------------
 

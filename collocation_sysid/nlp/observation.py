@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -27,6 +28,15 @@ Index = NDArray[np.int64]
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5
+
+
+class _Sample(NamedTuple):
+    """Functions of one sample's u and data; each holds what its users need and no more."""
+
+    value: ca.Function  # residual
+    slope: ca.Function  # residual, and its Jacobian by u
+    loss: ca.Function  # loss, and its gradient
+    hessian: ca.Function  # of the loss
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +100,7 @@ class Observation:
         return np.hstack([offsets, np.tile(common, (len(offsets), 1))])
 
     @cached_property
-    def _sample(self) -> tuple[ca.Function, ca.Function, ca.Function]:
-        """Reading with slope by u, and loss with gradient and Hessian, of one sample."""
+    def _sample(self) -> _Sample:
         nodes = ca.SX.sym("h", 3 * self._neighbours)
         own = ca.SX.sym("phi", self._own.shape[1])
         data = ca.SX.sym("data", 3 + 1 + 1)  # ŷ, 1/σ, place in the window
@@ -105,10 +114,11 @@ class Observation:
             beyond = 2 * self.huber * ca.sqrt(ca.fmax(square, limit)) - limit
             loss = ca.if_else(square > limit, beyond, square)
         hessian, gradient = ca.hessian(loss, u)
-        return (
+        return _Sample(
             ca.Function("value", [u, data], [residual]),
             ca.Function("slope", [u, data], [residual, ca.densify(ca.jacobian(residual, u))]),
-            ca.Function("loss", [u, data], [loss, gradient, ca.densify(hessian)], {"cse": True}),
+            ca.Function("loss", [u, data], [loss, gradient]),
+            ca.Function("hessian", [u, data], [ca.densify(hessian)], {"cse": True}),
         )
 
     def _reading(self, nodes: ca.SX, own: ca.SX, place: ca.SX) -> ca.SX:
@@ -156,11 +166,10 @@ class Observation:
         own = np.broadcast_to(phi[self._own].T[:, None], (self._own.shape[1], *around.shape[2:]))
         return np.concatenate([around.reshape(-1, *around.shape[2:]), own])
 
-    def _mapped(self, function: int, u: Array, data: Array | None = None) -> list[Array]:
+    def _mapped(self, chosen: ca.Function, u: Array, data: Array | None = None) -> list[Array]:
         """Outputs of a function of `_sample` for the first samples, (…, samples, M) each."""
         samples, count = u.shape[1:]
         data = self._data[:, :samples] if data is None else data
-        chosen = self._sample[function]
         outputs = chosen.map(samples * count)(u.reshape(len(u), -1), data.reshape(len(data), -1))
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         shaped = []
@@ -174,7 +183,7 @@ class Observation:
 
     def residuals(self, x: Array, phi: Array) -> Array:
         """(T, 3M) of (y − ŷ) / σ at grid positions x (N, 3n); zero where missing."""
-        (values,) = self._mapped(0, self._inputs(x, phi, len(self.grid_rows)))
+        (values,) = self._mapped(self._sample.value, self._inputs(x, phi, len(self.grid_rows)))
         return np.moveaxis(values[:, 0], 0, 2).reshape(values.shape[2], -1)
 
     def at_samples(self, by_p: Array) -> Array:
@@ -208,7 +217,7 @@ class Observation:
         count, size = len(self.markers.names), shared + self.local.size
         if samples == 0:
             return np.zeros((0, count, 3)), np.zeros((0, count, 3, size))
-        values, by_u = self._mapped(1, self._inputs(x, phi, samples))
+        values, by_u = self._mapped(self._sample.slope, self._inputs(x, phi, samples))
         nodes = 3 * self._neighbours
         by_nodes = by_u[:, :nodes].reshape(3, self._neighbours, 3, samples, count)
         around = at_samples.reshape(len(at_samples), count, 3, at_samples.shape[2])
@@ -226,7 +235,7 @@ class Observation:
         u = self._inputs(x, phi, samples)
         data = self._data[:, :samples].copy()
         data[:3], data[3] = 0.0, 1.0
-        (values,) = self._mapped(0, u, data)
+        (values,) = self._mapped(self._sample.value, u, data)
         return np.moveaxis(values[:, 0], 0, 2)
 
     def of_samples(self, positions_m: Array, phi: Array) -> Array:
@@ -249,12 +258,13 @@ class Observation:
 
     def loss(self, x: Array, phi: Array) -> float:
         """L(x, φ)."""
-        return float(self._mapped(2, self._inputs(x, phi, len(self.grid_rows)))[0].sum())
+        losses, _ = self._mapped(self._sample.loss, self._inputs(x, phi, len(self.grid_rows)))
+        return float(losses.sum())
 
     def gradient(self, x: Array, phi: Array) -> tuple[Array, Array]:
         """∂L/∂x (N, 3n) and ∂L/∂φ (k,)."""
-        slope = self._mapped(2, self._inputs(x, phi, len(self.grid_rows)))[1][:, 0]
-        nodes, own = np.split(slope, [3 * self._neighbours])
+        _, slope = self._mapped(self._sample.loss, self._inputs(x, phi, len(self.grid_rows)))
+        nodes, own = np.split(slope[:, 0], [3 * self._neighbours])
         nodes = nodes.reshape(self._neighbours, 3, *nodes.shape[1:]).transpose(0, 2, 3, 1)
         at = np.zeros((len(self.grid_rows), len(self.markers.names), 3))
         for i in range(self._neighbours):
@@ -321,7 +331,7 @@ class Observation:
         return self._hessian_values(np.zeros((self.grid_rows[-1] + 1, dofs)), np.zeros(0))
 
     def _hessian_values(self, x: Array, phi: Array) -> Array:
-        by_u = self._mapped(2, self._inputs(x, phi, len(self.grid_rows)))[2]
+        (by_u,) = self._mapped(self._sample.hessian, self._inputs(x, phi, len(self.grid_rows)))
         found = self._hessian(self._operator, np.moveaxis(by_u, (0, 1), (2, 3)))
         rows, columns = self.hessian_structure
         size = columns[-1] + 1

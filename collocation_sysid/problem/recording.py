@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, SimulationError
+from ..errors import InputError, SimulationError, hint_at
 from ..experiment import (
     Experiment,
     Force,
@@ -358,8 +357,7 @@ def _nuisance(section: EstimateSection | None) -> Nuisance:
 def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> None:
     for name in given:
         if name not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = hint_at(name, names)
             raise InputError(
                 f"found {name!r}; expected names of the markers {', '.join(names)}{hint}", None, key
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..nlp.collocation import Collocation, Violation
 from ..nlp.parameters import Theta
+from ..nlp.stopwatch import Stopwatch
 
 Array = NDArray[np.float64]
 
@@ -82,6 +84,12 @@ class Timing:
     evaluations: float = 0.0
     linear_algebra: float = 0.0
     total: float = 0.0
+
+    @classmethod
+    def of(cls, watch: Stopwatch, began: float) -> Timing:
+        """What a stopwatch has added up since `began`, a `time.perf_counter`."""
+        total = time.perf_counter() - began
+        return cls(watch.build, watch.evaluations, watch.linear_algebra, total)
 
 
 @dataclass(frozen=True, eq=False)

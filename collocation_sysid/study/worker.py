@@ -59,7 +59,7 @@ def _tip(finished: Run) -> dict[str, Any]:
     tip = int(np.linalg.norm(markers.observe(nodes_m) - centre, axis=1).argmax())
     measured = markers.positions_m[:, tip]
     rollout = finished.rollouts[experiment.name]
-    rolled = rollout.readings_m[:, tip] if isinstance(rollout, Rollout) else None
+    rolled = rollout.trajectory.markers_m[:, tip] if isinstance(rollout, Rollout) else None
     error = None
     if rolled is not None and markers.present[:, tip].any():
         error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
