@@ -12,12 +12,12 @@ from .errors import InputError, SimulationError
 from .experiment import Experiment, Grasp, Markers, PoseSequence
 from .fem.body import Body
 from .fem.mesh import TetMesh
+from .methods.solution import Solution, Status
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameter, Parameters, Theta
 from .nlp.simulation import Trajectory, simulate
+from .output.record import write_run
 from .problem import Problem, load_problem
-from .record import write_run
-from .results.solution import Solution, Status
 from .run import run, solve
 
 __version__ = version("collocation-sysid")

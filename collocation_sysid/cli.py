@@ -92,11 +92,11 @@ def solve(
     quiet: Quiet = False,
 ) -> None:
     """Identify the parameters and write a run folder."""
+    from .methods.solution import Status
+    from .output.record import as_json as json_text
+    from .output.record import result, write_run
+    from .output.writers import require_replaceable
     from .problem import load_problem
-    from .record import as_json as json_text
-    from .record import result, write_run
-    from .results.solution import Status
-    from .results.writers import require_replaceable
     from .run import run
     from .terminal import Progress, summary
 
@@ -259,7 +259,7 @@ class _Study:
 
 def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: bool) -> None:
     """Do the runs that are left, write the tables and plots, and print them."""
-    from .record import as_json as json_text
+    from .output.record import as_json as json_text
     from .study import RunStore, run_all
     from .study.display import StudyProgress, study_tables
     from .study.report import load_report, report_json, write_report
@@ -328,7 +328,7 @@ def plot(
     out: Out = None,
 ) -> None:
     """Draw the pictures of a run again, from its files."""
-    from .results.redraw import redraw
+    from .output.redraw import redraw
 
     _require_possible(out or run_folder)
     for file in redraw(run_folder, out or run_folder):
@@ -348,7 +348,7 @@ def report(
 
     Everything it found, pictures inside.
     """
-    from .report import comparison_page, run_page
+    from .output.report import comparison_page, run_page
 
     file = to or folder / "report.html"
     study = (folder / "summary.json").is_file()
@@ -372,7 +372,7 @@ def animate(
     """Film a run: the body as fitted beside the body as rolled out."""
     from rich.progress import Progress
 
-    from .results.animation import animate as film
+    from .output.animation import animate as film
 
     _require_possible(to.parent if to is not None else run_folder)
     with Progress(console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
@@ -398,8 +398,8 @@ def view(
 
     In a window (needs pyvista), or as a web page that needs nothing.
     """
-    from .results.view import export_page
-    from .results.view import view as show
+    from .output.view import export_page
+    from .output.view import view as show
 
     if html is None:
         show(run_folder, field, experiment)

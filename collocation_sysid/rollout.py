@@ -6,19 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array
 from .errors import SimulationError
 from .experiment import Experiment
 from .methods import METHODS
+from .methods.solution import Solution
 from .nlp.collocation import Collocation
 from .nlp.parameters import LAME, Parameter, Parameters, Theta
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem
-from .results.solution import Solution
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,16 +9,16 @@ from typing import Any
 from .errors import InputError, SimulationError, hint_at
 from .methods import METHODS
 from .methods.casadi_nlp import why_not
+from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .problem import Problem
-from .profiling import profile_of
-from .results.diagnostics import MarkerDiagnosis, diagnose
-from .results.identifiability import verdicts
-from .results.linearised import linearised_fit
-from .results.profile import Profile
-from .results.solution import Iteration, Solution, Status
-from .results.uncertainty import Uncertainty, uncertainty_of
 from .rollout import Rollout, roll_out
+from .statistics.diagnostics import MarkerDiagnosis, diagnose
+from .statistics.identifiability import verdicts
+from .statistics.linearised import linearised_fit
+from .statistics.profile import Profile
+from .statistics.profiling import profile_of
+from .statistics.uncertainty import Uncertainty, uncertainty_of
 
 Log = Callable[[str], None]
 

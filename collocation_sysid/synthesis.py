@@ -11,8 +11,8 @@ from .errors import InputError
 from .experiment import Experiment, write_markers_csv, write_poses_csv
 from .nlp.schemes import SCHEMES
 from .nlp.simulation import Trajectory, simulate
+from .output.writers import write_frames
 from .problem import Problem
-from .results.writers import write_frames
 
 
 def write_data(

@@ -12,12 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from .check import Findings
+from .methods.solution import Iteration
 from .nlp.parameters import Theta
 from .problem import Problem
-from .results.solution import Iteration
-from .results.uncertainty import Estimate
 from .rollout import Rollout
 from .run import Run
+from .statistics.uncertainty import Estimate
 
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2

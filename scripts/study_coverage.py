@@ -35,8 +35,8 @@ from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, solve
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import as_theta
 from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.results.linearised import linearised_fit
-from collocation_sysid.results.uncertainty import (
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.uncertainty import (
     ErrorsOption,
     Noise,
     Uncertainty,

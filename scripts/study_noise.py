@@ -31,7 +31,7 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.results.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import covariance
 
 Array = NDArray[np.float64]
 

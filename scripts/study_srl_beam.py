@@ -24,11 +24,11 @@ from collocation_sysid import Collocation, Problem, Solution, load_problem, solv
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.segment import Segment
-from collocation_sysid.results.diagnostics import diagnose
-from collocation_sysid.results.estimates import Estimate
-from collocation_sysid.results.identifiability import verdicts
-from collocation_sysid.results.linearised import LinearisedFit, linearised_fit
-from collocation_sysid.results.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.diagnostics import diagnose
+from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.identifiability import verdicts
+from collocation_sysid.statistics.linearised import LinearisedFit, linearised_fit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
 TRIALS = ("gravity", "load52", "load101")
 # Element and bricks along x, y and z.

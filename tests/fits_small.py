@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.results.linearised import FitBlock, LinearisedFit
+from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
 
 SAMPLE_S = 0.01
 PARAMETERS = Parameters(

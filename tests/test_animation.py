@@ -16,10 +16,10 @@ from PIL import Image
 from problem_files import TRUTH, run_command, settings, write_problem
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.results import animation
-from collocation_sysid.results.animation import Film, animate, film_samples
-from collocation_sysid.results.replay import read_run
-from collocation_sysid.results.view import frame_files, view
+from collocation_sysid.output import animation
+from collocation_sysid.output.animation import Film, animate, film_samples
+from collocation_sysid.output.replay import read_run
+from collocation_sysid.output.view import frame_files, view
 
 NODES = 36
 
@@ -181,7 +181,7 @@ def test_the_page_has_no_syntax_error(run, tmp_path):
 
 
 def test_without_pyvista_the_remedy_is_named(run, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.results.view.find_spec", lambda name: None)
+    monkeypatch.setattr("collocation_sysid.output.view.find_spec", lambda name: None)
     outcome = run_command("view", run)
     assert outcome.code == 2
     assert "pip install 'collocation-sysid[view]'" in outcome.err

@@ -14,8 +14,8 @@ from collocation_sysid.methods.augmented_lagrangian import AugmentedLagrangianOp
 from collocation_sysid.methods.penalty import PenaltyOptions
 from collocation_sysid.methods.penalty import solve as penalty
 from collocation_sysid.methods.reduced_space import solve as reduced_space
+from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.results.solution import Iteration, Status
 
 QUICK = sorted(set(SMALL_EXPERIMENTS) - {"quadratic-bar", "cube-with-unknowns", "released-cube"})
 

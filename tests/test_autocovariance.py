@@ -9,10 +9,10 @@ import pytest
 from fits_small import Problem, autoregressive, problem
 from scipy.linalg import block_diag, toeplitz
 
-from collocation_sysid.results.autocorrelation import error_processes
-from collocation_sysid.results.autocovariance import lagged_products
-from collocation_sysid.results.curvature import curvature
-from collocation_sysid.results.linearised import LinearisedFit
+from collocation_sysid.statistics.autocorrelation import error_processes
+from collocation_sysid.statistics.autocovariance import lagged_products
+from collocation_sysid.statistics.curvature import curvature
+from collocation_sysid.statistics.linearised import LinearisedFit
 
 LAG = 2
 PROBLEMS = {

@@ -24,10 +24,10 @@ from collocation_sysid.methods.casadi_nlp import (
     why_not,
 )
 from collocation_sysid.methods.reduced_space import solve as reduced_space
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.problem import load_problem
-from collocation_sysid.results.solution import Iteration, Solution, Status
 
 
 @cache

@@ -30,8 +30,8 @@ from rich.console import Console
 import collocation_sysid as cs
 from collocation_sysid import terminal
 from collocation_sysid.experiment import read_markers, read_poses
+from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem import ProblemFile, read_problem_file
-from collocation_sysid.results.solution import Iteration
 
 ROLLOUT = import_module("collocation_sysid.rollout")
 RESULT_KEYS = {

@@ -23,11 +23,11 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.continuation import ContinuationOptions, first_part, first_samples
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.problem import load_problem
-from collocation_sysid.results.solution import Iteration, Solution, Status
 from collocation_sysid.run import solve
 
 SHARES = (0.5, 1.0)

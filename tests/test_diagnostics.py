@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from collocation_sysid.results.diagnostics import MarkerDiagnosis, diagnose
-from collocation_sysid.results.linearised import FitBlock, LinearisedFit
+from collocation_sysid.statistics.diagnostics import MarkerDiagnosis, diagnose
+from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
 
 T_S = 0.01 * np.arange(160)
 SIGMA_M = 2e-4

@@ -10,10 +10,10 @@ from fits_small import PARAMETERS, Problem, autoregressive, problem
 from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
-from collocation_sysid.results.autocorrelation import dependence, error_processes
-from collocation_sysid.results.curvature import curvature
-from collocation_sysid.results.linearised import LinearisedFit
-from collocation_sysid.results.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.autocorrelation import dependence, error_processes
+from collocation_sysid.statistics.curvature import curvature
+from collocation_sysid.statistics.linearised import LinearisedFit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
 DRAWS = 150
 PROBLEMS = {

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, LAME, Parameter, Parameters
-from collocation_sysid.results.identifiability import verdicts
-from collocation_sysid.results.linearised import FitBlock, LinearisedFit
-from collocation_sysid.results.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.identifiability import verdicts
+from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
 VALUES = {"lambda_pa": 2000.0, "mu_pa": 300.0, "young_pa": 800.0, "poisson": 0.4}
 VALUES |= {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}

@@ -11,11 +11,11 @@ from problems_small import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, measured,
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPointOptions, solve
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.results.solution import Iteration, Solution, Status
 
 PRECISE = InteriorPointOptions(tolerance=1e-11)
 

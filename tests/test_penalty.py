@@ -23,10 +23,10 @@ from collocation_sysid.experiment import Experiment
 from collocation_sysid.methods.inner import FIRST_ORDER
 from collocation_sysid.methods.merit import Merit, Unconstrained
 from collocation_sysid.methods.penalty import PenaltyOptions, solve
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.results.solution import Iteration, Solution, Status
 
 NEWTON = PenaltyOptions(inner="levenberg-marquardt")
 

@@ -21,12 +21,13 @@ from problems_small import (
 )
 
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.results.pictures import (
+from collocation_sysid.output.pictures import (
     Confidence,
     album,
     confidence_ellipses,
@@ -41,14 +42,13 @@ from collocation_sysid.results.pictures import (
     spectrum,
     tracks,
 )
-from collocation_sysid.results.pictures.camera import Camera
-from collocation_sysid.results.pictures.confidence import ellipse
-from collocation_sysid.results.pictures.jacobian import RASTER, SHOWN_STEPS
-from collocation_sysid.results.pictures.mesh import apart
-from collocation_sysid.results.pictures.spectrum import spectral_density
-from collocation_sysid.results.replay import Replay
-from collocation_sysid.results.solution import Iteration, Solution, Status, Timing
-from collocation_sysid.results.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
+from collocation_sysid.output.pictures.camera import Camera
+from collocation_sysid.output.pictures.confidence import ellipse
+from collocation_sysid.output.pictures.jacobian import RASTER, SHOWN_STEPS
+from collocation_sysid.output.pictures.mesh import apart
+from collocation_sysid.output.pictures.spectrum import spectral_density
+from collocation_sysid.output.replay import Replay
+from collocation_sysid.output.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
 
 THETA = Theta(**TRUTH)
 TIMES = 0.01 * np.arange(20.0)
@@ -484,7 +484,7 @@ def test_an_experiment_can_be_read_back_from_its_arrays():
 def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
-        "import collocation_sysid.results.animation, collocation_sysid.results.redraw as r;"
+        "import collocation_sysid.output.animation, collocation_sysid.output.redraw as r;"
         "r.album([], [], []);"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )

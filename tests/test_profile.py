@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.results.profile import THRESHOLD, profile
+from collocation_sysid.statistics.profile import THRESHOLD, profile
 
 BOUNDS = (1.0, 1e6)
 BEST = 1000.0

@@ -26,12 +26,12 @@ from collocation_sysid.methods.interior_point import InteriorPointOptions
 from collocation_sysid.methods.interior_point import solve as interior_point
 from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, memory_mb, solve
 from collocation_sysid.methods.secant import updated, with_curvature
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.results.solution import Iteration, Solution, Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

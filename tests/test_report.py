@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from problem_files import TRUTH, run_command, settings, write_problem
 
-from collocation_sysid.report.run_page import verdict
+from collocation_sysid.output.report.run_page import verdict
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTHS = {"narrow": 380, "wide": 1280}

@@ -13,10 +13,10 @@ from problem_files import TRUTH, run_command, settings, write_problem
 from collocation_sysid import load_problem, run
 from collocation_sysid.experiment import read_markers, write_markers_csv
 from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.profiling import profile_of
-from collocation_sysid.record import result
-from collocation_sysid.results.linearised import linearised_fit
+from collocation_sysid.output.record import result
 from collocation_sysid.rollout import Rollout
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.profiling import profile_of
 
 UNKNOWN = "\n[experiment.estimate]\nmarker_offsets = { prior_m = 0.003 }\n"
 REDUCED = settings("solver.method=reduced-space")

@@ -15,10 +15,10 @@ import pytest
 from collocation_sysid import Problem, load_problem, run, solve, write_run
 from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.results.solution import Solution
-from collocation_sysid.results.uncertainty import Uncertainty, covariance
 from collocation_sysid.run import Run
+from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # A folder with the C3D files of scripts/get_srl_beam.py.

@@ -33,11 +33,11 @@ from collocation_sysid.methods.shooting import (
     simulated,
     solve,
 )
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.results.sensitivity import sensitivities
-from collocation_sysid.results.solution import Iteration, Solution, Status
+from collocation_sysid.statistics.sensitivity import sensitivities
 
 # As an attribute of the package the name is that of the method.
 shooting = importlib.import_module("collocation_sysid.methods.shooting")

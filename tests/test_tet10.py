@@ -20,8 +20,8 @@ from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.output.writers import write_frames
 from collocation_sysid.problem import load_problem
-from collocation_sysid.results.writers import write_frames
 from collocation_sysid.synthesis import write_data
 
 TET10 = element_named("tet10")

@@ -22,7 +22,7 @@ from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, Parameter, Parameters, Theta
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.results.uncertainty import (
+from collocation_sysid.statistics.uncertainty import (
     covariance,
     marker_sensitivities,
     sensitivities,

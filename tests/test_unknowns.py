@@ -24,7 +24,7 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.local import Local
 from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.results.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import covariance
 
 ONE_OF_EACH = {
     "offset": Nuisance(marker_offset_m=0.003),

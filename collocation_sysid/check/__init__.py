@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
 from ..nlp.schemes import scheme_named
@@ -33,7 +34,6 @@ __all__ = [
     "check_problem",
 ]
 
-Array = NDArray[np.float64]
 
 # Agreement with fourth-order central differences that rounding allows.
 AGREEMENT = 1e-6

@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..methods.reduced_space import memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.tangent import BlockSolver
-
-Array = NDArray[np.float64]
 
 # Rows timed, and sweeps that the reduced space mostly takes.
 ROWS, SWEEPS = 12, 10

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..nlp.collocation import Collocation
 from ..problem import Problem
-
-Array = NDArray[np.float64]
 
 # All kinds of rows are among these samples; derivatives do not depend on how many follow.
 SAMPLES = 12

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..fem.body import Body
 from ..fem.mesh import TetMesh
 from ..nlp.parameters import Theta
-
-Array = NDArray[np.float64]
 
 # Mean-ratio quality below which an element's shape functions are poor.
 FLAT = 0.1

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..experiment.experiment import Experiment
-
-Array = NDArray[np.float64]
 
 # Of the mean edge length: beyond this, a marker's place is mostly extrapolation.
 FAR = 0.5

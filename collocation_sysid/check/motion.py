@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from ..fem.pattern import dofs_of
@@ -16,8 +17,6 @@ from ..nlp.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_neede
 from ..nlp.parameters import Theta
 from ..nlp.rest import rest_state
 from ..nlp.schemes import Scheme
-
-Array = NDArray[np.float64]
 
 COUNT = 6
 # A scheme may add this share of the physical damping ratio, or this ratio where there is little.

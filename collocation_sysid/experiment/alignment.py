@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..arrays import Array
 from ..errors import InputError
-from .arrays import FloatArray
 from .clock import STEP_TOLERANCE, even_times_s, rounding_s, sample_interval_s
 from .grasp import PoseSequence
 from .readers import MarkerTable
@@ -24,7 +24,7 @@ def align(
     window_s: tuple[float, float] | None = None,
     resample_hz: float | None = None,
     every: int = 1,
-) -> tuple[FloatArray, PoseSequence, MarkerTable]:
+) -> tuple[Array, PoseSequence, MarkerTable]:
     """Put poses and markers on one evenly spaced time grid.
 
     Without `resample_hz` the grid is the markers' own time and no measurement is changed; the
@@ -87,7 +87,7 @@ def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
 
 def _resample(
     poses: PoseSequence, table: MarkerTable, rate_hz: float
-) -> tuple[FloatArray, PoseSequence, MarkerTable]:
+) -> tuple[Array, PoseSequence, MarkerTable]:
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
     t_s = table.t_s
@@ -106,7 +106,7 @@ def _resample(
     return grid, PoseSequence(grid, positions_m, quaternions, poses.interpolation), resampled
 
 
-def _between_neighbours(table: MarkerTable, grid: FloatArray) -> FloatArray:
+def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
     """Marker positions on the grid; NaN beside a missing sample or in a gap of the time."""
     t_s, x = table.t_s, table.positions_m
     k = np.clip(np.searchsorted(t_s, grid, side="right") - 1, 0, len(t_s) - 2)
@@ -120,7 +120,7 @@ def _between_neighbours(table: MarkerTable, grid: FloatArray) -> FloatArray:
     return np.where(on_earlier, x[k], np.where(on_later, x[k + 1], between))
 
 
-def _matched(poses: PoseSequence, t_s: FloatArray, step_s: float, grid: FloatArray) -> PoseSequence:
+def _matched(poses: PoseSequence, t_s: Array, step_s: float, grid: Array) -> PoseSequence:
     """Poses from the first to the last marker time, with their samples moved onto the grid."""
     if len(poses.t_s) == 1:
         return poses
@@ -139,7 +139,7 @@ def _matched(poses: PoseSequence, t_s: FloatArray, step_s: float, grid: FloatArr
     )
 
 
-def _mismatch(poses: PoseSequence, t_s: FloatArray, lacking_s: float) -> str:
+def _mismatch(poses: PoseSequence, t_s: Array, lacking_s: float) -> str:
     found = (
         f"there is no pose at the marker time {lacking_s:.9g} s: poses run from "
         f"{poses.t_s[0]:.9g} s to {poses.t_s[-1]:.9g} s at {_rate_hz(poses.t_s):.6g} Hz, "
@@ -150,5 +150,5 @@ def _mismatch(poses: PoseSequence, t_s: FloatArray, lacking_s: float) -> str:
     return f"{found}; cut the experiment with window_s, and set resample_hz if the rates differ"
 
 
-def _rate_hz(t_s: FloatArray) -> float:
+def _rate_hz(t_s: Array) -> float:
     return (len(t_s) - 1) / float(t_s[-1] - t_s[0])

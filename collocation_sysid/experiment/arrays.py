@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array, Index
 from ..errors import InputError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def read_only_floats(
     values: ArrayLike, shape: tuple[int | None, ...], name: str, finite: bool = True
-) -> FloatArray:
+) -> Array:
     """Return a read-only copy of `values`, whose shape must match `shape` (None: any length).
 
     Raises
@@ -33,7 +31,7 @@ def read_only_floats(
     return array
 
 
-def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> FloatArray:
+def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
     """Return a read-only copy of marker positions (T, M, 3).
 
     A sample with a coordinate that is not finite is missing: all three become NaN.
@@ -45,7 +43,7 @@ def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str
     return tracks
 
 
-def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> IntArray:
+def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Index:
     """Return a read-only int64 copy of node numbers, whose shape must match `shape`.
 
     Raises

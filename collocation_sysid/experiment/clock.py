@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import InputError
-from .arrays import FloatArray
 
 STEP_TOLERANCE = 0.01
 # Rounding of printed times is forgiven up to this part of a step, so that no lost frame passes.
@@ -57,7 +57,7 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     return mean_s
 
 
-def first_time_fault(t_s: FloatArray) -> tuple[int, str] | None:
+def first_time_fault(t_s: Array) -> tuple[int, str] | None:
     """Return the index of the first time that does not follow the one before, and say so."""
     faulty = np.flatnonzero(~(np.diff(t_s) > 0.0))
     if not faulty.size:
@@ -66,12 +66,12 @@ def first_time_fault(t_s: FloatArray) -> tuple[int, str] | None:
     return row, f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase"
 
 
-def even_times_s(t_s: FloatArray) -> FloatArray:
+def even_times_s(t_s: Array) -> Array:
     """Return as many exactly even times between the same first and last time."""
     return np.linspace(t_s[0], t_s[-1], len(t_s))
 
 
-def rounding_s(t_s: FloatArray) -> float:
+def rounding_s(t_s: Array) -> float:
     """Return the unit of the last decimal if rounding to it made even times uneven, else 0.
 
     Times of 30 Hz printed as 0.033, 0.067, 0.1 give 0.001; times 0.01, 0.02, 0.03 are even as

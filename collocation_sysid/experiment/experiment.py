@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import FloatArray, IntArray, read_only_floats
+from .arrays import read_only_floats
 from .clock import STEP_TOLERANCE, sample_interval_s
 from .grasp import Grasp, held_nodes
 from .loads import Force, PointMass
@@ -68,14 +69,14 @@ class Experiment:
 
     name: str
     body: Body
-    t_s: FloatArray
+    t_s: Array
     grasps: tuple[Grasp, ...]
     markers: Markers
-    gravity_m_s2: FloatArray
+    gravity_m_s2: Array
     start: Start = "equilibrium"
     start_rule: StartRule = "standard"
-    start_positions_m: FloatArray | None = None
-    start_velocities_m_s: FloatArray | None = None
+    start_positions_m: Array | None = None
+    start_velocities_m_s: Array | None = None
     validation: bool = False
     masses: tuple[PointMass, ...] = ()
     forces: tuple[Force, ...] = ()
@@ -101,17 +102,17 @@ class Experiment:
         return float(self.t_s[-1] - self.t_s[0])
 
     @cached_property
-    def held_nodes(self) -> IntArray:
+    def held_nodes(self) -> Index:
         """Nodes that are grasped throughout, sorted."""
         held, _ = self.grasped(self.t_s)
         return np.flatnonzero(held.all(axis=0))
 
     @cached_property
-    def free_nodes(self) -> IntArray:
+    def free_nodes(self) -> Index:
         """All other nodes, sorted; grasps with a time window may hold some for a while."""
         return np.setdiff1d(np.arange(len(self.body.nodes_m)), self.held_nodes)
 
-    def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], FloatArray]:
+    def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
         """Return which nodes are held at the times `t_s` (T,), and where.
 
         Returns
@@ -130,11 +131,11 @@ class Experiment:
             positions[np.ix_(here, grasp.nodes)] = grasp.carry(self.body.nodes_m, times[here])
         return held, positions
 
-    def held_positions(self, t_s: ArrayLike) -> FloatArray:
+    def held_positions(self, t_s: ArrayLike) -> Array:
         """Return where `held_nodes` are carried at `t_s` (T,), as (T, held, 3) metres."""
         return self.grasped(t_s)[1][:, self.held_nodes]
 
-    def node_mass_kg(self, t_s: ArrayLike) -> FloatArray:
+    def node_mass_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         mass = np.broadcast_to(self.body.node_mass, (len(times), n))
@@ -142,7 +143,7 @@ class Experiment:
             mass = mass + point.at_nodes(times, n)
         return mass
 
-    def node_forces_n(self, t_s: ArrayLike) -> FloatArray:
+    def node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the forces besides gravity on the nodes at `t_s` (T,), (T, n, 3)."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
@@ -150,7 +151,7 @@ class Experiment:
             total = total + force.at_nodes(times, n)
         return total
 
-    def rigid_positions(self, t_s: ArrayLike) -> FloatArray:
+    def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
 
         That is the first grasp that holds throughout, else the first. Without a grasp the body
@@ -236,7 +237,7 @@ class Experiment:
             )
 
 
-def _fixes_a_body(points_m: FloatArray) -> bool:
+def _fixes_a_body(points_m: Array) -> bool:
     """Whether holding these points leaves no rigid motion."""
     if len(points_m) < 3:
         return False

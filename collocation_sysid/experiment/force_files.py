@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arrays import Array
 from ..errors import InputError
-from .arrays import FloatArray
 from .clock import first_time_fault
 from .formats.plain import read_grid
 from .formats.text import decode, listed, numbers, read_bytes
@@ -13,7 +13,7 @@ from .formats.text import decode, listed, numbers, read_bytes
 FORCE_COLUMNS = ("t_s", "fx_n", "fy_n", "fz_n")
 
 
-def read_forces(path: str | Path) -> tuple[FloatArray, FloatArray]:
+def read_forces(path: str | Path) -> tuple[Array, Array]:
     """Read a force over time, its columns in any order.
 
     Returns

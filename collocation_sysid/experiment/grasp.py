@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import FloatArray, IntArray, read_only_floats, read_only_nodes
+from .arrays import read_only_floats, read_only_nodes
 from .clock import first_time_fault
 
 Interpolation = Literal["linear", "hold"]
@@ -51,9 +52,9 @@ class PoseSequence:
         of unit norm; the first bad row is named, counting from 1.
     """
 
-    t_s: FloatArray
-    positions_m: FloatArray
-    quaternions_xyzw: FloatArray
+    t_s: Array
+    positions_m: Array
+    quaternions_xyzw: Array
     interpolation: Interpolation = "linear"
 
     def __post_init__(self) -> None:
@@ -80,7 +81,7 @@ class PoseSequence:
         """Return the identity pose for all time: grasped nodes stay where they are undeformed."""
         return cls(np.array([t0_s]), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
 
-    def at(self, t_s: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return the poses at the times `t_s` (k,).
 
         Up to half a sample before the first and after the last pose is allowed: "linear" continues
@@ -113,7 +114,7 @@ class PoseSequence:
         rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
         return rotations, self.positions_m[k] + fraction * step_m
 
-    def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> FloatArray:
+    def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
         """Return where the undeformed points (k, 3) are carried at `t_s` (T,), as (T, k, 3)."""
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
@@ -124,11 +125,11 @@ class PoseSequence:
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
-    def _turns(self) -> FloatArray:
+    def _turns(self) -> Array:
         """Rotation vector from each sample to the next, in the frame of the earlier one."""
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 
-    def _require_covered(self, times: FloatArray) -> None:
+    def _require_covered(self, times: Array) -> None:
         first_step, last_step = np.diff(self.t_s)[[0, -1]]
         earliest = self.t_s[0] - max(0.5 * first_step, _TIME_TOLERANCE_S)
         latest = self.t_s[-1] + max(0.5 * last_step, _TIME_TOLERANCE_S)
@@ -155,7 +156,7 @@ class Grasp:
         First and last time at which they are held; throughout by default.
     """
 
-    nodes: IntArray
+    nodes: Index
     poses: PoseSequence
     from_s: float = -np.inf
     until_s: float = np.inf
@@ -179,12 +180,12 @@ class Grasp:
             times <= self.until_s + _TIME_TOLERANCE_S
         )
 
-    def carry(self, nodes_m: FloatArray, t_s: ArrayLike) -> FloatArray:
+    def carry(self, nodes_m: Array, t_s: ArrayLike) -> Array:
         """Return where the body's nodes (n, 3) that it holds are at `t_s` (T,), (T, h, 3)."""
         return self.poses.carry(nodes_m[self.nodes], t_s)
 
 
-def held_nodes(grasps: Sequence[Grasp]) -> IntArray:
+def held_nodes(grasps: Sequence[Grasp]) -> Index:
     """Return all nodes that are grasped at some time, sorted.
 
     Raises
@@ -203,7 +204,7 @@ def held_nodes(grasps: Sequence[Grasp]) -> IntArray:
 
 
 def first_pose_fault(
-    t_s: FloatArray, positions_m: FloatArray, quaternions_xyzw: FloatArray
+    t_s: Array, positions_m: Array, quaternions_xyzw: Array
 ) -> tuple[int, str] | None:
     """Return the index of the first unusable pose and what is wrong with it; None if all are fine.
 
@@ -226,7 +227,7 @@ def first_pose_fault(
     return None
 
 
-def _unit_and_continuous(quaternions: FloatArray) -> FloatArray:
+def _unit_and_continuous(quaternions: Array) -> Array:
     """Normalise, and flip signs so that neighbours lie in the same half of the sphere."""
     unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     aligned = np.sum(unit[1:] * unit[:-1], axis=1) >= 0.0

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import FloatArray, IntArray, read_only_floats, read_only_nodes
+from .arrays import read_only_floats, read_only_nodes
 from .clock import first_time_fault
 
 # A window opens and closes at its times, also where they are rounded to just off a grid time.
@@ -30,7 +31,7 @@ class PointMass:
         When it joins the body; it then moves at the body's velocity. Always, by default.
     """
 
-    nodes: IntArray
+    nodes: Index
     mass_kg: float
     from_s: float = -np.inf
 
@@ -39,7 +40,7 @@ class PointMass:
         if not (np.isfinite(self.mass_kg) and self.mass_kg > 0):
             raise InputError(f"mass_kg of a point mass is {self.mass_kg:g}; expected more than 0")
 
-    def at_nodes(self, t_s: ArrayLike, node_count: int) -> FloatArray:
+    def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Mass that each node carries at the times `t_s` (T,), (T, n) [kg]."""
         times = np.atleast_1d(np.asarray(t_s, dtype=float))
         mass = np.zeros((len(times), node_count))
@@ -61,9 +62,9 @@ class Force:
         Times of the rows; the force is zero outside them. A single row without a time is constant.
     """
 
-    nodes: IntArray
-    force_n: FloatArray
-    t_s: FloatArray | None = None
+    nodes: Index
+    force_n: Array
+    t_s: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", _some_nodes(self.nodes, "the force"))
@@ -78,7 +79,7 @@ class Force:
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         object.__setattr__(self, "t_s", t_s)
 
-    def at_nodes(self, t_s: ArrayLike, node_count: int) -> FloatArray:
+    def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Force on each node at the times `t_s` (T,), (T, n, 3) [N]."""
         times = np.atleast_1d(np.asarray(t_s, dtype=float))
         total = np.repeat(self.force_n[:1], len(times), axis=0)
@@ -91,7 +92,7 @@ class Force:
         return force
 
 
-def _some_nodes(nodes: ArrayLike, what: str) -> IntArray:
+def _some_nodes(nodes: ArrayLike, what: str) -> Index:
     chosen = np.unique(read_only_nodes(nodes, (None,), f"nodes of {what}"))
     if chosen.size == 0:
         raise InputError(f"{what} needs at least one node; its selection found none")

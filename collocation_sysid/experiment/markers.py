@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
+from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import FloatArray, IntArray, read_only_floats, read_only_tracks
+from .arrays import read_only_floats, read_only_tracks
 from .placement import Placement, place_markers
 
 __all__ = ["Markers", "Placement", "place_markers"]
@@ -40,9 +41,9 @@ class Markers:
     """
 
     names: tuple[str, ...]
-    t_s: FloatArray
-    positions_m: FloatArray
-    sigma_m: FloatArray
+    t_s: Array
+    positions_m: Array
+    sigma_m: Array
     placement: Placement
 
     def __post_init__(self) -> None:
@@ -77,7 +78,7 @@ class Markers:
         return np.asarray(np.isfinite(self.positions_m[:, :, 0]))
 
     @property
-    def missing(self) -> IntArray:
+    def missing(self) -> Index:
         """(M,) number of missing samples of each marker."""
         return (~self.present).sum(axis=0)
 
@@ -86,7 +87,7 @@ class Markers:
         """Number of present samples over all markers."""
         return int(self.present.sum())
 
-    def observe(self, node_positions_m: ArrayLike) -> FloatArray:
+    def observe(self, node_positions_m: ArrayLike) -> Array:
         """Return marker positions (..., M, 3) for node positions (..., n, 3)."""
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         around = nodes_m[..., self.placement.nodes, :]

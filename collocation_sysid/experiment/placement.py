@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import FloatArray, IntArray, read_only_floats, read_only_nodes
+from .arrays import read_only_floats, read_only_nodes
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -45,9 +46,9 @@ class Placement:
         Number of nodes of the body.
     """
 
-    nodes: IntArray
-    weights: FloatArray
-    distance_m: FloatArray
+    nodes: Index
+    weights: Array
+    distance_m: Array
     node_count: int
 
     def __post_init__(self) -> None:
@@ -135,7 +136,7 @@ def place_markers(
 class _Shape:
     """The body in one configuration, prepared for locating points."""
 
-    def __init__(self, nodes_m: FloatArray, body: Body) -> None:
+    def __init__(self, nodes_m: Array, body: Body) -> None:
         self.nodes_m = nodes_m
         self.body = body
         corners = body.cells[:, :4]
@@ -150,12 +151,12 @@ class _Shape:
         faces, self.face_owner = _boundary_faces(corners)
         self.triangles = nodes_m[faces]
 
-    def vertex(self, node: int) -> tuple[IntArray, FloatArray]:
+    def vertex(self, node: int) -> tuple[Index, Array]:
         """Nodes and weights of a marker on a node: an element around it, all weight on the node."""
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
-    def embed(self, point: FloatArray) -> tuple[IntArray, FloatArray, float]:
+    def embed(self, point: Array) -> tuple[Index, Array, float]:
         """Nodes, weights and distance to the surface of a marker inside or outside the body."""
         depth = self._barycentric(point, slice(None)).min(axis=1)
         cell = int(np.argmax(depth))
@@ -168,11 +169,11 @@ class _Shape:
             cell = int(nearest[np.argmax(depth[nearest])])
         return self.body.cells[cell], self._weights(point, cell), distance
 
-    def _barycentric(self, point: FloatArray, cells: slice | IntArray) -> FloatArray:
+    def _barycentric(self, point: Array, cells: slice | Index) -> Array:
         rest = np.einsum("ei,eij->ej", point - self.origin[cells], self.inverse[cells])
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
-    def _weights(self, point: FloatArray, cell: int) -> FloatArray:
+    def _weights(self, point: Array, cell: int) -> Array:
         """Shape functions at the point.
 
         The corners' barycentric coordinates are exact for straight sides. Where deformation has
@@ -192,7 +193,7 @@ class _Shape:
         return best
 
 
-def _boundary_faces(corners: IntArray) -> tuple[IntArray, IntArray]:
+def _boundary_faces(corners: Index) -> tuple[Index, Index]:
     """Triangles that belong to one tetrahedron only, and that tetrahedron."""
     faces = np.concatenate([corners[:, triple] for triple in combinations(range(4), 3)])
     owner = np.tile(np.arange(len(corners)), 4)
@@ -203,7 +204,7 @@ def _boundary_faces(corners: IntArray) -> tuple[IntArray, IntArray]:
     return faces[outer], owner[outer]
 
 
-def _distance_to_triangles(point: FloatArray, triangles: FloatArray) -> FloatArray:
+def _distance_to_triangles(point: Array, triangles: Array) -> Array:
     """Distance from a point (3,) to each triangle (F, 3, 3)."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     normal = np.cross(b - a, c - a)
@@ -216,7 +217,7 @@ def _distance_to_triangles(point: FloatArray, triangles: FloatArray) -> FloatArr
     return np.where(above, to_plane, to_edges)
 
 
-def _distance_to_segments(point: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+def _distance_to_segments(point: Array, start: Array, end: Array) -> Array:
     along = end - start
     fraction = np.einsum("fi,fi->f", point - start, along) / np.einsum("fi,fi->f", along, along)
     nearest = start + np.clip(fraction, 0.0, 1.0)[:, None] * along

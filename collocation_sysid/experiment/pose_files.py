@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..arrays import Array
 from ..errors import InputError
-from .arrays import FloatArray
 from .formats.plain import read_grid
 from .formats.text import Grid, Row, decode, listed, numbers, read_bytes
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
@@ -78,9 +78,9 @@ def read_poses(
 
 def _sequence(
     path: str | Path,
-    t_s: FloatArray,
-    positions_m: FloatArray,
-    quaternions: FloatArray,
+    t_s: Array,
+    positions_m: Array,
+    quaternions: Array,
     places: list[str],
 ) -> PoseSequence:
     if fault := first_pose_fault(t_s, positions_m, quaternions):
@@ -91,7 +91,7 @@ def _sequence(
 # Columns ------------------------------------------------------------------------------------------
 
 
-def _columns(table: Grid, names: list[str] | tuple[str, ...]) -> FloatArray:
+def _columns(table: Grid, names: list[str] | tuple[str, ...]) -> Array:
     return numbers(table, [table.columns.index(name) for name in names], blank_allowed=False)
 
 
@@ -172,7 +172,7 @@ def _components(table: Grid, given: str | None, axes: list[str]) -> list[str]:
 # Matrices -----------------------------------------------------------------------------------------
 
 
-def _archive(path: str | Path) -> tuple[FloatArray, FloatArray]:
+def _archive(path: str | Path) -> tuple[Array, Array]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
@@ -194,8 +194,8 @@ def _archive(path: str | Path) -> tuple[FloatArray, FloatArray]:
 
 def _from_matrices(
     path: str | Path,
-    t_s: FloatArray,
-    matrices: FloatArray,
+    t_s: Array,
+    matrices: Array,
     length_unit: str | None,
     places: list[str],
 ) -> PoseSequence:
@@ -227,5 +227,5 @@ def _from_matrices(
     return _sequence(path, t_s, matrices[:, :3, 3] * metres, quaternions, places)
 
 
-def _row(values: FloatArray) -> str:
+def _row(values: Array) -> str:
     return ", ".join(f"{value:.4g}" for value in values)

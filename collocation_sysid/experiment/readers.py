@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError, hint_at
-from .arrays import FloatArray, read_only_floats, read_only_tracks
+from .arrays import read_only_floats, read_only_tracks
 from .clock import first_time_fault
 from .formats import Choose, RawTracks, read_tracks
 from .formats.text import listed
@@ -36,9 +37,9 @@ class MarkerTable:
         What was missing or assumed in the file, a sentence each.
     """
 
-    t_s: FloatArray
+    t_s: Array
     names: tuple[str, ...]
-    positions_m: FloatArray
+    positions_m: Array
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -162,7 +163,7 @@ def _unit(path: str | Path, raw: RawTracks, given: str | None) -> str:
     return unit
 
 
-def _times_s(path: str | Path, raw: RawTracks, given_hz: float | None) -> FloatArray:
+def _times_s(path: str | Path, raw: RawTracks, given_hz: float | None) -> Array:
     """Times of the frames: as in the file, else from the rate."""
     t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": given_hz}
     stated = {key: rate for key, rate in rates.items() if rate}
@@ -189,7 +190,7 @@ def _times_s(path: str | Path, raw: RawTracks, given_hz: float | None) -> FloatA
     return np.arange(len(raw.coordinates)) / first
 
 
-def _refuse_other_rate(path: str | Path, t_s: FloatArray, key: str, rate_hz: float) -> None:
+def _refuse_other_rate(path: str | Path, t_s: Array, key: str, rate_hz: float) -> None:
     """Lost frames spoil the mean step, and coarsely printed times the median: one must agree."""
     if len(t_s) < 2:
         return
@@ -203,7 +204,7 @@ def _refuse_other_rate(path: str | Path, t_s: FloatArray, key: str, rate_hz: flo
         )
 
 
-def _present(raw: RawTracks, names: Iterable[str]) -> tuple[FloatArray, list[str]]:
+def _present(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
     """Coordinates with NaN for every missing sample, and a sentence for each marker with some."""
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).any(axis=2))

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from ..arrays import Array
 from ..errors import InputError
-from .arrays import FloatArray, read_only_floats, read_only_tracks
+from .arrays import read_only_floats, read_only_tracks
 from .clock import STEP_TOLERANCE
 from .grasp import PoseSequence
 from .readers import MarkerTable
@@ -43,10 +44,10 @@ class RigidFit:
         Frames without three markers off one line.
     """
 
-    positions_m: FloatArray
-    quaternions_xyzw: FloatArray
-    residual_m: FloatArray
-    marker_residual_m: FloatArray
+    positions_m: Array
+    quaternions_xyzw: Array
+    residual_m: Array
+    marker_residual_m: Array
     missing: NDArray[np.bool_]
 
     def poses(self, t_s: ArrayLike) -> PoseSequence:
@@ -134,9 +135,9 @@ class TemplateFit(NamedTuple):
         Of each marker of the template; NaN for one without a sample in the window.
     """
 
-    rotation: FloatArray
-    translation_m: FloatArray
-    residual_m: FloatArray
+    rotation: Array
+    translation_m: Array
+    residual_m: Array
 
     def apply(self, table: MarkerTable) -> MarkerTable:
         """Return all markers of a table in the new frame."""
@@ -194,20 +195,20 @@ def align_to_template(
     return TemplateFit(rotations[0], translations[0], np.linalg.norm(moved - places, axis=1))
 
 
-def loosest_marker(reference_m: FloatArray, positions_m: FloatArray) -> int:
+def loosest_marker(reference_m: Array, positions_m: Array) -> int:
     """Return which marker's distances from the others changed most, of (B, 3) in one frame.
 
     A rigid fit spreads one marker's motion over all of them; distances do not.
     """
 
-    def distances(points: FloatArray) -> FloatArray:
+    def distances(points: Array) -> Array:
         return np.linalg.norm(points[:, None] - points[None], axis=2)
 
     change = np.abs(distances(positions_m) - distances(reference_m))
     return int(np.nansum(change, axis=1).argmax())
 
 
-def _fixes_rotation(points: FloatArray, weight: FloatArray) -> NDArray[np.bool_]:
+def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
     """Whether points (T, B, 3) with a weight (T, B) above 0 spread in two directions, (T,)."""
     used = (weight > 0).astype(np.float64)
     centred = (points - _mean(points, used)[:, None]) * used[:, :, None]
@@ -219,15 +220,13 @@ def _fixes_rotation(points: FloatArray, weight: FloatArray) -> NDArray[np.bool_]
     return spread[:, 1] > _FLAT * spread[:, 0]
 
 
-def _mean(points: FloatArray, weight: FloatArray) -> FloatArray:
+def _mean(points: Array, weight: Array) -> Array:
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
     present = np.where(weight[:, :, None] > 0, points, 0.0)
     return np.einsum("tb,tbi->ti", weight, present) / total[:, None]
 
 
-def _best_motions(
-    source: FloatArray, target: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
     """Rotations (T, 3, 3) and translations (T, 3) from source to target, both (T, B, 3)."""
     source_mean, target_mean = _mean(source, weight), _mean(target, weight)
     used = weight[:, :, None] > 0

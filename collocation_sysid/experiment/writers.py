@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import FloatArray
+from ..arrays import Array
 from .grasp import PoseSequence
 from .pose_files import POSE_COLUMNS
 from .readers import MarkerTable
@@ -35,7 +35,7 @@ def write_markers_csv(
     _write_csv(path, header, np.column_stack([table.t_s, tracks]))
 
 
-def _write_csv(path: str | Path, header: Sequence[str], values: FloatArray) -> None:
+def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
     """Write beside the target and rename, so that a reader never meets half a file."""
     target = Path(path)
     draft = target.with_name(f".{target.name}.{os.getpid()}.tmp")

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from .batched import Batch, Evaluator, available_threads, choose_evaluator, make_evaluator
 from .elements import Element, element_named, reference_geometry
@@ -25,7 +26,6 @@ from .nodes import Nodes
 from .pattern import SymmetricPattern, element_destinations
 from .selection import Selection
 
-Array = NDArray[np.float64]
 Theta = Sequence[float] | Array
 
 

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Index
+
 if TYPE_CHECKING:
     from .elements import Element
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class _Mesh(Protocol):

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-Index = NDArray[np.int64]
+from ..arrays import Index
 
 
 @dataclass(frozen=True, eq=False)

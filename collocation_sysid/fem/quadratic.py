@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from .mesh_checks import refuse_unknown_nodes
-
-Array = NDArray[np.float64]
 
 # Corners at the ends of the edge of each mid node, nodes 4 to 9: VTK's and meshio's order.
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))

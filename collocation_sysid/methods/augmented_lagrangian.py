@@ -15,15 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..results.solution import Solution, Status
 from .inner import Inner
+from .solution import Solution, Status
 from .stages import OutOfBudget, Stages, Watch, check_positive
-
-Array = NDArray[np.float64]
 
 # ρ rises where a stage leaves more than this share of the slack, and the solve ends where not even
 # the largest ρ leaves less than the second.

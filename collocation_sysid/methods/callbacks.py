@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..nlp.collocation import Collocation
-from ..results.solution import Iteration
+from .solution import Iteration
 
-Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
 HessianValues = Callable[[Array, float, Array, Array], None]
 

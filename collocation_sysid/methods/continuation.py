@@ -15,19 +15,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError, SimulationError
 from ..experiment.experiment import Experiment
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march_on
 from ..nlp.parameters import Parameters
-from ..results.solution import Iteration, Solution, Status, Timing
 from .method import Method
 from .multipliers import constraint_multipliers
+from .solution import Iteration, Solution, Status, Timing
 from .start import carried_rigidly
 
-Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
 
 # Fewest samples of a part.

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
 from .horizon import Point
 from .multipliers import constraint_multipliers
-
-Array = NDArray[np.float64]
 
 
 def exact_curvature(

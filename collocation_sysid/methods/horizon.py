@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
@@ -17,9 +17,6 @@ from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver, Tangent
 from .robust import huberised
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.

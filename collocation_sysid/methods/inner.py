@@ -12,17 +12,16 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, OptimizeResult
 from scipy.optimize import minimize as scipy_minimise
 
+from ..arrays import Array
 from ..errors import InputError
 from .cg_descent import CgDescentOptions
 from .cg_descent import minimise as cg_descent
 from .levenberg_marquardt import minimise as levenberg_marquardt
 from .merit import Merit
 
-Array = NDArray[np.float64]
 Report = Callable[[Array, float, Array], None]
 
 Inner = Literal["cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"]

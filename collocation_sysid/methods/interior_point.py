@@ -9,16 +9,14 @@ from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..results.solution import Solution, Status
 from .callbacks import Monitor, NlpFunctions, Watch
 from .nlpsol import build, interruptible, timing
+from .solution import Solution, Status
 from .start import initial_variables
-
-Array = NDArray[np.float64]
 
 Hessian = Literal["exact", "gauss-newton", "limited-memory"]
 

@@ -16,17 +16,14 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
 from scipy.optimize import lsq_linear
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from ..arrays import Array, Index
 from ..errors import InputError
 from ..nlp.lapack import cholesky_in_place, one_blas_thread
 from .merit import Merit, Unconstrained
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 

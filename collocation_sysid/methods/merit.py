@@ -12,13 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from ..arrays import Array, Index
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class Unconstrained:

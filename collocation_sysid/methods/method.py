@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ..results.solution import Solution
+from .solution import Solution
 
 
 @dataclass(frozen=True)

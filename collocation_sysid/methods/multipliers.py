@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver
-
-Array = NDArray[np.float64]
 
 
 def constraint_multipliers(

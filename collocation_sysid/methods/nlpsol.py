@@ -14,8 +14,8 @@ from typing import Any
 import casadi as ca
 
 from ..errors import InputError
-from ..results.solution import Timing
 from .callbacks import Monitor, NlpFunctions
+from .solution import Timing
 
 
 def build(

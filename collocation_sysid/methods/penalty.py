@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..results.solution import Solution, Status
 from .inner import Inner
+from .solution import Solution, Status
 from .stages import OutOfBudget, Stages, Watch, check_positive
-
-Array = NDArray[np.float64]
 
 Schedule = Literal["constant", "geometric", "progress"]
 

@@ -19,18 +19,16 @@ even a rung cannot be simulated as a whole, the rows that can be are solved firs
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.lapack import one_blas_thread
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
-from ..results.solution import Solution, Status, Timing
 from .multipliers import constraint_multipliers
 from .search import ReducedSpaceOptions, Search, Watch
-
-Array = NDArray[np.float64]
+from .solution import Solution, Status, Timing
 
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0

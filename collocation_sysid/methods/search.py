@@ -8,19 +8,18 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from ..arrays import Array
 from ..errors import InputError, SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.stopwatch import Stopwatch
-from ..results.solution import Iteration, Status
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
 from .secant import updated, with_curvature
+from .solution import Iteration, Status
 
-Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
 
 

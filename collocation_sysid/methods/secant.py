@@ -8,12 +8,10 @@ Dennis, Gay and Welsch (NL2SOL, 1981) makes it superlinear at no cost.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ..arrays import Array
 from .horizon import Point
-
-Array = NDArray[np.float64]
 
 # B may not take more than this share of the curvature of SᵀS away in any direction.
 LARGEST_SHARE = 0.9

@@ -22,19 +22,18 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
+from ..arrays import Array
 from ..errors import InputError, SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march_on
 from ..nlp.stopwatch import Stopwatch
-from ..results.solution import Iteration, Solution, Status, Timing
 from .horizon import Horizon
 from .multipliers import constraint_multipliers
+from .solution import Iteration, Solution, Status, Timing
 from .start import carried_rigidly
 
-Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
 Gradient = Literal["forward", "adjoint"]
 

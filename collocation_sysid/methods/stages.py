@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
-from ..results.solution import Iteration, Solution, Status, Timing
 from .inner import FIRST_ORDER, Inner, check_inner, minimise
 from .merit import Merit, Unconstrained
+from .solution import Iteration, Solution, Status, Timing
 from .start import initial_variables
 
-Array = NDArray[np.float64]
 Watch = Callable[[Iteration], None]
 
 # Iterations between lines of the history; those of first order are many and cheap.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march
@@ -12,8 +12,6 @@ from ..nlp.newton import Solver
 from ..nlp.parameters import Theta
 from ..nlp.rest import start_state
 from ..nlp.segment import Segment
-
-Array = NDArray[np.float64]
 
 
 def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:

@@ -31,16 +31,13 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from .parameters import Parameters, Theta
 from .segment import Segment
 from .setting import Setting
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

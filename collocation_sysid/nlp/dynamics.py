@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
 from .parameters import Theta
 from .schemes import Scheme, scheme_named
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

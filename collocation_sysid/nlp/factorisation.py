@@ -14,17 +14,14 @@ from typing import Literal, Protocol
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
+from ..arrays import Array, Index
 from ..fem.batched import in_slices
 from ..fem.pattern import SymmetricPattern
 from .lapack import cholesky_in_place
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 Choice = Literal["auto", "band", "sparse"]
 

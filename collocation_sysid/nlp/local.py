@@ -25,9 +25,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..experiment.experiment import Experiment
-
-Array = NDArray[np.float64]
 
 # A time shift stays within this many samples: markers are read between neighbouring samples.
 LARGEST_SHIFT_SAMPLES = 2.0

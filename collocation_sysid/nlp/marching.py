@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from .dynamics import Dynamics
@@ -16,7 +16,6 @@ from .parameters import Theta
 from .rest import start_state
 from .stopwatch import Stopwatch
 
-Array = NDArray[np.float64]
 Progress = Callable[[float], None]
 
 

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from ..arrays import Array, Index
 from ..fem.body import Body
 from .factorisation import Factor, Factoriser
 from .parameters import Theta
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # ω² below this share of the largest K_ii / M_ii is zero up to rounding.
 RIGID = 1e-12

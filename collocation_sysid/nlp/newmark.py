@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
@@ -15,7 +16,6 @@ from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_er
 from .parameters import Theta
 from .rest import start_state
 
-Array = NDArray[np.float64]
 Progress = Callable[[float], None]
 
 

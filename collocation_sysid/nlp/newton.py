@@ -9,13 +9,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from ..fem.pattern import dofs_of
 from .factorisation import Factor, Factoriser
 from .stopwatch import Stopwatch
 
-Array = NDArray[np.float64]
 Residual = Callable[[Array], Array]
 Linearise = Callable[[Array], tuple[Array, Array]]
 T = TypeVar("T")

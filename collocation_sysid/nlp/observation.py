@@ -18,13 +18,10 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from ..arrays import Array, Index
 from ..experiment.markers import Markers
 from .local import Local, rotation
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5

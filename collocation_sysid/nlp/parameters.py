@@ -17,11 +17,9 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
-
-Array = NDArray[np.float64]
 
 LAME = ("lambda_pa", "mu_pa")
 ENGINEERING = ("young_pa", "poisson")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, Solver, simulation_error
 from .parameters import Theta
-
-Array = NDArray[np.float64]
 
 
 @one_blas_thread()

@@ -11,8 +11,8 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
@@ -23,9 +23,6 @@ from .observation import Observation
 from .parameters import Parameters, Theta
 from .passing import PassingGrasps
 from .setting import Setting
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class Segment:

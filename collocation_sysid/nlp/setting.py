@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from .dynamics import Dynamics
 from .parameters import Theta
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

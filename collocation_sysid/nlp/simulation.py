@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from .dynamics import Dynamics
@@ -15,8 +16,6 @@ from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
 from .parameters import Parameters, as_theta
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

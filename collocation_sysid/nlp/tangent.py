@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .factorisation import Choice, Factor, Factoriser
@@ -31,9 +31,6 @@ from .parameters import Theta
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Element results and factors of this size at most are kept at a time.
 CHUNK_BYTES = 128e6

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError, SimulationError, hint_at
 from ..experiment import (
     Experiment,
@@ -44,7 +45,6 @@ from .recording_schema import (
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
-Array = NDArray[np.float64]
 Build = Callable[[Markers], Experiment]
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.

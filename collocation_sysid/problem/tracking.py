@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..experiment import (
     MarkerTable,
@@ -18,8 +18,6 @@ from ..experiment import (
 )
 from ..experiment.rigid import loosest_marker
 from .recording_schema import ExperimentSection, GraspSection, MarkersSection
-
-Array = NDArray[np.float64]
 
 # A frame is reported when its residual is this many times the usual one, and above rounding.
 UNUSUAL, ROUNDING = 3.0, 1e-6

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from ..results.style import (
+from ..output.style import (
     BLACK,
     BLUE,
     CYCLE,

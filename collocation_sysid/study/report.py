@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..record import as_json
+from ..output.record import as_json
 from ..terminal import UNITS
 from .plan import PlannedRun, short_keys
 from .plots import comparison_plots, sweep_plots

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..record import as_json
+from ..output.record import as_json
 
 # What became of a run.
 FINISHED, ERROR, TIMEOUT, CRASHED, STOPPED = "finished", "error", "timeout", "crashed", "stopped"

@@ -18,8 +18,8 @@ import numpy as np
 
 from ..errors import InputError, SimulationError
 from ..experiment.grasp import held_nodes
+from ..output.record import as_json, result
 from ..problem import load_problem
-from ..record import as_json, result
 from ..rollout import Rollout
 from ..run import Run, run
 from .store import ERROR, FINISHED, write_whole

@@ -53,10 +53,7 @@ from collocation_sysid.check import check_problem
 from collocation_sysid.experiment.nuisance import Nuisance
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.profiling import profile_of
-from collocation_sysid.results.diagnostics import diagnose
-from collocation_sysid.results.linearised import linearised_fit
-from collocation_sysid.results.style import (
+from collocation_sysid.output.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -67,7 +64,10 @@ from collocation_sysid.results.style import (
     legend,
     new_figure,
 )
-from collocation_sysid.results.uncertainty import uncertainty_of
+from collocation_sysid.statistics.diagnostics import diagnose
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.profiling import profile_of
+from collocation_sysid.statistics.uncertainty import uncertainty_of
 
 mpl.rcParams["figure.dpi"] = 110
 HERE = [Path.cwd(), *Path.cwd().parents]

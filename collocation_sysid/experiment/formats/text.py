@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ...arrays import Array
 from ...errors import InputError
-from ..arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def grid(path: str | Path, columns: list[str], rows: list[Row]) -> Grid:
     return Grid(Path(path), columns, rows)
 
 
-def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> FloatArray:
+def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
     """The cells of some columns as (rows, columns); NaN where blank.
 
     Raises
@@ -145,7 +145,7 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> FloatArr
     return values
 
 
-def tracks(grid: Grid, first_columns: Sequence[int]) -> FloatArray:
+def tracks(grid: Grid, first_columns: Sequence[int]) -> Array:
     """Coordinates (rows, M, 3) of markers whose x stands in `first_columns`, y and z after it."""
     columns = [first + axis for first in first_columns for axis in range(3)]
     return numbers(grid, columns, blank_allowed=True).reshape(-1, len(first_columns), 3)

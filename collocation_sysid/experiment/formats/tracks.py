@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from ..arrays import FloatArray
+from ...arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +40,10 @@ class RawTracks:
     """
 
     labels: Sequence[str]
-    coordinates: FloatArray
+    coordinates: Array
     unit: str | None = None
     unit_key: str = ""
-    t_s: FloatArray | None = None
+    t_s: Array | None = None
     rate_hz: float | None = None
     rate_key: str = ""
     lines: Sequence[int] | None = None

@@ -9,9 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..expressions import PointKernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,185 @@
+"""What every method returns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import Array
+from ..nlp.collocation import Collocation, Violation
+from ..nlp.parameters import Theta
+from ..nlp.stopwatch import Stopwatch
+
+
+class Status(Enum):
+    """How a solve ended; the value is the name in files, `sentence` is for people."""
+
+    CONVERGED = "converged"
+    ACCEPTABLE = "acceptable"
+    ITERATION_LIMIT = "iteration-limit"
+    TIME_LIMIT = "time-limit"
+    INFEASIBLE = "infeasible"
+    STALLED = "stalled"
+    DIVERGED = "diverged"
+    NUMERICAL_FAILURE = "numerical-failure"
+    INTERRUPTED = "interrupted"
+    REFUSED = "refused"
+    NOT_SIMULABLE = "not-simulable"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the answer satisfies the solver's tolerances."""
+        return self in (Status.CONVERGED, Status.ACCEPTABLE)
+
+    @property
+    def sentence(self) -> str:
+        """One sentence for people."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.CONVERGED: "Converged: the optimality conditions hold to the tolerance.",
+    Status.ACCEPTABLE: "Converged to the acceptable tolerance only; progress ended before the "
+    "desired one.",
+    Status.ITERATION_LIMIT: "Stopped at the iteration limit; raise max_iterations or start from a "
+    "better guess.",
+    Status.TIME_LIMIT: "Stopped at the time limit.",
+    Status.INFEASIBLE: "The equations of motion could not be satisfied from this start; check "
+    "grasp, mass and units, or start from another guess.",
+    Status.STALLED: "The steps became too small to make progress; check scaling and guess.",
+    Status.DIVERGED: "The iterates grew without bound; check units and bounds.",
+    Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
+    "guess or linear solver may help.",
+    Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
+    Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
+    "damped parameters, or use interior-point, which needs no simulation.",
+    Status.REFUSED: "The solver refused the problem or one of its options.",
+}
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of the history."""
+
+    number: int
+    loss: float
+    rms_m: float
+    violation_n: float
+    theta: Theta
+    time_s: float
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Where the time went [s]."""
+
+    build: float = 0.0
+    evaluations: float = 0.0
+    linear_algebra: float = 0.0
+    total: float = 0.0
+
+    @classmethod
+    def of(cls, watch: Stopwatch, began: float) -> Timing:
+        """What a stopwatch has added up since `began`, a `time.perf_counter`."""
+        total = time.perf_counter() - began
+        return cls(watch.build, watch.evaluations, watch.linear_algebra, total)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Parameters and trajectory found by a method, converged or not.
+
+    Attributes
+    ----------
+    status : Status
+    message : str
+        A sentence for people, with what the solver said.
+    method : str
+    collocation : Collocation
+        The problem that was solved.
+    z : (variables,) the final variables, see `nlp.collocation`
+    multipliers : (constraints,) of g, in the scaling of the NLP
+    iterations : int
+    history : sequence of Iteration
+    timing : Timing
+    notes : sequence of str
+        What the user should know, such as how the solve was started.
+    evaluations : int
+        How often the method asked for residuals or derivatives of whole trajectories; a sweep
+        and a simulation count as one.
+    """
+
+    status: Status
+    message: str
+    method: str
+    collocation: Collocation
+    z: Array
+    multipliers: Array
+    iterations: int
+    history: Sequence[Iteration]
+    timing: Timing
+    notes: Sequence[str] = field(default=())
+    evaluations: int = 0
+
+    @property
+    def q(self) -> Array:
+        """(nq,) logarithms of the estimated parameters."""
+        return self.z[: self.collocation.nq]
+
+    @property
+    def theta(self) -> Theta:
+        """(λ, μ, γ_r, γ_m)."""
+        return self.collocation.theta(self.z)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by the user's names."""
+        return self.collocation.parameters.values(self.q)
+
+    @property
+    def positions_m(self) -> list[Array]:
+        """Node positions (N, n, 3) on the collocation grid of each fitted experiment."""
+        _, positions = self.collocation.unpack(self.z)
+        return [x.reshape(len(x), -1, 3) for x in positions]
+
+    @cached_property
+    def readings_m(self) -> list[Array]:
+        """Fitted markers (T, M, 3) of each experiment, with its own unknowns."""
+        collocation = self.collocation
+        _, positions = collocation.unpack(self.z)
+        own = collocation.unpack_own(self.z)
+        return [
+            segment.observation.predicted(x, phi)
+            for segment, x, phi in zip(collocation.segments, positions, own, strict=True)
+        ]
+
+    @cached_property
+    def rms_m(self) -> float:
+        """Root mean square distance of markers from their measurements."""
+        return self.collocation.rms_m(self.z)
+
+    @cached_property
+    def max_violation_n(self) -> float:
+        """Largest residual of the equations of motion [N], evaluated afresh."""
+        violations = self.collocation.violations_n(self.z)
+        return float(max(np.abs(residual).max(initial=0.0) for residual in violations))
+
+    @cached_property
+    def max_violation_relative(self) -> float:
+        """The same over the largest force in the balance."""
+        return self.max_violation_n / max(self.collocation.largest_force_n(self.z), 1e-300)
+
+    @cached_property
+    def kkt_residual(self) -> float:
+        """Largest violation of the NLP's first-order conditions, see `Collocation`."""
+        return self.collocation.kkt_residual(self.z, self.multipliers)
+
+    @property
+    def largest_violations(self) -> list[Violation]:
+        """The worst equations of motion."""
+        return self.collocation.largest_violations(self.z)

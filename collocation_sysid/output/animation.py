@@ -1,0 +1,228 @@
+"""A run as a film: the body as fitted beside the body as rolled out, with measured markers."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..errors import InputError
+from .pictures.camera import Camera
+from .pictures.scene import (
+    Drawn,
+    View,
+    draw_directions,
+    draw_key,
+    draw_scale,
+    key,
+    sheet,
+    width_over_height,
+)
+from .replay import Replay, read_run
+from .style import TEXT_PT
+
+WIDTH_MM, TALLEST_MM, LOWEST_MM = 160.0, 110.0, 30.0
+# GIF packs badly. H.264 wants even numbers of pixels either way, see `_even`.
+PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
+HEAD_MM, FOOT_MM = 12.0, 12.0
+MOST_FRAMES = 3000
+
+Progress = Callable[[float], None]
+
+
+def animate(
+    run: str | Path,
+    to: str | Path | None = None,
+    fps: float = 25.0,
+    slow: float = 1.0,
+    experiment: str | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Film an experiment of a run from the run folder's files, and return the file.
+
+    Parameters
+    ----------
+    run : str or Path
+        A run folder.
+    to : str or Path, optional
+        A file ending in .mp4, which needs ffmpeg, or .gif; by default <experiment>.gif in the
+        run folder.
+    fps : float
+        Frames a second.
+    slow : float
+        How many times slower than the recording.
+    experiment : str, optional
+        By default the first.
+    progress : callable, optional
+        Called with the share of frames written.
+
+    Raises
+    ------
+    InputError
+        If `run` is not a run folder or has no such experiment, for another kind of file, when
+        ffmpeg is missing, and for numbers that cannot be.
+    """
+    for name, value in (("--fps", fps), ("--slow", slow)):
+        if not 0 < value < np.inf:
+            raise InputError(f"found {value:g}; expected a number above 0", None, name)
+    _, replays = read_run(run)
+    replay = chosen(replays, experiment, run)
+    file = Path(to) if to is not None else Path(run) / f"{replay.name}.gif"
+    if file.suffix.lower() not in PIXELS_WIDE:
+        raise InputError(
+            f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
+        )
+    film = Film(replay)
+    shown = film_samples(replay.t_s, fps, slow)
+    ffmpeg = _ffmpeg(file) if file.suffix.lower() == ".mp4" else None
+    file.parent.mkdir(parents=True, exist_ok=True)
+    dpi = PIXELS_WIDE[file.suffix.lower()] / (WIDTH_MM / 25.4)
+    with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
+        writer = _writer(fps, ffmpeg)
+        with writer.saving(film.figure, str(file), dpi):
+            for number, t in enumerate(shown):
+                film.show(int(t))
+                writer.grab_frame()
+                if progress is not None:
+                    progress((number + 1) / len(shown))
+    return file
+
+
+def chosen(replays: Sequence[Replay], experiment: str | None, run: str | Path) -> Replay:
+    """The experiment of that name, or the first.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name, or none with a trajectory.
+    """
+    seen = {replay.name: replay for replay in replays if _has_shapes(replay)}
+    if not seen:
+        raise InputError("no experiment of this run has a trajectory", run)
+    if experiment is None:
+        return next(iter(seen.values()))
+    if experiment not in seen:
+        raise InputError(
+            f"found {experiment!r}; expected one of {', '.join(seen)}", run, "--experiment"
+        )
+    return seen[experiment]
+
+
+def _has_shapes(replay: Replay) -> bool:
+    shapes = replay.shapes_m
+    return shapes is not None and bool(np.isfinite(shapes).all(axis=(1, 2)).any())
+
+
+def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
+    """Samples (k,) nearest to the times of a film's frames.
+
+    Raises
+    ------
+    InputError
+        If the film would have too many frames.
+    """
+    duration = float(t_s[-1] - t_s[0])
+    count = round(duration * slow * fps) + 1
+    if count > MOST_FRAMES:
+        raise InputError(
+            f"{duration:.3g} s, {slow:g} times slower, at {fps:g} frames a second make {count} "
+            f"frames, more than {MOST_FRAMES}; lower --fps or --slow"
+        )
+    wanted = np.arange(count) / (slow * fps)
+    return np.minimum(np.rint(wanted / duration * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
+
+
+class Film:
+    """The picture of one sample after another.
+
+    Attributes
+    ----------
+    figure : Figure
+    """
+
+    figure: Figure
+
+    def __init__(self, replay: Replay) -> None:
+        self.replay = replay
+        trajectories = (
+            ("fitted", replay.positions_m, replay.markers_m),
+            ("rolled out", replay.rolled_out_positions_m, replay.rolled_out_m),
+        )
+        there = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
+        # A roll-out may leave the picture where it goes astray; the fit and the markers may not.
+        outer = there[0][1][:, np.unique(replay.surface)]
+        outer = outer[np.isfinite(outer).all(axis=(1, 2))]
+        camera = Camera.facing(outer, replay.up)
+        everything = np.vstack([outer.reshape(-1, 3), replay.measured_m.reshape(-1, 3)])
+        width = WIDTH_MM / len(there)
+        aspect = width_over_height(camera, everything)
+        height = float(np.clip((width - 8) / aspect, LOWEST_MM, TALLEST_MM))
+        total = _even(HEAD_MM + height + FOOT_MM)
+        self.figure, axes = sheet(WIDTH_MM, total)
+        self.figure.set_facecolor("white")
+        self.panels = []
+        for k, (name, positions, markers) in enumerate(there):
+            corner = (k * width + 4, FOOT_MM)
+            view = View.fitting(camera, everything, (width - 8, height), corner)
+            title = axes.text(corner[0], total - 3, "", va="top", fontsize=TEXT_PT, zorder=6)
+            self.panels.append((name, positions, markers, Drawn(axes, view, replay.surface), title))
+        self._surround(axes, camera, view.mm_per_m, total)
+        self.clock = axes.text(WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT)
+
+    def _surround(self, axes: Axes, camera: Camera, mm_per_m: float, total: float) -> None:
+        draw_directions(axes, camera, (7.0, 4.0))
+        draw_scale(axes, mm_per_m, (WIDTH_MM * 0.17, 4.0))
+        draw_key(axes, key("grasped", "measured", "behind the body"), (WIDTH_MM * 0.42, 5.5))
+
+    def show(self, t: int) -> None:
+        """Show sample `t`."""
+        replay = self.replay
+        measured = replay.measured_m[t]
+        for name, positions, markers, drawn, title in self.panels:
+            drawn.show(positions[t], replay.held[t], measured)
+            distances = np.linalg.norm(markers[t] - measured, axis=1)
+            present = distances[np.isfinite(distances)]
+            off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
+            title.set_text(f"{name}: {off}")
+        self.clock.set_text(f"{replay.t_s[t] - replay.t_s[0]:.2f} s")
+
+
+def _even(height_mm: float) -> float:
+    """The next height that is an even number of pixels."""
+    per_mm = PIXELS_WIDE[".mp4"] / WIDTH_MM
+    return float(2 * np.ceil(height_mm * per_mm / 2) / per_mm)
+
+
+def _writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
+    if ffmpeg is None:
+        return PillowWriter(fps=fps)  # type: ignore[arg-type]
+    # What every browser plays.
+    return FFMpegWriter(fps=fps, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])  # type: ignore[arg-type]
+
+
+def _ffmpeg(file: Path) -> str:
+    """The ffmpeg of the system, or else of imageio-ffmpeg."""
+    if found := shutil.which("ffmpeg"):
+        return found
+    if find_spec("imageio_ffmpeg") is not None:
+        from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
+
+        try:
+            return get_ffmpeg_exe()
+        except RuntimeError:
+            pass
+    raise InputError(
+        "MP4 needs ffmpeg, which is not there: pip install 'collocation-sysid[film]', install "
+        "ffmpeg, or choose a file ending in .gif",
+        file,
+        "--to",
+    )

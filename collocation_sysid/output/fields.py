@@ -1,0 +1,96 @@
+"""What the material feels, element by element: det F, energy density, and von Mises stress.
+
+Each is the mean over the element, that is over its quadrature points by their volumes. The stress
+is Cauchy's, elastic without the damping's part: with P = ∂ψ/∂F,
+
+    σ = P Fᵀ / J,   s = σ − ⅓ (tr σ) I,   von Mises: √(3/2 s:s)
+
+(Holzapfel 2000, eqs. 3.9 and 6.4); uniaxial stress is its own von Mises stress.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Array
+from ..fem.batched import Batch, Evaluator, make_evaluator
+from ..fem.body import Body
+from ..fem.elements import Element
+from ..fem.expressions import THETA, PointKernel
+from ..fem.materials import Energy
+
+NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
+
+
+@dataclass(frozen=True, eq=False)
+class ElementFields:
+    """Evaluates the fields of a body at any states.
+
+    Attributes
+    ----------
+    body : Body
+    lambda_pa, mu_pa : float
+    """
+
+    body: Body
+    lambda_pa: float
+    mu_pa: float
+    _evaluator: Evaluator
+    _volumes: Array
+
+    @classmethod
+    def of(cls, body: Body, lambda_pa: float, mu_pa: float) -> ElementFields:
+        """Compile the fields of a body's material."""
+        kernel = field_kernel(body.element, body.material)
+        cells = len(body.cells)
+        # Every element has a place of its own, where its points add up.
+        places = len(NAMES) * np.arange(cells)[:, None] + np.arange(len(NAMES))
+        batch = Batch(kernel, body.cells, body.geometry, places, len(NAMES) * cells)
+        volumes = body.geometry[:, :, -1].sum(axis=1)
+        return cls(body, lambda_pa, mu_pa, make_evaluator(batch, body.evaluator), volumes)
+
+    def at(self, positions_m: ArrayLike) -> dict[str, Array]:
+        """The fields by `NAMES`, (T, E) each, at positions (T, n, 3).
+
+        An inverted element has no logarithm of its J: what needs one is NaN there.
+        """
+        x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, self.body.nodes_m.size)
+        sums = np.empty((len(x), len(NAMES) * len(self._volumes)))
+        theta = np.array([self.lambda_pa, self.mu_pa, 0.0])
+        self._evaluator([x], theta, sums, self.body.threads)
+        means = sums.reshape(len(x), -1, len(NAMES)) / self._volumes[:, None]
+        return {name: means[:, :, k] for k, name in enumerate(NAMES)}
+
+
+def field_kernel(element: Element, energy: Energy) -> PointKernel:
+    """The fields at a quadrature point times its volume, see `expressions` for the inputs."""
+    x = ca.SX.sym("x", 3 * element.nodes)
+    geometry = ca.SX.sym("geometry", 3 * element.nodes + 1)
+    theta = ca.SX.sym("theta", len(THETA))
+    gradients = ca.reshape(geometry[:-1], 3, element.nodes)
+    f = ca.vec(ca.reshape(x, 3, element.nodes) @ gradients.T)
+    values = ca.substitute(ca.vertcat(*_point_fields(energy, theta)), _F, f)
+    pieces = ca.densify(geometry[-1] * values)
+    inputs: Sequence[ca.SX] = (x, geometry, theta)
+    function = ca.Function(
+        "fields", inputs, [pieces], ["x", "geometry", "theta"], ["fields"], {"cse": True}
+    )
+    return PointKernel(function, ("x",), {"fields": "none"})
+
+
+_F = ca.SX.sym("F", 9)
+
+
+def _point_fields(energy: Energy, theta: ca.SX) -> tuple[ca.SX, ...]:
+    """J, ψ and the von Mises stress at the deformation gradient `_F`, column after column."""
+    f = ca.reshape(_F, 3, 3)
+    j = ca.det(f)
+    psi = energy(f, theta[0], theta[1])
+    cauchy = ca.reshape(ca.gradient(psi, _F), 3, 3) @ f.T / j
+    deviator = cauchy - ca.trace(cauchy) / 3 * ca.SX.eye(3)
+    return j, psi, ca.sqrt(1.5 * ca.sumsqr(deviator))

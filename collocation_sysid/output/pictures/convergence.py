@@ -1,0 +1,93 @@
+"""What a method went through: error, loss, violation and parameters against iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from ...arrays import Array
+from ...methods.solution import Iteration
+from ...nlp.parameters import DAMPING, LAME
+from ..style import (
+    BLACK,
+    BLUE,
+    COLUMN_MM,
+    CYCLE,
+    LINE_PT,
+    SYMBOLS,
+    TEXT_PT,
+    VERMILION,
+    dress,
+    framed_figure,
+    legend_above,
+    log_axis,
+)
+
+
+def convergence(
+    history: Sequence[Iteration],
+    names: Sequence[str] = LAME + DAMPING,
+    truth: Mapping[str, float] | None = None,
+) -> Figure:
+    """Draw marker error, loss, violation of the dynamics and parameters against iteration.
+
+    Parameters
+    ----------
+    history : sequence of Iteration
+    names : sequence of str
+        Parameters to draw, in either convention.
+    truth : mapping, optional
+        Parameters are drawn relative to these; by default to their final values.
+    """
+    figure = framed_figure(COLUMN_MM, 130, 14, 2, 9.5, 2)
+    heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
+    grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
+    panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
+    numbers = [iteration.number for iteration in history]
+    curves = (
+        ("RMS [mm]", [1e3 * i.rms_m for i in history], BLUE),
+        ("loss", [i.loss for i in history], BLUE),
+        ("violation [N]", [i.violation_n for i in history], VERMILION),
+    )
+    for axes, (label, values, colour) in zip(panels, curves, strict=False):
+        axes.plot(numbers, _positive(values), "o-", ms=2.5, lw=LINE_PT, color=colour)
+        dress(axes, "", "", label)
+        log_axis(axes)
+    _draw_parameters(panels[3], history, names, truth)
+    panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
+    for axes in panels:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.yaxis.set_label_coords(-0.145, 0.5)
+        axes.tick_params(labelbottom=axes is panels[3])
+    return figure
+
+
+def _draw_parameters(
+    axes: Axes,
+    history: Sequence[Iteration],
+    names: Sequence[str],
+    truth: Mapping[str, float] | None,
+) -> None:
+    axes.axhline(1.0, color=BLACK, lw=0.6)
+    numbers = [iteration.number for iteration in history]
+    for k, name in enumerate(names if history else ()):
+        values = np.array([getattr(iteration.theta, name) for iteration in history], dtype=float)
+        symbol, unit = SYMBOLS[name]
+        reference = values[-1] if truth is None else truth[name]
+        label = f"{symbol} = {values[-1]:.4g} {unit}"
+        style = {"ms": 2.5, "lw": LINE_PT, "color": CYCLE[k % len(CYCLE)]}
+        axes.plot(numbers, _positive(values / (reference or 1.0)), "o-", label=label, **style)
+    dress(axes, "", "", f"θ / {'final θ' if truth is None else 'truth'}")
+    log_axis(axes)
+    if history and names:
+        legend_above(axes, columns=2)
+
+
+def _positive(values: Sequence[float] | Array) -> Array:
+    """Values with gaps where a logarithmic axis has no place for them."""
+    array = np.asarray(values, dtype=float)
+    return np.where((array > 0) & np.isfinite(array), array, np.nan)

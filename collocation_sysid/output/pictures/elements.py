@@ -1,0 +1,55 @@
+"""Sizes and shapes of the elements as histograms."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from ...arrays import Array
+from ...fem.mesh_checks import signed_volumes
+from ..style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, dress, framed_figure
+
+_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+BINS = 24
+
+
+def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
+    """Draw how many elements have which size and which quality.
+
+    The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l²: 1 for
+    the regular tetrahedron, towards 0 the flatter it is.
+
+    Parameters
+    ----------
+    nodes_m : (n, 3) undeformed
+    tetrahedra : (E, 4) corners
+    """
+    squares = (np.diff(nodes_m[tetrahedra[:, _EDGES]], axis=2) ** 2).sum(axis=(1, 2, 3))
+    quality = 12 * (3 * signed_volumes(nodes_m, tetrahedra)) ** (2 / 3) / squares
+    quality = np.minimum(quality, 1.0)  # rounding
+    size_mm = 1e3 * np.sqrt(squares / 6)
+    figure = framed_figure(COLUMN_MM, 42, 13, 2, 9.5, 5.5)
+    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
+    widest = float(size_mm.max())
+    spread = np.ptp(size_mm) > 0.02 * widest
+    limits = (float(size_mm.min()), widest) if spread else (0.9 * widest, 1.1 * widest)
+    left.hist(size_mm, BINS, range=limits, color=BLUE)
+    right.hist(quality, BINS, range=(0.0, 1.0), color=BLUE)
+    worst = float(quality.min())
+    right.axvline(worst, color=VERMILION, lw=1.0)
+    text = {"textcoords": "offset points", "fontsize": SMALL_PT, "color": VERMILION}
+    aside = (3, "left") if worst < 0.5 else (-3, "right")
+    right.annotate(
+        f"worst {worst:.2f}", (worst, 0.97), xycoords=("data", "axes fraction"),
+        xytext=(aside[0], 0), ha=aside[1], va="top", **text,
+    )  # fmt: skip
+    dress(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
+    dress(right, "", "quality, 1 = regular")
+    for axes in (left, right):
+        axes.grid(False, axis="x")
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    left.xaxis.set_major_locator(MaxNLocator(4))
+    right.set_xticks((0.0, 0.5, 1.0))
+    return figure

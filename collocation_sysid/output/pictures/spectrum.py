@@ -1,0 +1,110 @@
+"""How strongly the markers move at which frequency, beside the body's natural frequencies."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import periodogram
+
+from ...arrays import Array
+from ..style import (
+    BLACK,
+    BLUE,
+    COLUMN_MM,
+    LINE_PT,
+    SMALL_PT,
+    dress,
+    framed_figure,
+    legend_above,
+    log_axis,
+)
+
+# Zeros appended make the curve smooth; they resolve nothing.
+PADDING = 4
+# Markers seen less than this are left out: gaps are bridged by straight lines.
+SEEN = 0.5
+# What lies this far below the largest density is rounding.
+DECADES = 8
+
+
+def spectrum(
+    t_s: Array, measured_m: Array, fitted_m: Array | None, natural_hz: Array | None
+) -> Figure:
+    """Draw the spectral density of the measured tracks, of the residual, and the modes.
+
+    Parameters
+    ----------
+    t_s : (T,) evenly spaced
+    measured_m : (T, M, 3) NaN where missing
+    fitted_m : (T, M, 3) or None
+    natural_hz : (k,) or None
+        Natural frequencies; those above half the sampling rate are left out.
+    """
+    figure = framed_figure(COLUMN_MM, 58, 14, 2, 9.5, 9)
+    axes = figure.subplots()
+    rate = (len(t_s) - 1) / (t_s[-1] - t_s[0])
+    hertz, density = spectral_density(measured_m, rate)
+    axes.plot(hertz, density, color=BLACK, lw=LINE_PT, label="measured")
+    if fitted_m is not None:
+        _, rest = spectral_density(measured_m - fitted_m, rate)
+        axes.plot(hertz, rest, color=BLUE, lw=LINE_PT, label="measured − fitted")
+    dress(axes, "", "frequency [Hz]", "density [mm²/Hz]")
+    log_axis(axes)
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(low, np.nanmax(density, initial=0.0) * 10.0**-DECADES), 4 * high)
+    axes.set_xlim(0, rate / 2)
+    _draw_modes(axes, natural_hz if natural_hz is not None else np.zeros(0), rate / 2)
+    legend_above(axes, columns=2)
+    return figure
+
+
+def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
+    """Frequencies, and the power spectral density [mm²/Hz] of the motion of a mean marker.
+
+    Straight trends are taken off, and Hann's window applied; the densities of x, y and z add up.
+    Gaps are bridged linearly, and markers seen less than half of the time left out.
+
+    Parameters
+    ----------
+    tracks_m : (T, M, 3) NaN where missing
+    rate_hz : float
+    """
+    present = np.asarray(np.isfinite(tracks_m).all(axis=2))
+    kept = np.flatnonzero(present.mean(axis=0) >= SEEN)
+    padded = PADDING * len(tracks_m)
+    if not len(kept):
+        hertz = np.arange(padded // 2 + 1) * rate_hz / padded
+        return hertz[1:], np.full(len(hertz) - 1, np.nan)
+    t = np.arange(len(tracks_m))
+    filled = np.zeros((len(t), len(kept), 3))
+    for place, marker in enumerate(kept):
+        seen = present[:, marker]
+        for axis in range(3):
+            filled[:, place, axis] = np.interp(t, t[seen], tracks_m[seen, marker, axis])
+    hertz, density = periodogram(1e3 * filled, rate_hz, "hann", padded, detrend="linear", axis=0)
+    mean = density.sum(axis=2).mean(axis=1)
+    return hertz[1:], np.where(mean[1:] > 0, mean[1:], np.nan)
+
+
+def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
+    """Lines at the natural frequencies, numbered at their upper ends."""
+    shown = natural_hz[natural_hz < limit_hz]
+    for group in _together(shown, 0.05 * limit_hz):
+        for hertz in shown[group]:
+            axes.axvline(hertz, color="#808080", lw=0.8, ls=(0, (2, 1.5)), zorder=0.9)
+        numbers = f"{group[0] + 1}" if len(group) == 1 else f"{group[0] + 1}–{group[-1] + 1}"
+        axes.annotate(
+            numbers, (shown[group].mean(), 1.0), xycoords=("data", "axes fraction"),
+            xytext=(0, -1), textcoords="offset points", ha="center", va="top",
+            fontsize=SMALL_PT, bbox={"fc": "white", "ec": "none", "pad": 0.8},
+        )  # fmt: skip
+    if len(shown):
+        axes.plot([], [], color="#808080", lw=0.8, ls=(0, (2, 1.5)), label="natural frequencies")
+
+
+def _together(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
+    """Groups of neighbours nearer to each other than `gap`."""
+    breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
+    return [group for group in np.split(np.arange(len(ascending)), breaks) if len(group)]

@@ -1,0 +1,323 @@
+"""What a run leaves behind: result.json, arrays, plots and ParaView frames in one folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+
+from ..arrays import Array
+from ..check.motion import motion_of
+from ..errors import SimulationError
+from ..experiment import Experiment
+from ..methods.solution import Solution
+from ..nlp.schemes import scheme_named
+from ..rollout import Rollout
+from ..run import Run
+from ..statistics.estimates import Estimate
+from ..statistics.identifiability import verdicts
+from .fields import ElementFields
+from .replay import Replay
+from .writers import run_folder, write_frames
+
+SCHEMA_VERSION = 1
+
+
+def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
+    """Write the run folder, whole or not at all, and return it.
+
+    ``result.json``, ``problem.toml`` as run, ``trajectory.npz``, pictures, and ``frames/`` with
+    ``trajectory.pvd`` for ParaView. With several experiments the arrays' names and the frames'
+    folders have the experiment's name in front.
+    """
+    solution = finished.solution
+    with run_folder(folder) as place:
+        (place / "problem.toml").write_text(finished.problem.text, encoding="utf-8")
+        (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
+        seen = replays(finished)
+        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
+        _write_pictures(finished, seen, place)
+        if frames:
+            _write_all_frames(solution, place)
+    return Path(folder)
+
+
+def _write_pictures(finished: Run, seen: Sequence[Replay], place: Path) -> None:
+    # matplotlib takes a while to import, and nothing else needs it.
+    from .pictures import Confidence, album, jacobian_sparsity, save_pictures
+
+    solution = finished.solution
+    free = [item.name for item in solution.collocation.parameters.free]
+    found = finished.uncertainty
+    confidence = Confidence.of(found) if found is not None else None
+    pictures = album(seen, solution.history, free, confidence)
+    pictures["jacobian"] = jacobian_sparsity(solution.collocation, solution.z)
+    save_pictures(place, pictures)
+
+
+def _write_all_frames(solution: Solution, place: Path) -> None:
+    collocation, theta = solution.collocation, solution.theta
+    segments = collocation.segments
+    for segment, positions, violations in zip(
+        segments, solution.positions_m, collocation.violations_n(solution.z), strict=True
+    ):
+        here = place if len(segments) == 1 else place / segment.experiment.name
+        here.mkdir(exist_ok=True)
+        body = segment.body
+        residual = np.zeros((len(positions), segment.dofs))
+        residual[:, segment.free_dofs] = violations
+        write_frames(
+            here,
+            segment.dynamics.t_s,
+            positions,
+            body.cells,
+            body.element,
+            body.nodes_m,
+            {"residual_force_n": residual.reshape(positions.shape)},
+            fields=ElementFields.of(body, theta.lambda_pa, theta.mu_pa),
+        )
+
+
+def replays(finished: Run) -> list[Replay]:
+    """The experiments as they are looked at: those fitted, then those for validation."""
+    solution = finished.solution
+    fitted = {
+        segment.experiment.name: (positions[segment.observation.grid_rows], readings)
+        for segment, positions, readings in zip(
+            solution.collocation.segments, solution.positions_m, solution.readings_m, strict=True
+        )
+    }
+    found = []
+    for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
+        rollout = finished.rollouts[experiment.name]
+        rolled_out = None
+        if isinstance(rollout, Rollout):
+            rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
+        fit = fitted.get(experiment.name)
+        if fit is not None or rolled_out is not None:
+            found.append(Replay.of(experiment, fit, rolled_out, _natural_hz(experiment, solution)))
+    return found
+
+
+def _natural_hz(experiment: Experiment, solution: Solution) -> Array | None:
+    """Natural frequencies with the answer; a method that failed has none worth the search."""
+    if not solution.status.converged:
+        return None
+    scheme = scheme_named(solution.collocation.scheme)
+    try:
+        motion = motion_of(experiment, scheme, experiment.timestep_s, solution.theta)
+    except SimulationError:
+        return None
+    return np.array([mode.frequency_hz for mode in motion.modes])
+
+
+def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
+    """Arrays of trajectory.npz at the samples; a lone fitted experiment has no prefix."""
+    alone = sum(replay.positions_m is not None for replay in seen) == 1
+    arrays = {}
+    for replay in seen:
+        bare = alone and replay.positions_m is not None
+        arrays |= replay.arrays("" if bare else f"{replay.name}/")
+    return arrays
+
+
+def result(finished: Run) -> dict[str, Any]:
+    """The content of result.json."""
+    solution, problem = finished.solution, finished.problem
+    collocation = solution.collocation
+    fitted = {segment.experiment.name for segment in collocation.segments}
+    rolled = {n: r for n, r in finished.rollouts.items() if isinstance(r, Rollout) and n in fitted}
+    return {
+        "schema": SCHEMA_VERSION,
+        "status": solution.status.value,
+        "converged": solution.status.converged,
+        "message": solution.message,
+        "method": solution.method,
+        "title": problem.file.title,
+        "parameters": _parameters(finished),
+        "derived": _derived(finished),
+        "unknowns": _unknowns(finished),
+        "uncertainty": _uncertainty(finished),
+        "fit": _fit(solution),
+        "residuals": [
+            {**asdict(diagnosis), "offset_m": diagnosis.offset_m.tolist()}
+            for diagnosis in finished.diagnoses
+        ],
+        "dynamics": {
+            "max_violation_n": solution.max_violation_n,
+            "max_violation_relative": solution.max_violation_relative,
+            "largest": [str(violation) for violation in solution.largest_violations],
+        },
+        "rollout": {
+            "rms_m": _pooled_rms(finished, rolled),
+            "max_m": max((r.max_m for r in rolled.values()), default=None),
+            "experiments": {
+                name: {
+                    "rms_m": r.rms_m,
+                    "max_m": r.max_m,
+                    "fitted": name in fitted,
+                    "unknowns": r.unknowns,
+                }
+                if isinstance(r, Rollout)
+                else {"failed": r, "fitted": name in fitted}
+                for name, r in finished.rollouts.items()
+            },
+        },
+        "iterations": solution.iterations,
+        "evaluations": solution.evaluations,
+        "timing_s": {
+            field.name: getattr(solution.timing, field.name) for field in fields(solution.timing)
+        },
+        "problem": {
+            "nodes": len(problem.body.nodes_m),
+            "elements": len(problem.body.cells),
+            "timesteps": sum(segment.grid_rows for segment in collocation.segments),
+            "variables": collocation.variables,
+            "constraints": collocation.constraints,
+            "scheme": collocation.scheme,
+        },
+        "notes": list(dict.fromkeys([*problem.notes, *solution.notes, *finished.all_notes])),
+        "history": [
+            {
+                "iteration": line.number,
+                "loss": line.loss,
+                "rms_m": line.rms_m,
+                "violation_n": line.violation_n,
+                "theta": list(line.theta),
+                "time_s": line.time_s,
+            }
+            for line in solution.history
+        ],
+        "provenance": {
+            "version": version("collocation-sysid"),
+            "casadi": casadi.CasadiMeta.version(),
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "problem_file": str(problem.path),
+            "problem_sha256": hashlib.sha256(problem.text.encode()).hexdigest(),
+            "mesh_sha256": problem.body.mesh.sha256,
+        },
+    }
+
+
+def as_json(content: Any) -> str:
+    """Text of a result; JSON has no NaN and no infinity, null takes their place."""
+    return json.dumps(_finite(content), indent=1, allow_nan=False)
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not np.isfinite(content) else content
+
+
+def _parameters(finished: Run) -> dict[str, Any]:
+    parameters = finished.solution.collocation.parameters
+    values = finished.solution.parameters
+    estimates = finished.uncertainty.estimates if finished.uncertainty is not None else {}
+    return {
+        item.name: {
+            "value": values[item.name],
+            "guess": item.guess,
+            "fixed": item.fixed,
+            **_error_bar(estimates.get(item.name, Estimate(values[item.name]))),
+        }
+        for item in parameters.items
+    }
+
+
+def _derived(finished: Run) -> dict[str, Any]:
+    if finished.uncertainty is None:
+        theta = finished.solution.theta
+        return {"young_pa": {"value": theta.young_pa}, "poisson": {"value": theta.poisson}}
+    return {
+        name: {"value": estimate.value, **_error_bar(estimate)}
+        for name, estimate in finished.uncertainty.derived.items()
+    }
+
+
+def _error_bar(estimate: Estimate) -> dict[str, Any]:
+    return {
+        "std_error": estimate.std_error,
+        "ci95": None if estimate.ci95 is None else list(estimate.ci95),
+        "at_bound": estimate.at_bound,
+        "reason": estimate.reason,
+    }
+
+
+def _unknowns(finished: Run) -> dict[str, dict[str, Any]]:
+    """The experiments' own unknowns in their units, with the deviation of their prior."""
+    deviations = finished.uncertainty.local if finished.uncertainty is not None else {}
+    collocation = finished.solution.collocation
+    found = {}
+    for segment, phi in zip(
+        collocation.segments, collocation.unpack_own(finished.solution.z), strict=True
+    ):
+        local = segment.local
+        for name, value, scale in zip(local.names, phi, local.scales, strict=True):
+            found.setdefault(segment.experiment.name, {})[name.partition(": ")[2]] = {
+                "value": float(value * scale),
+                "prior": float(scale),
+                "std_error": deviations[name] * scale if name in deviations else None,
+            }
+    return found
+
+
+def _uncertainty(finished: Run) -> dict[str, Any] | None:
+    found = finished.uncertainty
+    if found is None:
+        return None
+    return {
+        "noise": found.noise,
+        "errors": found.errors,
+        "reduced_chi_squared": found.reduced_chi_squared,
+        "autocorrelation": found.dependence.lag1,
+        "names": list(found.names),
+        "correlation": found.correlation.tolist(),
+        "covariance": found.covariance.tolist(),
+        "quantiles": found.quantiles.tolist(),
+        "verdicts": list(verdicts(found)),
+        "profiles": {
+            profile.parameter: {
+                "interval": list(profile.interval),
+                "values": profile.values.tolist(),
+                "rises": (profile.losses - profile.losses.min()).tolist(),
+                "threshold": profile.threshold,
+                "sentence": profile.sentence,
+            }
+            for profile in finished.profiles
+        },
+    }
+
+
+def _fit(solution: Solution) -> dict[str, Any]:
+    experiments = {}
+    segments = solution.collocation.segments
+    for segment, readings in zip(segments, solution.readings_m, strict=True):
+        markers = segment.experiment.markers
+        squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
+        experiments[segment.experiment.name] = {
+            "rms_m": float(np.sqrt(squares.mean())),
+            "samples": markers.samples,
+            "missing": int(markers.missing.sum()),
+        }
+    return {"rms_m": solution.rms_m, "experiments": experiments}
+
+
+def _pooled_rms(finished: Run, rolled: Mapping[str, Rollout]) -> float | None:
+    if not rolled:
+        return None
+    counts = {e.name: e.markers.samples for e in finished.problem.experiments}
+    squares = sum(counts[name] * r.rms_m**2 for name, r in rolled.items())
+    return float(np.sqrt(squares / sum(counts[name] for name in rolled)))

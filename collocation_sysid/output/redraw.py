@@ -1,0 +1,42 @@
+"""Draw a run's pictures again from its files alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ..methods.solution import Iteration
+from ..nlp.parameters import Theta
+from .pictures import Confidence, album, save_pictures
+from .replay import damaged, read_run
+
+
+def redraw(run: str | Path, folder: str | Path) -> list[Path]:
+    """Write the pictures of a run folder into `folder`, all but that of the Jacobian.
+
+    Raises
+    ------
+    InputError
+        If `run` is not a run folder.
+    """
+    run, folder = Path(run), Path(folder)
+    result, replays = read_run(run)
+    try:
+        history = [_iteration(line) for line in result["history"]]
+        free = [name for name, item in result["parameters"].items() if not item["fixed"]]
+        pictures = album(replays, history, free, Confidence.from_result(result))
+    except (ValueError, LookupError, TypeError) as error:
+        raise damaged(run, error) from error
+    folder.mkdir(parents=True, exist_ok=True)
+    return save_pictures(folder, pictures)
+
+
+def _iteration(line: dict[str, Any]) -> Iteration:
+    return Iteration(
+        line["iteration"],
+        line["loss"],
+        line["rms_m"],
+        line["violation_n"],
+        Theta(*line["theta"]),
+        line["time_s"],
+    )

@@ -1,0 +1,184 @@
+"""One experiment of a run as it is looked at: shapes and markers at its samples.
+
+Pictures, animations and the 3-D view need nothing else, so that they can be made again from the
+arrays of a run folder.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..errors import InputError
+from ..experiment.experiment import Experiment
+
+RESULT_FILE = "result.json"
+ARRAYS_FILE = "trajectory.npz"
+# Of the body, and so the same for all experiments of a run.
+SHARED = ("undeformed_m", "tetrahedra", "surface")
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Measured, fitted and rolled-out motion of an experiment; T samples, n nodes, M markers.
+
+    Attributes
+    ----------
+    name : str
+    t_s : (T,)
+    undeformed_m : (n, 3)
+    tetrahedra : (E, 4) corners of the elements
+    surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
+    held : (T, n) bool, which nodes are grasped
+    up : (3,) unit vector against gravity; z where there is none
+    marker_names : (M,) str
+    marker_places_m : (M, 3) where the markers sit on the undeformed body
+    measured_m : (T, M, 3) NaN where missing
+    positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
+    rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
+    natural_hz : (k,) natural frequencies with the answer, ascending
+    """
+
+    name: str
+    t_s: Array
+    undeformed_m: Array
+    tetrahedra: NDArray[np.integer]
+    surface: NDArray[np.integer]
+    held: NDArray[np.bool_]
+    up: Array
+    marker_names: Sequence[str]
+    marker_places_m: Array
+    measured_m: Array
+    positions_m: Array | None = None
+    markers_m: Array | None = None
+    rolled_out_positions_m: Array | None = None
+    rolled_out_m: Array | None = None
+    natural_hz: Array | None = None
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        fitted: tuple[Array, Array] | None = None,
+        rolled_out: tuple[Array, Array] | None = None,
+        natural_hz: Array | None = None,
+    ) -> Replay:
+        """Gather an experiment with (positions, markers) as fitted, and as rolled out."""
+        body, markers = experiment.body, experiment.markers
+        placement = markers.placement
+        pull = np.linalg.norm(experiment.gravity_m_s2)
+        return cls(
+            experiment.name,
+            experiment.t_s,
+            body.nodes_m,
+            body.mesh.tetrahedra,
+            body.mesh.surface,
+            experiment.grasped(experiment.t_s)[0],
+            -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
+            markers.names,
+            np.einsum("mk,mkj->mj", placement.weights, body.nodes_m[placement.nodes]),
+            markers.positions_m,
+            *(fitted or (None, None)),
+            *(rolled_out or (None, None)),
+            natural_hz,
+        )
+
+    @property
+    def shapes_m(self) -> Array | None:
+        """(T, n, 3) positions to show where there is room for one: fitted, else rolled out."""
+        return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
+
+    def arrays(self, prefix: str = "") -> dict[str, Array]:
+        """Arrays for a file; those of the body without the prefix, and some as single numbers."""
+        own: dict[str, Any] = {
+            "t_s": self.t_s,
+            "positions_m": self.positions_m,
+            "markers_m": self.markers_m,
+            "measured_m": self.measured_m,
+            "residuals_m": None if self.markers_m is None else self.markers_m - self.measured_m,
+            "marker_names": np.array(self.marker_names),
+            "marker_places_m": self.marker_places_m,
+            "rolled_out_m": self.rolled_out_m,
+            "rolled_out_positions_m": _single(self.rolled_out_positions_m),
+            "held": self.held,
+            "up": self.up,
+            "natural_hz": self.natural_hz,
+        }
+        shared: dict[str, Any] = {
+            "undeformed_m": self.undeformed_m,
+            "tetrahedra": self.tetrahedra.astype(np.int32),
+            "surface": self.surface.astype(np.int32),
+        }
+        return shared | {prefix + key: value for key, value in own.items() if value is not None}
+
+    @classmethod
+    def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> Replay:
+        """Take an experiment out of a run's arrays.
+
+        Raises
+        ------
+        KeyError
+            If an array is missing.
+        """
+        prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
+        needed = ("t_s", "held", "up", "marker_places_m", "measured_m")
+        optional = (
+            "positions_m",
+            "markers_m",
+            "rolled_out_positions_m",
+            "rolled_out_m",
+            "natural_hz",
+        )
+        found: dict[str, Any] = {key: arrays[key] for key in SHARED}
+        found |= {key: arrays[prefix + key] for key in needed}
+        found |= {key: arrays.get(prefix + key) for key in optional}
+        names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
+        return cls(name=name, marker_names=names, **found)
+
+
+def _single(array: Array | None) -> NDArray[np.float32] | None:
+    return None if array is None else array.astype(np.float32)
+
+
+def read_run(folder: str | Path) -> tuple[dict[str, Any], list[Replay]]:
+    """Read the content of result.json, and all experiments, from a run folder.
+
+    Raises
+    ------
+    InputError
+        If it is not a run folder, or one that is damaged.
+    """
+    run = Path(folder)
+    try:
+        result = json.loads((run / RESULT_FILE).read_text(encoding="utf-8"))
+        with np.load(run / ARRAYS_FILE) as stored:
+            arrays = dict(stored)
+        return result, [Replay.from_arrays(name, arrays) for name in _experiments(result)]
+    except (FileNotFoundError, NotADirectoryError) as error:
+        name = Path(str(error.filename)).name
+        raise InputError(f"this is not a run folder: it has no {name}", run) from error
+    except (OSError, EOFError, BadZipFile, ValueError, LookupError, TypeError) as error:
+        raise damaged(run, error) from error
+
+
+def damaged(run: Path, error: Exception) -> InputError:
+    """The refusal of a run whose files do not hold what they should."""
+    reason = f"{type(error).__name__}: {error}"
+    return InputError(
+        f"{RESULT_FILE} or {ARRAYS_FILE} is damaged ({reason}); solve the problem again", run
+    )
+
+
+def _experiments(result: Mapping[str, Any]) -> list[str]:
+    """Names of the fitted experiments, then of those for validation that could be simulated."""
+    rolled = result["rollout"]["experiments"]
+    only_predicted = [n for n, r in rolled.items() if not r["fitted"] and "failed" not in r]
+    return [*result["fit"]["experiments"], *only_predicted]

@@ -1,0 +1,177 @@
+"""The page about one run, made from its folder alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from .page import SYMBOLS, millimetres, number, picture, read_json, rendered
+
+# Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
+WORST, APART = 8, 5
+
+CAPTIONS = {
+    "shapes": "The body at times of the recording; orange: measured markers.",
+    "mesh": "The mesh, its grasped nodes and the markers' places.",
+    "tracks": "Measured, fitted and rolled-out markers, the residual below.",
+    "error": "Distance of the markers from their measurements over time.",
+    "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
+    "confidence": "95 % confidence ellipses of pairs of parameters.",
+    "correlation": "Correlation of the estimates.",
+    "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
+    "elements": "Size and quality of the elements.",
+    "jacobian": "Structure of the constraints' Jacobian.",
+}
+
+
+def run_page(run: str | Path) -> str:
+    """The page of a run folder.
+
+    Raises
+    ------
+    InputError
+        If it is not a run folder, or damaged.
+    """
+    run = Path(run)
+    result = read_json(run / "result.json", "a run folder")
+    try:
+        return rendered(
+            "run.html",
+            result=result,
+            verdict=verdict(result),
+            notes=_notes(result),
+            parameters=_parameters(result),
+            worst=_worst_errors(run),
+            pictures=_pictures(run),
+            problem=_text(run / "problem.toml"),
+        )
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise InputError(
+            f"result.json or trajectory.npz is damaged ({type(error).__name__}: {error}); "
+            "solve the problem again",
+            run,
+        ) from error
+
+
+def verdict(result: dict[str, Any]) -> list[str]:
+    """The run in a few sentences."""
+    said = [result["message"]]
+    if result["converged"]:
+        said += _weakest(result)
+    fit, rolled = result["fit"], result["rollout"]
+    sentence = f"The fitted markers are {millimetres(fit['rms_m'])} off (RMS)"
+    if rolled["rms_m"] is not None:
+        sentence += (
+            f"; the roll-out misses by {millimetres(rolled['rms_m'])}, at most "
+            f"{millimetres(rolled['max_m'])}"
+        )
+    said.append(f"{sentence}.")
+    for name, experiment in rolled["experiments"].items():
+        if "failed" in experiment:
+            said.append(f"The roll-out of '{name}' failed: {experiment['failed']}.")
+        elif not experiment["fitted"]:
+            said.append(
+                f"'{name}' was predicted, not fitted: {millimetres(experiment['rms_m'])} RMS."
+            )
+    return said
+
+
+def _notes(result: dict[str, Any]) -> list[str]:
+    """Notes that the page does not hold elsewhere."""
+    found = result["uncertainty"]
+    profiles = found["profiles"].values() if found else ()
+    said = {*(found["verdicts"] if found else ()), *(p["sentence"] for p in profiles)}
+    return [note for note in result["notes"] if note not in said]
+
+
+def _weakest(result: dict[str, Any]) -> list[str]:
+    free = {name: p for name, p in result["parameters"].items() if not p["fixed"]}
+    unknown = [SYMBOLS[name][0] for name, p in free.items() if p["std_error"] is None]
+    said = [f"No error bar for {', '.join(unknown)}: see the notes."] if unknown else []
+    known = {name: p["std_error"] / p["value"] for name, p in free.items() if p["std_error"]}
+    if known:
+        name = max(known, key=lambda key: known[key])
+        how = "weakly" if known[name] > 0.1 else "least well, but well"
+        said.append(f"{SYMBOLS[name][0]} is {how} identified: ±{number(196 * known[name], 2)} %.")
+    return said
+
+
+def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
+    rows = []
+    for group in ("parameters", "derived"):
+        for name, found in result[group].items():
+            symbol, unit = SYMBOLS[name]
+            low, high = found.get("ci95") or (None, None)
+            rows.append(
+                {
+                    "symbol": symbol,
+                    "unit": unit,
+                    "value": found["value"],
+                    "std_error": found.get("std_error"),
+                    "low": low,
+                    "high": high,
+                    "reason": "fixed" if found.get("fixed") else found.get("reason"),
+                    "guess": found.get("guess"),
+                    "derived": group == "derived",
+                }
+            )
+    return rows
+
+
+def _worst_errors(run: Path) -> list[dict[str, Any]]:
+    """The largest residuals, with time and marker."""
+    with np.load(run / "trajectory.npz") as stored:
+        names = [key for key in stored.files if key.rpartition("/")[2] == "residuals_m"]
+        found = []
+        for key in names:
+            prefix = key.removesuffix("residuals_m")
+            errors = np.linalg.norm(stored[key], axis=2)
+            t_s, markers = stored[f"{prefix}t_s"], stored[f"{prefix}marker_names"]
+            found += _peaks(prefix.rstrip("/"), np.nan_to_num(errors), t_s, markers)
+    return sorted(found, key=lambda item: -item["error_m"])[:WORST]
+
+
+def _peaks(
+    experiment: str, errors: np.ndarray, t_s: np.ndarray, markers: np.ndarray
+) -> list[dict[str, Any]]:
+    errors, found = errors.copy(), []
+    for _ in range(WORST):
+        t, m = np.unravel_index(int(errors.argmax()), errors.shape)
+        if not errors[t, m] > 0:
+            break
+        found.append(
+            {
+                "experiment": experiment,
+                "t_s": float(t_s[t]),
+                "marker": str(markers[m]),
+                "error_m": float(errors[t, m]),
+            }
+        )
+        errors[max(0, t - APART) : t + APART + 1, m] = 0
+    return found
+
+
+def _pictures(run: Path) -> list[dict[str, str]]:
+    """Every PNG of the folder, those known here first."""
+    order = list(CAPTIONS)
+
+    def kind(file: Path) -> str:
+        return next((k for k in order if file.stem.startswith(k)), "")
+
+    files = sorted(
+        run.glob("*.png"), key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name)
+    )
+    found = []
+    for file in files:
+        about = file.stem.removeprefix(kind(file)).strip("_")
+        caption = CAPTIONS.get(kind(file), file.stem)
+        title = f"{about}: {caption}" if about and kind(file) else caption
+        found.append({"source": picture(file), "caption": title})
+    return found
+
+
+def _text(file: Path) -> str:
+    return file.read_text(encoding="utf-8") if file.is_file() else ""

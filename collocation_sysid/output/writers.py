@@ -1,0 +1,259 @@
+"""Files of a run: frames for ParaView, and a folder that is there whole or not at all."""
+
+from __future__ import annotations
+
+import base64
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..fem.elements import Element
+from .fields import ElementFields
+from .replay import RESULT_FILE
+
+# Cell types of the VTK file format by meshio's names, which order nodes alike.
+VTK_CELL_TYPES = {"tetra": 10, "tetra10": 24}
+VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
+MAX_FRAMES = 200
+
+
+# Frames ---------------------------------------------------------------------------------------
+
+
+def write_vtu(
+    path: str | Path,
+    points_m: ArrayLike,
+    cells: ArrayLike,
+    meshio_type: str,
+    point_data: Mapping[str, ArrayLike] | None = None,
+    cell_data: Mapping[str, ArrayLike] | None = None,
+) -> None:
+    """Write an unstructured grid of one cell type as VTK XML with base64 data.
+
+    Parameters
+    ----------
+    path : str or Path
+    points_m : (n, 3)
+    cells : (E, nodes per cell) node numbers
+    meshio_type : {"tetra", "tetra10"}
+    point_data : mapping of name to (n,) or (n, k) numbers
+    cell_data : mapping of name to (E,) or (E, k) numbers
+
+    Raises
+    ------
+    InputError
+        For an unknown cell type, or data of another length.
+    """
+    if meshio_type not in VTK_CELL_TYPES:
+        raise InputError(
+            f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}", path
+        )
+    points = np.asarray(points_m, dtype=float)
+    nodes = np.asarray(cells, dtype=np.int64)
+    offsets = nodes.shape[1] * np.arange(1, len(nodes) + 1)
+    types = np.full(len(nodes), VTK_CELL_TYPES[meshio_type], dtype=np.uint8)
+    sections = (
+        ("PointData", _data_arrays("point", point_data or {}, len(points), path)),
+        ("CellData", _data_arrays("cell", cell_data or {}, len(nodes), path)),
+        ("Points", [_data_array("Points", points)]),
+        (
+            "Cells",
+            [
+                _data_array("connectivity", nodes.ravel()),
+                _data_array("offsets", offsets),
+                _data_array("types", types),
+            ],
+        ),
+    )
+    body = "".join(f"<{tag}>\n{''.join(arrays)}</{tag}>\n" for tag, arrays in sections)
+    Path(path).write_text(
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" '
+        'header_type="UInt64">\n<UnstructuredGrid>\n'
+        f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{len(nodes)}">\n'
+        f"{body}</Piece>\n</UnstructuredGrid>\n</VTKFile>\n",
+        encoding="utf-8",
+    )
+
+
+def _data_arrays(
+    kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
+) -> list[str]:
+    arrays = {name: np.asarray(values) for name, values in data.items()}
+    for name, array in arrays.items():
+        if array.ndim not in (1, 2) or len(array) != count:
+            raise InputError(
+                f"{kind} data '{name}' has shape {array.shape}, expected one row for each of "
+                f"{count} {kind}s",
+                path,
+            )
+    return [_data_array(name, array) for name, array in arrays.items()]
+
+
+def _data_array(name: str, values: NDArray) -> str:
+    kind = values.dtype.str[1:]
+    if kind not in VTK_TYPES:  # booleans, other integers and half precision
+        kind = "f8" if values.dtype.kind == "f" else "i8"
+    little = np.ascontiguousarray(values, dtype=f"<{kind}")
+    content = little.nbytes.to_bytes(8, "little") + little.tobytes()
+    components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
+    return (
+        f'<DataArray type="{VTK_TYPES[kind]}" Name={quoteattr(name)}{components} '
+        f'format="binary">{base64.b64encode(content).decode("ascii")}</DataArray>\n'
+    )
+
+
+def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
+    """Write the list of (t_s, file) that ParaView opens as one animation.
+
+    Files are named relative to the list's own folder.
+    """
+    folder = Path(path).parent.resolve()
+    lines = []
+    for t_s, file in frames:
+        name = Path(os.path.relpath(Path(file).resolve(), folder)).as_posix()
+        lines.append(f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n')
+    Path(path).write_text(
+        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
+        f"{''.join(lines)}</Collection>\n</VTKFile>\n",
+        encoding="utf-8",
+    )
+
+
+def write_frames(
+    folder: str | Path,
+    t_s: ArrayLike,
+    positions_m: ArrayLike,
+    cells: ArrayLike,
+    element: Element,
+    undeformed_m: ArrayLike,
+    point_series: Mapping[str, ArrayLike] | None = None,
+    max_frames: int = MAX_FRAMES,
+    fields: ElementFields | None = None,
+) -> Path:
+    """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
+
+    Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
+    cells. Of more than `max_frames` samples every second, third, … is written.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Exists.
+    t_s : (T,) evenly spaced
+    positions_m : (T, n, 3)
+    cells : (E, nodes per element)
+    element : Element
+    undeformed_m : (n, 3)
+    point_series : mapping of name to (T, n) or (T, n, k) numbers
+    fields : ElementFields, optional
+    """
+    times, positions = np.asarray(t_s, dtype=float), np.asarray(positions_m, dtype=float)
+    velocities = np.gradient(positions, times, axis=0, edge_order=1)
+    series = {name: np.asarray(values) for name, values in (point_series or {}).items()}
+    frames = Path(folder) / "frames"
+    frames.mkdir(exist_ok=True)
+    written = []
+    for number, k in enumerate(range(0, len(times), -(-len(times) // max_frames))):
+        file = frames / f"frame_{number:04d}.vtu"
+        data = {
+            "displacement_m": positions[k] - undeformed_m,
+            "velocity_m_s": velocities[k],
+            **{name: values[k] for name, values in series.items()},
+        }
+        in_cells = {n: v[0] for n, v in fields.at(positions[k]).items()} if fields else {}
+        write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
+        written.append((float(times[k]), file))
+    listing = Path(folder) / "trajectory.pvd"
+    write_pvd(listing, written)
+    return listing
+
+
+# Folder ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
+    """Give a temporary folder beside `path` to write into, and name it `path` at the end.
+
+    An earlier run at `path` is replaced, at the end and whole. After an exception the temporary
+    folder is removed and `path` is as it was.
+
+    Parameters
+    ----------
+    path : str or Path
+    overwrite : bool
+        Whether an earlier run may be replaced.
+
+    Raises
+    ------
+    InputError
+        If there is anything else at `path`; at once, so that no work is lost.
+    """
+    target = Path(path).resolve()
+    require_replaceable(target, overwrite)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    mark = secrets.token_hex(4)
+    temporary = target.with_name(f".{target.name}.{mark}.partial")
+    temporary.mkdir()
+    try:
+        yield temporary
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    try:
+        require_replaceable(target, overwrite)
+        _put_in_place(temporary, target, target.with_name(f".{target.name}.{mark}.old"))
+    except (InputError, OSError) as error:
+        raise InputError(
+            f"the finished run cannot be put there ({error}); it is kept in {temporary}", target
+        ) from error
+
+
+def require_replaceable(target: Path, overwrite: bool = True) -> None:
+    """Refuse a place for a run folder that holds anything but an earlier run.
+
+    Raises
+    ------
+    InputError
+        Naming the place and what is there.
+    """
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError("is a file, expected a folder for the run; choose another", target)
+    if os.path.ismount(target):
+        raise InputError("is a mount point and cannot be replaced; choose a folder in it", target)
+    if not any(target.iterdir()):
+        return
+    if not (target / RESULT_FILE).is_file():
+        raise InputError(
+            f"the folder has files but no {RESULT_FILE}, so it is not an earlier run and is left "
+            "alone; choose another folder",
+            target,
+        )
+    if not overwrite:
+        raise InputError(
+            "the folder holds an earlier run; choose another, or allow it to be overwritten", target
+        )
+
+
+def _put_in_place(new: Path, target: Path, aside: Path) -> None:
+    if not target.exists():
+        new.rename(target)
+        return
+    target.rename(aside)
+    try:
+        new.rename(target)
+    except OSError:
+        aside.rename(target)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

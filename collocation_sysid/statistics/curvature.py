@@ -1,0 +1,77 @@
+"""The curvature of the fit, factored, in coordinates where the statistics are simple.
+
+With S the slopes of all residuals and P the priors' slopes, the information is A = SᵀS + PᵀP.
+The root L with A⁻¹ = L Lᵀ turns S into D = S L, for which DᵀD + LᵀPᵀP L = I: a covariance B of
+the score Sᵀe becomes L (LᵀB L) Lᵀ for the parameters, without any further inverse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from .linearised import LinearisedFit
+
+Mask = NDArray[np.bool_]
+
+# Eigenvalue of the information, in units of its diagonal, that is zero up to rounding; and the
+# share in such a direction that does not matter.
+SINGULAR = 1e-12
+NEGLIGIBLE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """A⁻¹ = L Lᵀ of the parameters within their bounds, in the r directions that are determined.
+
+    Attributes
+    ----------
+    root : (p, r) L, with rows of zeros for parameters at a bound
+    slopes : of each experiment (T, 3M, r), D = S L; zero where missing
+    prior : (r, r) Lᵀ PᵀP L
+    undetermined : (p,) bool
+        Parameters in whose direction the loss is flat.
+    """
+
+    root: Array
+    slopes: tuple[Array, ...]
+    prior: Array
+    undetermined: Mask
+
+    @property
+    def fitted(self) -> float:
+        """Number of parameters the data determine; one that a prior determines counts in part."""
+        return float(sum(np.sum(slope**2) for slope in self.slopes))
+
+    def covariance(self, of_score: Array) -> Array:
+        """(p, p) of the parameters from LᵀB L (r, r); infinite variance if undetermined."""
+        found = self.root @ of_score @ self.root.T
+        lost = self.undetermined
+        found[lost] = found[:, lost] = np.nan
+        found[lost, lost] = np.inf
+        return found
+
+
+def curvature(fit: LinearisedFit) -> Curvature:
+    """Factor the information of a fit; parameters at a bound count as fixed."""
+    free = np.flatnonzero(~fit.at_bound)
+    slopes = [block.channels[1][..., free] for block in fit.blocks]
+    information = np.diag(fit.prior_slope[free] ** 2)
+    for slope in slopes:
+        rows = slope.reshape(slope.shape[0] * slope.shape[1], len(free))
+        information = information + rows.T @ rows
+    units = np.sqrt(np.diag(information))
+    units[units == 0] = 1.0
+    values, vectors = np.linalg.eigh(information / np.outer(units, units))
+    known = values > SINGULAR
+    root = np.zeros((len(fit.names), int(known.sum())))
+    root[free] = vectors[:, known] / np.sqrt(values[known]) / units[:, None]
+    undetermined = np.zeros(len(fit.names), dtype=bool)
+    undetermined[free] = (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
+    prior = root * fit.prior_slope[:, None]
+    return Curvature(
+        root, tuple(slope @ root[free] for slope in slopes), prior.T @ prior, undetermined
+    )

@@ -1,0 +1,197 @@
+"""What the residuals of each marker look like, and what that suggests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from ..arrays import Array
+from .linearised import FitBlock, LinearisedFit
+
+SIGNIFICANCE = 0.01
+# A pattern with this share of the residuals' power is worth naming.
+DOMINANT = 0.5
+EARLY_TIME = 0.1
+# Bins of the periodogram on both sides of its peak that belong to a damped oscillation.
+PEAK_BINS = 2
+# Fewer periods than this within the record are a drift.
+FEWEST_PERIODS = 3
+SAME_FREQUENCY = 0.2
+ROUNDING_M = 1e-9
+# Share of the samples beyond Huber's threshold that noise alone may explain.
+MOST_WILD = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerDiagnosis:
+    """The residuals h(x) − ŷ of one marker in one experiment.
+
+    Shares are of the residuals' power, the sum of their squares over axes and present samples.
+
+    Attributes
+    ----------
+    experiment, marker : str
+    samples : int
+    rms_m : float
+        Of the distance between fitted and measured marker, wild samples included.
+    offset_m : (3,) mean of h(x) − ŷ
+    constant_share : float
+        Power of the mean.
+    lag1 : float
+        Autocorrelation of consecutive present samples about the mean, pooled over the axes.
+    frequency_hz, oscillating_share : float
+        Largest peak of the periodogram, and the power in it.
+    early_share : float
+        Power within the first tenth of the time.
+    sentence : str
+        What this suggests.
+    """
+
+    experiment: str
+    marker: str
+    samples: int
+    rms_m: float
+    offset_m: Array
+    constant_share: float
+    lag1: float
+    frequency_hz: float
+    oscillating_share: float
+    early_share: float
+    sentence: str
+
+
+def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
+    """Diagnose every marker that was seen, experiment by experiment."""
+    return tuple(
+        _diagnose(block, marker, fit.shared, _estimated(fit, block))
+        for block in fit.blocks
+        for marker in np.flatnonzero(block.present.any(axis=0)).tolist()
+    )
+
+
+def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
+    """Whether marker offsets and a time shift of the experiment are estimated already."""
+    own = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared :]]
+    return any(n.startswith("offset") for n in own), any(n.startswith("time") for n in own)
+
+
+def _diagnose(
+    block: FitBlock, marker: int, shared: int, estimated: tuple[bool, bool]
+) -> MarkerDiagnosis:
+    present = block.present[:, marker]
+    residual = block.residual[:, marker] * block.sigma_m[marker]
+    samples = int(present.sum())
+    power = float(np.sum(residual**2))
+    total = power if power > 0 else 1.0
+    mean = residual.sum(axis=0) / samples
+    varying = np.where(present[:, None], residual - mean, 0.0)
+    frequency, peak = _largest_peak(varying, block.t_s)
+    early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
+    found = MarkerDiagnosis(
+        experiment=block.name,
+        marker=block.marker_names[marker],
+        samples=samples,
+        rms_m=_rms_m(block, marker),
+        offset_m=mean,
+        constant_share=float(samples * mean @ mean / total),
+        lag1=_lag1(varying, present),
+        frequency_hz=frequency,
+        oscillating_share=peak * float(np.sum(varying**2)) / total,
+        early_share=float(np.sum(residual[early] ** 2) / total),
+        sentence="",
+    )
+    pairs = int(np.sum(present[1:] & present[:-1]))
+    motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
+    said = _suggestion(found, pairs, block.t_s, motion, estimated)
+    wild = int(block.wild[:, marker].sum())
+    if wild > MOST_WILD * samples:
+        said += (
+            f"; {wild} samples are beyond Huber's threshold: exchanged labels, or reflections "
+            "taken for the marker"
+        )
+    return replace(found, sentence=said)
+
+
+def _rms_m(block: FitBlock, marker: int) -> float:
+    misfit = block.residual if block.misfit is None else block.misfit
+    squares = np.sum(misfit[:, marker] ** 2) / block.present[:, marker].sum()
+    return float(block.sigma_m[marker] * np.sqrt(squares))
+
+
+def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
+    pairs, samples = np.sum(present[1:] & present[:-1]), present.sum()
+    power = np.sum(varying**2)
+    if not pairs or not power > 0:
+        return 0.0
+    return float(np.sum(varying[1:] * varying[:-1]) / pairs / (power / samples))
+
+
+def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
+    """Frequency [Hz] of the largest peak, zero if none, and its share of the power."""
+    if len(t_s) < 4:
+        return 0.0, 0.0
+    # Gaps count as zeros: they spread some power, but move no peak.
+    spectrum = np.sum(np.abs(np.fft.rfft(varying, axis=0)) ** 2, axis=1)
+    spectrum[1 : (len(t_s) + 1) // 2] *= 2
+    total = spectrum.sum()
+    if not total > 0:
+        return 0.0, 0.0
+    peak = 1 + int(np.argmax(spectrum[1:]))
+    around = slice(max(1, peak - PEAK_BINS), peak + PEAK_BINS + 1)
+    weights = spectrum[around]
+    bins = np.arange(len(spectrum))[around]
+    record_s = (t_s[1] - t_s[0]) * len(t_s)
+    centre = float(weights @ bins / weights.sum())
+    return centre / record_s, float(weights.sum() / total)
+
+
+def _suggestion(
+    found: MarkerDiagnosis, pairs: int, t_s: Array, motion: Array, estimated: tuple[bool, bool]
+) -> str:
+    name = f"{found.experiment}/{found.marker}"
+    size = f"{1e3 * found.rms_m:.2g} mm RMS"
+    if found.rms_m < ROUNDING_M:
+        return f"{name}: fits to rounding"
+    persistent = pairs > 0 and abs(found.lag1) > norm.isf(SIGNIFICANCE / 2) / np.sqrt(3 * pairs)
+    shifted = found.constant_share > chi2.isf(SIGNIFICANCE, 3) / (3 * found.samples)
+    if not persistent and not shifted:
+        return f"{name}: {size}, white, as noise should be"
+    if found.constant_share > DOMINANT:
+        offset = 1e3 * np.linalg.norm(found.offset_m)
+        said = (
+            f"{100 * found.constant_share:.0f} % of its power is constant: its place on the body "
+            f"is off by {offset:.2g} mm; {'widen the prior of' if estimated[0] else 'estimate'} "
+            "marker_offsets"
+        )
+    elif found.early_share > DOMINANT:
+        end_s = EARLY_TIME * (t_s[-1] - t_s[0])
+        said = (
+            f"{100 * found.early_share:.0f} % of its power is in the first {end_s:.2g} s: the "
+            "start state or the release time is off"
+        )
+        said += "" if estimated[1] else "; estimate time_shift"
+    elif found.oscillating_share > DOMINANT:
+        said = _oscillation(found, t_s, motion)
+    elif persistent and found.lag1 > DOMINANT:
+        said = "it wanders slowly: creep of the material, or a grasp that gives, is not modelled"
+    else:
+        said = "a mixture, little of which is white noise"
+    return f"{name}: {size}; {said}"
+
+
+def _oscillation(found: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
+    share = f"{100 * found.oscillating_share:.0f} % of its power"
+    record_s = (t_s[1] - t_s[0]) * len(t_s)
+    if found.frequency_hz * record_s < FEWEST_PERIODS:
+        return (
+            f"{share} is a slow drift: creep of the material, or a grasp that gives, is not in "
+            "the model"
+        )
+    said = f"{share} oscillates at {found.frequency_hz:.3g} Hz"
+    of_motion, _ = _largest_peak(motion - motion.mean(axis=0), t_s)
+    if abs(found.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:
+        return f"{said}, with the motion: the model's stiffness, damping or mass differ"
+    return f"{said}, unlike the motion: a vibration or a mode that the model lacks"

@@ -1,0 +1,158 @@
+"""Values with error bars, in the user's parameters and in the other elastic convention.
+
+The logarithm of a parameter is taken as normal (or Student's t), for Poisson's ratio
+ln ν/(½ − ν) = ln λ/μ is: intervals stay within what is physically possible. A number after ± is
+given only where it tells something; else the estimate has a reason instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..nlp.parameters import ENGINEERING, LAME, Parameters, Theta
+
+Mask = NDArray[np.bool_]
+
+# Deviation of a logarithm beyond which the data do not determine the parameter.
+UNDETERMINED = 100.0
+# An interval wider than this factor, or this share of Poisson's (0, ½), identifies nothing.
+WIDE_FACTOR = 10.0
+WIDE_POISSON = 0.4
+# A correlation beyond this, for a deviation beyond that, leaves only a combination identified.
+CONFOUNDED = 0.98
+CONFOUNDED_DEVIATION = 0.1
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One value with its error bar.
+
+    Attributes
+    ----------
+    value : float
+    std_error : float or None
+        None for what was not estimated, is at a bound, or is not identified by the data.
+    ci95 : (lower, upper) or None
+        95 % confidence interval; within what is physically possible. An interval may be there,
+        and wide, where there is no `std_error`.
+    at_bound : bool
+        The value, or one it follows from, ended at a bound.
+    reason : str or None
+        Why something that was estimated has no `std_error`.
+    """
+
+    value: float
+    std_error: float | None = None
+    ci95: tuple[float, float] | None = None
+    at_bound: bool = False
+    reason: str | None = None
+
+
+def correlation_of(covariance: Array) -> Array:
+    """Correlations; NaN where a variance is not finite."""
+    deviation = np.sqrt(np.diag(covariance))
+    deviation[~np.isfinite(deviation) | (deviation == 0)] = np.nan
+    return covariance / np.outer(deviation, deviation)
+
+
+def user_estimates(
+    parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
+) -> dict[str, Estimate]:
+    """Estimates of the user's parameters, by name.
+
+    Parameters
+    ----------
+    of_q : (nq, nq) covariance of q
+    bounded : (nq,) which of q are at a bound
+    quantiles : (nq,) half widths of the 95 % intervals, in deviations
+    """
+    found = {name: Estimate(value) for name, value in parameters.values(q).items()}
+    partners = np.abs(np.nan_to_num(correlation_of(of_q)))
+    np.fill_diagonal(partners, 0.0)
+    for k, item in enumerate(parameters.free):
+        value = float(np.exp(q[k]))
+        if bounded[k]:
+            found[item.name] = _at_bound(value)
+            continue
+        deviation = float(np.sqrt(of_q[k, k]))
+        estimate = _estimate(item.name, value, deviation, float(quantiles[k]))
+        other = int(np.argmax(partners[k]))
+        if estimate.std_error is None or estimate.ci95 is None:
+            pass
+        elif estimate.ci95[0] <= item.lower and estimate.ci95[1] >= item.upper:
+            reason = "its 95 % interval covers the whole range between its bounds"
+            estimate = Estimate(value, None, estimate.ci95, reason=reason)
+        elif partners[k, other] > CONFOUNDED and deviation > CONFOUNDED_DEVIATION:
+            reason = (
+                f"confounded with {parameters.free[other].name} "
+                f"(correlation {correlation_of(of_q)[k, other]:.3f})"
+            )
+            estimate = Estimate(value, None, estimate.ci95, reason=reason)
+        found[item.name] = estimate
+    return found
+
+
+def derived_estimates(
+    parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
+) -> dict[str, Estimate]:
+    """(E, ν) if the user works with (λ, μ) and the other way round, by the delta method."""
+    theta = parameters.theta(q)
+    theta_q, _ = parameters.theta_derivatives(q)
+    if parameters.names[:2] == LAME:
+        names, gradients = ENGINEERING, _engineering_by_lame(theta) @ theta_q[:2]
+    else:
+        names, gradients = LAME, theta_q[:2]
+    found = {}
+    for name, gradient in zip(names, gradients, strict=True):
+        value = float(getattr(theta, name))
+        used = np.flatnonzero(gradient)
+        if bounded[used].any():
+            found[name] = _at_bound(value)
+        elif not len(used) or not value > 0:
+            found[name] = Estimate(value)
+        else:
+            variance = gradient[used] @ of_q[np.ix_(used, used)] @ gradient[used]
+            deviation = float(np.sqrt(variance)) / value
+            found[name] = _estimate(name, value, deviation, float(quantiles[used].max()))
+    return found
+
+
+def _at_bound(value: float) -> Estimate:
+    return Estimate(
+        value, at_bound=True, reason="it ended at a bound, or follows from one that did"
+    )
+
+
+def _estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
+    """An estimate whose logarithm has this standard deviation."""
+    if not deviation <= UNDETERMINED:  # or NaN
+        return Estimate(value, reason="the data do not determine it")
+    if name == "poisson":
+        odds = value / (0.5 - value)
+        low, high = _around(odds, deviation * 0.5 / (0.5 - value), quantile)
+        low, high = 0.5 - 0.5 / (1 + low), 0.5 - 0.5 / (1 + high)
+        wide, reason = high - low > WIDE_POISSON, "its 95 % interval covers nearly all of (0, 0.5)"
+    else:
+        low, high = _around(value, deviation, quantile)
+        wide = high > WIDE_FACTOR * low
+        reason = f"its 95 % interval spans more than a factor of {WIDE_FACTOR:g}"
+    if wide:
+        return Estimate(value, None, (low, high), reason=reason)
+    return Estimate(value, value * deviation, (low, high))
+
+
+def _around(value: float, deviation: float, quantile: float) -> tuple[float, float]:
+    spread = float(np.exp(min(quantile * deviation, UNDETERMINED)))
+    return value / spread, value * spread
+
+
+def _engineering_by_lame(theta: Theta) -> Array:
+    """∂(E, ν)/∂(λ, μ)."""
+    first, second = theta.lambda_pa, theta.mu_pa
+    young = (second**2, 3 * first**2 + 4 * first * second + 2 * second**2)
+    poisson = (second / 2, -first / 2)
+    return np.array([young, poisson]) / (first + second) ** 2

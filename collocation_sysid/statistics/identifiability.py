@@ -1,0 +1,128 @@
+"""What the data fix, and what they leave open, in words.
+
+Directions are those of the marginal covariance of the logarithms q. Scaled to unit variances it
+is the correlation matrix; an eigenvalue ε ≪ 1 belongs to a combination Σ w_k q_k, that is a
+product of powers of the parameters, which is known √ε times better than each of them alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..nlp.parameters import ENGINEERING, LAME
+from .estimates import CONFOUNDED, Estimate
+from .uncertainty import Uncertainty
+
+# An interval within this factor fixes a parameter; a wider one does so "only".
+WELL_FIXED = 1.25
+# Share of the largest part from which on a parameter belongs to a combination.
+MEMBER = 0.2
+# Above this factor an interval tells nothing.
+HOPELESS = 1e4
+
+
+def verdicts(uncertainty: Uncertainty) -> tuple[str, ...]:
+    """Sentences on what the data say about each parameter and about combinations of them.
+
+    The intervals meant are those of 95 %. Sentences on parameters at a bound or not identifiable
+    are the same as in the notes.
+    """
+    open_ends = [note for note in uncertainty.notes if note.split()[0] in uncertainty.names]
+    combined = _combinations(uncertainty)
+    in_other_terms = _other_convention(uncertainty) if open_ends or combined else []
+    return (*_one_by_one(uncertainty), *combined, *in_other_terms, *open_ends)
+
+
+def _one_by_one(uncertainty: Uncertainty) -> list[str]:
+    factors = {
+        name: factor
+        for name in uncertainty.names
+        if (factor := _factor(uncertainty.estimates[name])) is not None
+    }
+    well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
+    badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]
+    parts = [_listed(part) for part in (well, badly) if part]
+    return [f"the data fix {'; '.join(parts)} (95 %)"] if parts else []
+
+
+def _combinations(uncertainty: Uncertainty) -> list[str]:
+    deviations = np.sqrt(np.diag(uncertainty.covariance))
+    known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0))
+    if len(known) < 2:
+        return []
+    correlation = uncertainty.correlation[np.ix_(known, known)]
+    values, vectors = np.linalg.eigh(correlation)
+    sentences = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value > 1 - CONFOUNDED:
+            break
+        members = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
+        # Three or more that are well known each need no word about their company.
+        widths = (uncertainty.quantiles * deviations)[known[members]]
+        if len(members) == 2 or (len(members) > 2 and widths.max() > np.log(WELL_FIXED)):
+            sentences.append(
+                _combination(uncertainty, known[members], max(value, 0.0), vector[members])
+            )
+    return sentences
+
+
+def _combination(
+    uncertainty: Uncertainty, members: NDArray[np.intp], eigenvalue: float, vector: Array
+) -> str:
+    names = [uncertainty.names[k] for k in members]
+    deviations = np.sqrt(np.diag(uncertainty.covariance))[members]
+    quantiles = uncertainty.quantiles[members]
+    weights = vector / deviations
+    largest = int(np.argmax(np.abs(weights)))
+    fixed = np.exp(quantiles.max() * np.sqrt(eigenvalue) / abs(weights[largest]))
+    alone = [_spread(float(f)) for f in np.exp(np.minimum(quantiles * deviations, 100.0))]
+    how = ""
+    if len(members) == 2:
+        how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
+    return (
+        f"{_listed(names)} are confounded{how}: only their combination "
+        f"{_product(names, weights / weights[largest])} is fixed, to {_spread(float(fixed))}, "
+        f"each alone only to {_listed(alone)} (95 %)"
+    )
+
+
+def _other_convention(uncertainty: Uncertainty) -> list[str]:
+    if not {*LAME, *ENGINEERING} & set(uncertainty.names):
+        return []
+    parts = []
+    for name, estimate in uncertainty.derived.items():
+        factor = _factor(estimate)
+        if factor is not None:
+            parts.append(f"{name} {'only ' if factor > WELL_FIXED else ''}to {_spread(factor)}")
+    return [f"in the other elastic pair: they fix {_listed(parts)} (95 %)"] if parts else []
+
+
+def _factor(estimate: Estimate) -> float | None:
+    """Half width of the interval as a factor."""
+    if estimate.ci95 is None or not estimate.ci95[0] > 0:
+        return None
+    factor = float(np.sqrt(estimate.ci95[1] / estimate.ci95[0]))
+    return factor if factor < HOPELESS else None
+
+
+def _spread(factor: float) -> str:
+    if factor < 1.5:
+        return f"±{100 * (factor - 1):.2g} %"
+    return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"
+
+
+def _product(names: Sequence[str], powers: Array) -> str:
+    parts = []
+    for name, power in zip(names, powers, strict=True):
+        parts.append(name if abs(power - 1) < 5e-3 else f"{name}^{power:.2g}")
+    return " · ".join(parts)
+
+
+def _listed(parts: Sequence[str]) -> str:
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,0 +1,177 @@
+"""The fit near its answer: residuals of all samples and their slopes along the motion equations.
+
+Everything the statistics need to know of a fit. Estimated are the shared parameters, q, and
+possibly local ones of single experiments, such as the offset of a marker on the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..nlp.collocation import Collocation
+from .sensitivity import marker_sensitivities
+
+Mask = NDArray[np.bool_]
+
+# A parameter this near a bound, in its logarithm, is at it: interior-point methods stay inside.
+AT_BOUND = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class FitBlock:
+    """One experiment's residuals and their slopes at the answer.
+
+    Attributes
+    ----------
+    name : str
+        Of the experiment.
+    t_s : (T,) sample times, equally spaced
+    marker_names : (M,)
+    present : (T, M) bool
+    residual : (T, M, 3) (h(x) − ŷ) / σ, zero where missing
+    slope : (T, M, 3, p) derivative of the residual by all p parameters, zero where missing
+    sigma_m : (M,) standard deviations given
+    misfit : (T, M, 3), optional
+        Residuals as they are, where Huber's loss has shortened those in `residual`.
+    """
+
+    name: str
+    t_s: Array
+    marker_names: tuple[str, ...]
+    present: Mask
+    residual: Array
+    slope: Array
+    sigma_m: Array
+    misfit: Array | None = None
+
+    @property
+    def wild(self) -> Mask:
+        """(T, M) samples beyond Huber's threshold."""
+        if self.misfit is None:
+            return np.zeros(self.present.shape, dtype=bool)
+        return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
+
+    @property
+    def measurements(self) -> int:
+        """Scalar measurements that are present."""
+        return 3 * int(self.present.sum())
+
+    @cached_property
+    def channels(self) -> tuple[Array, Array, Mask]:
+        """Residuals (T, 3M), slopes (T, 3M, p) and presence (T, 3M); column 3 m + axis."""
+        samples, markers = self.present.shape
+        return (
+            self.residual.reshape(samples, 3 * markers),
+            self.slope.reshape(samples, 3 * markers, -1 if self.slope.size else 0),
+            np.repeat(self.present, 3, axis=1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedFit:
+    """The least-squares problem at its answer.
+
+    Attributes
+    ----------
+    blocks : tuple of FitBlock
+        One per fitted experiment.
+    names : (p,) the shared parameters first, whose logarithms are q; then local ones, with their
+        unit in brackets: ``"gravity/offset Tip1 x [m]"``
+    shared : int
+        Number of shared parameters.
+    prior_residual, prior_slope : (p,) in units of the prior's deviation, zero without a prior
+    at_bound : (p,) bool
+        Parameters that ended at a bound.
+    """
+
+    blocks: tuple[FitBlock, ...]
+    names: tuple[str, ...]
+    shared: int
+    prior_residual: Array
+    prior_slope: Array
+    at_bound: Mask
+
+    @property
+    def measurements(self) -> int:
+        """Scalar measurements that are present."""
+        return sum(block.measurements for block in self.blocks)
+
+    @property
+    def chi_squared(self) -> float:
+        """Σ residual² of the markers, without priors."""
+        return float(sum(np.sum(block.residual**2) for block in self.blocks))
+
+
+def linearised_fit(
+    collocation: Collocation, z: Array, marker_z: Sequence[Array] | None = None
+) -> LinearisedFit:
+    """The fit near a solution.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) a point that satisfies the equations of motion, the optimum
+    marker_z : sequence of (T, 3M, nq), optional
+        `marker_sensitivities`, where they are known already.
+
+    Raises
+    ------
+    SimulationError
+        Where the equations of motion are singular.
+    """
+    _, positions = collocation.unpack(z)
+    p, own = collocation.parameters_of(z), collocation.unpack_own(z)
+    if marker_z is None:
+        marker_z = marker_sensitivities(collocation, z)
+    blocks = []
+    for segment, x, phi, by_p, places in zip(
+        collocation.segments, positions, own, marker_z, collocation.places, strict=True
+    ):
+        markers = segment.experiment.markers
+        residual, here = segment.observation.linearised(
+            x, phi, by_p, segment.moving, collocation.nq
+        )
+        slope = np.zeros((*residual.shape, len(p)))
+        slope[..., places] = here
+        misfit = residual
+        if collocation.huber is not None:
+            residual, slope = _reweighted(residual, slope, collocation.huber)
+        blocks.append(
+            FitBlock(
+                name=segment.experiment.name,
+                t_s=markers.t_s,
+                marker_names=markers.names,
+                present=markers.present,
+                residual=residual,
+                slope=slope,
+                sigma_m=markers.sigma_m,
+                misfit=misfit,
+            )
+        )
+    prior_residual, prior_slope = collocation.prior(p)
+    lower, upper = collocation.bounds_p
+    return LinearisedFit(
+        blocks=tuple(blocks),
+        names=collocation.names,
+        shared=collocation.nq,
+        prior_residual=prior_residual,
+        prior_slope=prior_slope,
+        at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
+    )
+
+
+def _reweighted(residual: Array, slope: Array, threshold: float) -> tuple[Array, Array]:
+    """Samples beyond Huber's threshold as it sees them.
+
+    Slopes have the weight of the fit's normal equations; residuals end at the threshold, so that a
+    few wild samples tell nothing of the others' noise.
+    """
+    length = np.linalg.norm(residual, axis=2)
+    weight = (threshold / np.maximum(length, threshold))[..., None]
+    return residual * weight, slope * np.sqrt(weight)[..., None]

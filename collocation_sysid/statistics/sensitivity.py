@@ -1,0 +1,57 @@
+"""How the trajectory follows the parameters: Z = dx/dp with the equations of motion kept.
+
+From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.tangent`; p are the
+shared parameters q and those of an experiment's own that move its body, see `Segment.moving`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..arrays import Array
+from ..nlp.collocation import Collocation
+from ..nlp.lapack import one_blas_thread
+from ..nlp.segment import Segment
+from ..nlp.tangent import BlockSolver
+
+
+def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
+    """dx/dp of each experiment, (N, 3n, m) in metres per unit of p.
+
+    Held dofs have zeros, and so has x_0 unless it is found in equilibrium.
+
+    Raises
+    ------
+    SimulationError
+        Where the equations of a step are singular.
+    """
+    return [np.stack(list(rows)) for _, rows in _by_experiment(collocation, z)]
+
+
+@one_blas_thread()
+def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
+    """d(markers)/dp of each experiment at its samples, (T, 3M, m); column 3 m + axis.
+
+    Of the plain markers, h(x), by the parameters that move the body. Needs no more memory than the
+    result.
+
+    Raises
+    ------
+    SimulationError
+        Where the equations of a step are singular.
+    """
+    found = []
+    for segment, rows in _by_experiment(collocation, z):
+        sampled = set(segment.observation.grid_rows.tolist())
+        operator = segment.experiment.markers.operator
+        found.append(np.stack([operator @ row for t, row in enumerate(rows) if t in sampled]))
+    return found
+
+
+def _by_experiment(collocation: Collocation, z: Array) -> Iterator[tuple[Segment, Iterator[Array]]]:
+    _, positions = collocation.unpack(z)
+    settings = collocation.settings(collocation.parameters_of(z))
+    for segment, x, setting in zip(collocation.segments, positions, settings, strict=True):
+        yield segment, BlockSolver(segment).sensitivities(x, setting)
