@@ -6,21 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from .section import (
-    Boundless,
-    Corner,
-    Finite,
-    Flag,
-    NotNegative,
-    Positive,
-    Section,
-    Text,
-    Unit,
-    Vector,
-    Whole,
-    given_keys,
-    require_one,
-)
+from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text, Whole
+from .section import Corner, Section, Unit, Vector, given_keys, require_one
 
 
 class NodesSection(Section):

@@ -6,23 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from ..checked import Flag, NotNegative, Positive, Text, Whole
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..methods import METHODS
 from ..methods.casadi_nlp import why_not
 from ..nlp.schemes import SCHEMES
 from .recording_schema import ExperimentSection
-from .section import (
-    Flag,
-    NotNegative,
-    Positive,
-    Section,
-    Text,
-    Unit,
-    Whole,
-    given_keys,
-    require_one,
-)
+from .section import Section, Unit, given_keys, require_one
 
 
 def _offered(name: Any) -> Any:
