@@ -14,7 +14,7 @@ from .fem.body import Body
 from .fem.mesh import TetMesh
 from .methods.solution import Solution, Status
 from .nlp.collocation import Collocation
-from .nlp.parameters import Parameter, Parameters, Theta
+from .nlp.parameters import Parameter, Parameters, Tied, Unknown
 from .nlp.simulation import Trajectory, simulate
 from .output.record import write_run
 from .problem import Problem, load_problem
@@ -37,8 +37,9 @@ __all__ = [
     "Solution",
     "Status",
     "TetMesh",
-    "Theta",
+    "Tied",
     "Trajectory",
+    "Unknown",
     "load_problem",
     "run",
     "simulate",

@@ -13,7 +13,7 @@ from .experiment import Experiment
 from .methods import METHODS
 from .methods.solution import Solution
 from .nlp.collocation import Collocation
-from .nlp.parameters import LAME, Parameter, Parameters, Theta
+from .nlp.parameters import Parameters
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem
@@ -46,7 +46,7 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         segment, phi = _seen(experiment, solution)
         trajectory = simulate(
             segment.corrected(phi),
-            solution.theta,
+            experiment.body.theta(solution.parameters),
             integrator,
             timestep_s=section.timestep_s,
             substeps=transcription.substeps,
@@ -78,7 +78,7 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
             return segment, phi
     alone = Collocation(
         [replace(experiment, validation=False)],
-        _fixed(solution.theta),
+        Parameters.of(solution.parameters),
         collocation.scheme,
         collocation.substeps,
         huber=collocation.huber,
@@ -88,8 +88,3 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
         return segment, np.zeros(0)
     predicted = METHODS["reduced-space"].solve(alone)
     return segment, alone.unpack_own(predicted.z)[0]
-
-
-def _fixed(theta: Theta) -> Parameters:
-    names = (*LAME, *Theta._fields[2:])
-    return Parameters(tuple(Parameter(n, v, fixed=True) for n, v in zip(names, theta, strict=True)))

@@ -12,8 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from .check import Findings
+from .fem.constants import symbol_of, unit_of
 from .methods.solution import Iteration
-from .nlp.parameters import Theta
 from .problem import Problem
 from .rollout import Rollout
 from .run import Run
@@ -22,14 +22,6 @@ from .statistics.uncertainty import Estimate
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
-UNITS = {
-    "lambda_pa": ("λ", "Pa"),
-    "mu_pa": ("μ", "Pa"),
-    "young_pa": ("E", "Pa"),
-    "poisson": ("ν", ""),
-    "gamma_r_s": ("γ_r", "s"),
-    "gamma_m_1_s": ("γ_m", "1/s"),
-}
 
 
 class Progress:
@@ -92,7 +84,7 @@ class Progress:
 def _iterations(lines: list[Iteration]) -> RenderableType:
     if not lines:
         return Text("")
-    heads = ["", "RMS mm", "violation N", *(UNITS[name][0] for name in Theta._fields), "s"]
+    heads = ["", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s"]
     table = Table(*heads, box=None, pad_edge=False)
     for column in table.columns:
         column.justify = "right"
@@ -106,7 +98,7 @@ def _cells(line: Iteration) -> list[str]:
         str(line.number),
         f"{line.rms_m * 1e3:.4f}",
         f"{line.violation_n:.1e}",
-        *(f"{value:.4g}" for value in line.theta),
+        *(f"{value:.4g}" for value in line.parameters.values()),
         f"{line.time_s:.1f}",
     ]
 
@@ -144,7 +136,7 @@ def _parameter_table(finished: Run) -> Table:
 
 
 def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
-    symbol, unit = UNITS[name]
+    symbol, unit = symbol_of(name), unit_of(name)
     interval = "" if estimate.ci95 is None else "{:.5g} … {:.5g}".format(*estimate.ci95)
     if estimate.at_bound:
         interval = "at its bound"
@@ -248,7 +240,6 @@ def _body_section(findings: Findings) -> RenderableType:
     size = " × ".join(f"{1e3 * x:.4g}" for x in findings.size_m)
     low, mean, high = (1e3 * x for x in findings.edges_m)
     worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in findings.worst_elements)
-    guess = findings.guess
     return _section(
         "Body",
         {
@@ -257,8 +248,10 @@ def _body_section(findings: Findings) -> RenderableType:
             "mesh": f"{findings.nodes:,} nodes, {findings.elements:,} {findings.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {findings.median_element_quality:.2f}, worst in elements {worst}",
-            "guess": f"E {guess['young_pa']:.4g} Pa, ν {guess['poisson']:.3g}, "
-            f"γ_r {guess['gamma_r_s']:.3g} s, γ_m {guess['gamma_m_1_s']:.3g} 1/s",
+            "guess": ", ".join(
+                f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
+                for name, value in findings.guess.items()
+            ),
         },
     )
 

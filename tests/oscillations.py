@@ -10,14 +10,13 @@ from problems_small import EDGE_M, hung_cube, nodes_where, vertex_markers
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.nlp.modes import Modes, natural_modes
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
 
 # Small enough for the cube to be linear, large enough against the tolerance of Newton's method.
 AMPLITUDE_M = 1e-6 * EDGE_M
 
 
-def released_in_a_mode(theta: Theta, mode: int, timestep_s: float = 0.01, steps: int = 30):
+def released_in_a_mode(theta: np.ndarray, mode: int, timestep_s: float = 0.01, steps: int = 30):
     """A weightless cube held at its top, displaced in one of its modes and let go.
 
     Returns
@@ -43,7 +42,7 @@ def released_in_a_mode(theta: Theta, mode: int, timestep_s: float = 0.01, steps:
 
 
 def oscillation(
-    experiment: Experiment, modes: Modes, mode: int, theta: Theta, integrator: str, **options
+    experiment: Experiment, modes: Modes, mode: int, theta: np.ndarray, integrator: str, **options
 ) -> tuple[float, float]:
     """Undamped angular frequency and damping ratio of a mode's amplitude in a simulation.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -34,6 +34,13 @@ GUESS = Parameters(
         Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0),
     )
 )
+
+
+def as_theta(given: Parameters | Mapping[str, float]) -> np.ndarray:
+    """Constants of a body of one region in λ and μ, in its order."""
+    return np.array([*(given.guesses if isinstance(given, Parameters) else given).values()])
+
+
 GRAVITY_M_S2 = (0.0, 0.0, -9.81)
 EDGE_M = 0.1
 

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from checks import relative_error
+from materials_small import ELASTIC, elastic
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem import batched
@@ -17,7 +18,6 @@ from collocation_sysid.fem.batched.combine import combine_natively, combine_with
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import neo_hookean
 
-LAME = (200.0, 300.0)
 VARIABLE = "COLLOCATION_SYSID_EVALUATOR"
 
 
@@ -73,8 +73,8 @@ def test_everything_works_without_llvmlite(small_mesh, make_body, without_llvmli
     body = new_body(small_mesh)
     assert body.evaluator == "casadi"
     x = squeezed(small_mesh)
-    expected = make_body("neo-hookean", "casadi").elastic_force(x, *LAME)
-    np.testing.assert_array_equal(body.elastic_force(x, *LAME), expected)
+    expected = make_body("neo-hookean", "casadi").elastic_force(x, **ELASTIC)
+    np.testing.assert_array_equal(body.elastic_force(x, **elastic(body)), expected)
     assert make_combiner(random_plan(np.random.default_rng(0))).__qualname__.startswith(
         combine_with_numpy.__name__
     )
@@ -93,9 +93,9 @@ def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, monkey
     monkeypatch.setattr(simd, "vector_lanes", lambda: lanes)
     x = squeezed(small_mesh)
     body, reference = new_body(small_mesh, evaluator="simd"), make_body("neo-hookean", "casadi")
-    found, expected = (each.elastic_force(x, *LAME) for each in (body, reference))
+    found, expected = (each.elastic_force(x, **elastic(each)) for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
-    found, expected = (each.stiffness(x, *LAME).toarray() for each in (body, reference))
+    found, expected = (each.stiffness(x, **elastic(each)).toarray() for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
 
 
@@ -121,7 +121,7 @@ def test_functions_an_energy_may_use(small_mesh, name):
         return lambda_pa * FUNCTIONS_OF_J[name](ca.det(F))
 
     values = [
-        new_body(small_mesh, energy, evaluator).energy(squeezed(small_mesh), *LAME)
+        new_body(small_mesh, energy, evaluator).energy(squeezed(small_mesh), **ELASTIC)
         for evaluator in ("simd", "casadi")
     ]
     assert values[0] == pytest.approx(values[1], rel=1e-13)
@@ -133,8 +133,8 @@ def test_function_the_vector_code_lacks_is_refused_with_the_remedy(small_mesh):
 
     x = squeezed(small_mesh)
     with pytest.raises(InputError, match=r"operation OP_\w+; choose evaluator='casadi'"):
-        new_body(small_mesh, clipped, "simd").energy(x, *LAME)
-    assert new_body(small_mesh, clipped, "casadi").energy(x, *LAME) > 0
+        new_body(small_mesh, clipped, "simd").energy(x, **ELASTIC)
+    assert new_body(small_mesh, clipped, "casadi").energy(x, **ELASTIC) > 0
 
 
 # Compiled code on disk ------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def compiled(monkeypatch) -> list[str]:
 
 
 def evaluate(mesh) -> float:
-    return new_body(mesh, evaluator="simd").energy(squeezed(mesh), *LAME)
+    return new_body(mesh, evaluator="simd").energy(squeezed(mesh), **ELASTIC)
 
 
 def test_compiled_code_is_kept_and_used_again(small_mesh, cache, compiled):
@@ -169,7 +169,7 @@ def test_compiled_code_is_kept_and_used_again(small_mesh, cache, compiled):
 
 def test_another_material_gets_a_file_of_its_own(small_mesh, cache):
     evaluate(small_mesh)
-    new_body(small_mesh, "linear", "simd").energy(squeezed(small_mesh), *LAME)
+    new_body(small_mesh, "linear", "simd").energy(squeezed(small_mesh), **ELASTIC)
     assert len(list(cache.iterdir())) == 2
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from checks import assert_derivative, directional_derivative, relative_error
+from materials_small import elastic, theta_for
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -15,8 +16,6 @@ from collocation_sysid.fem.elements import ELEMENTS
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 
-LAME = (200.0, 300.0)
-THETA = np.array([*LAME, 0.009, 1.0])
 ROTATION_INVARIANT = [name for name in MATERIALS if name != "linear"]
 EVALUATORS = ["simd", "casadi"]
 LENGTH_M = 0.03  # a large change of a position
@@ -54,17 +53,21 @@ def times(body: Body, triangles: np.ndarray, field: np.ndarray) -> np.ndarray:
 def test_force_is_minus_the_slope_of_the_energy(make_body, material, evaluator, rng):
     body = make_body(material, evaluator)
     x = deformed(body, rng)[0]
-    force = body.elastic_force(x, *LAME)
+    force = body.elastic_force(x, **elastic(body))
     assert_derivative(
-        lambda x: body.energy(x, *LAME), lambda dx: -np.sum(force * dx), x, rng, scale=LENGTH_M
+        lambda x: body.energy(x, **elastic(body)),
+        lambda dx: -np.sum(force * dx),
+        x,
+        rng,
+        scale=LENGTH_M,
     )
 
 
 def test_stiffness_is_minus_the_slope_of_the_force(body, rng):
     x = deformed(body, rng)[0]
-    K = body.stiffness(x, *LAME)
+    K = body.stiffness(x, **elastic(body))
     assert_derivative(
-        lambda x: body.elastic_force(x, *LAME),
+        lambda x: body.elastic_force(x, **elastic(body)),
         lambda dx: -(K @ dx.ravel()).reshape(dx.shape),
         x,
         rng,
@@ -73,7 +76,7 @@ def test_stiffness_is_minus_the_slope_of_the_force(body, rng):
 
 
 def test_stiffness_is_symmetric_on_the_mesh_graph_and_resists_every_strain_at_rest(body):
-    K = body.stiffness(body.nodes_m, *LAME)
+    K = body.stiffness(body.nodes_m, **elastic(body))
     assert sp.issparse(K)
     assert abs(K - K.T).max() == 0.0
     assert K.nnz == 9 * (len(body.nodes_m) + 2 * len(body.mesh.edges))
@@ -85,8 +88,15 @@ def test_stiffness_is_symmetric_on_the_mesh_graph_and_resists_every_strain_at_re
 def test_translation_changes_nothing(body, rng):
     x = deformed(body, rng)[0]
     moved = x + np.array([3.0, -2.0, 1.0])
-    assert body.energy(moved, *LAME) == pytest.approx(body.energy(x, *LAME), rel=1e-12)
-    assert relative_error(body.elastic_force(moved, *LAME), body.elastic_force(x, *LAME)) < 1e-11
+    assert body.energy(moved, **elastic(body)) == pytest.approx(
+        body.energy(x, **elastic(body)), rel=1e-12
+    )
+    assert (
+        relative_error(
+            body.elastic_force(moved, **elastic(body)), body.elastic_force(x, **elastic(body))
+        )
+        < 1e-11
+    )
 
 
 @pytest.mark.parametrize("material", ROTATION_INVARIANT)
@@ -94,8 +104,8 @@ def test_rotation_turns_the_forces_along(make_body, material, rng):
     body = make_body(material)
     x = deformed(body, rng)[0]
     turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
-    found = body.elastic_force(x @ turn.T, *LAME)
-    assert relative_error(found, body.elastic_force(x, *LAME) @ turn.T) < 1e-11
+    found = body.elastic_force(x @ turn.T, **elastic(body))
+    assert relative_error(found, body.elastic_force(x, **elastic(body)) @ turn.T) < 1e-11
 
 
 @pytest.mark.parametrize("material", ROTATION_INVARIANT)
@@ -103,12 +113,12 @@ def test_rigid_motion_causes_no_force(make_body, material, rng):
     body = make_body(material)
     turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
     moved = body.nodes_m @ turn.T + [0.3, 0.2, -0.1]
-    scale = abs(body.elastic_force(deformed(body, rng)[0], *LAME)).max()
-    assert abs(body.elastic_force(moved, *LAME)).max() < 1e-12 * scale
+    scale = abs(body.elastic_force(deformed(body, rng)[0], **elastic(body))).max()
+    assert abs(body.elastic_force(moved, **elastic(body))).max() < 1e-12 * scale
 
 
 def test_elastic_forces_balance(body, rng):
-    force = body.elastic_force(deformed(body, rng)[0], *LAME)
+    force = body.elastic_force(deformed(body, rng)[0], **elastic(body))
     assert abs(force.sum(axis=0)).max() < 1e-13 * abs(force).sum()
 
 
@@ -116,7 +126,7 @@ def test_elastic_forces_balance(body, rng):
 def test_elastic_forces_exert_no_torque(make_body, material, rng):
     body = make_body(material)
     x = deformed(body, rng)[0]
-    torques = np.cross(x, body.elastic_force(x, *LAME))
+    torques = np.cross(x, body.elastic_force(x, **elastic(body)))
     assert abs(torques.sum(axis=0)).max() < 1e-13 * abs(torques).sum()
 
 
@@ -128,20 +138,20 @@ def test_damping_takes_energy_out_near_rest(body, amplitude_m, rng):
     x = np.repeat(body.nodes_m[None], 20, axis=0)
     x = x + rng.uniform(-amplitude_m, amplitude_m, x.shape)
     v = velocities(body, rng, len(x))
-    damping = body.force(x, v, THETA) - body.force(x, np.zeros_like(v), THETA)
+    damping = body.force(x, v, theta_for(body)) - body.force(x, np.zeros_like(v), theta_for(body))
     assert (np.einsum("ti,ti->t", damping, v) < 0).all()
 
 
 def test_rigid_rotation_is_not_slowed_by_stiffness_damping(body, rng):
     spin = np.cross([1.0, 2.0, 3.0], body.nodes_m)
-    force = body.force(body.nodes_m, spin, [*LAME, 0.1, 0.0])
-    scale = abs(body.force(body.nodes_m, velocities(body, rng, 1), [*LAME, 0.1, 0.0])).max()
+    force = body.force(body.nodes_m, spin, theta_for(body, 0.1, 0.0))
+    scale = abs(body.force(body.nodes_m, velocities(body, rng, 1), theta_for(body, 0.1, 0.0))).max()
     assert abs(force).max() < 1e-12 * scale
 
 
 def test_translation_is_slowed_by_mass_damping_alone(body):
     v = np.tile([1.0, 2.0, 3.0], len(body.nodes_m))
-    force = body.force(body.nodes_m, v, [*LAME, 0.1, 2.0])[0]
+    force = body.force(body.nodes_m, v, theta_for(body, 0.1, 2.0))[0]
     np.testing.assert_allclose(force, -2.0 * np.repeat(body.node_mass, 3) * v, atol=1e-14)
 
 
@@ -150,8 +160,8 @@ def test_translation_is_slowed_by_mass_damping_alone(body):
 
 def test_linearise_returns_the_force(body, rng):
     x, v = deformed(body, rng), velocities(body, rng)
-    force = body.linearise(x, v, THETA).force
-    assert relative_error(force, body.force(x, v, THETA)) < 1e-13
+    force = body.linearise(x, v, theta_for(body)).force
+    assert relative_error(force, body.force(x, v, theta_for(body))) < 1e-13
 
 
 @pytest.mark.parametrize("evaluator", EVALUATORS)
@@ -159,19 +169,26 @@ def test_linearise_returns_the_force(body, rng):
 def test_linearise_gives_the_slopes_of_the_force(make_body, material, evaluator, rng):
     body = make_body(material, evaluator)
     x, v = deformed(body, rng), velocities(body, rng)
-    at = body.linearise(x, v, THETA)
+    at = body.linearise(x, v, theta_for(body))
     assert_derivative(
-        lambda x: body.force(x, v, THETA),
+        lambda x: body.force(x, v, theta_for(body)),
         lambda dx: times(body, at.by_position, dx),
         x,
         rng,
         scale=LENGTH_M,
     )
     assert_derivative(
-        lambda v: body.force(x, v, THETA), lambda dv: times(body, at.by_velocity, dv), v, rng
+        lambda v: body.force(x, v, theta_for(body)),
+        lambda dv: times(body, at.by_velocity, dv),
+        v,
+        rng,
     )
     assert_derivative(
-        lambda theta: body.force(x, v, theta), lambda d: at.by_theta @ d, THETA, rng, scale=THETA
+        lambda theta: body.force(x, v, theta),
+        lambda d: at.by_theta @ d,
+        theta_for(body),
+        rng,
+        scale=theta_for(body),
     )
 
 
@@ -180,9 +197,11 @@ def test_each_parameter_has_its_own_column(make_body, k, rng):
     body = make_body()
     x, v = deformed(body, rng), velocities(body, rng)
     expected = directional_derivative(
-        lambda theta: body.force(x, v, theta), THETA, THETA[k] * np.eye(4)[k]
+        lambda theta: body.force(x, v, theta),
+        theta_for(body),
+        theta_for(body)[k] * np.eye(len(theta_for(body)))[k],
     )
-    found = THETA[k] * body.linearise(x, v, THETA).by_theta[:, :, k]
+    found = theta_for(body)[k] * body.linearise(x, v, theta_for(body)).by_theta[:, :, k]
     assert relative_error(found, expected) < 1e-10
 
 
@@ -195,7 +214,7 @@ def test_slopes_of_the_damping_force_by_position_are_symmetric(make_body, materi
 
     def damping(x: np.ndarray) -> np.ndarray:
         without, with_damping = (
-            body.force(x, np.broadcast_to(v, x.shape), [*LAME, gamma_r, 0.0])
+            body.force(x, np.broadcast_to(v, x.shape), theta_for(body, gamma_r, 0.0))
             for gamma_r in (0.0, 1.0)
         )
         return with_damping - without
@@ -209,12 +228,12 @@ def test_linearise_writes_into_the_given_rows(make_body, rng):
     body = make_body()
     x, v = deformed(body, rng), velocities(body, rng)
     rows = np.full((len(x), body.linearisation_width), np.nan)
-    at = body.linearise(x, v, THETA, out=rows)
-    for name, expected in vars(body.linearise(x, v, THETA)).items():
+    at = body.linearise(x, v, theta_for(body), out=rows)
+    for name, expected in vars(body.linearise(x, v, theta_for(body))).items():
         assert np.shares_memory(getattr(at, name), rows)
         np.testing.assert_array_equal(getattr(at, name), expected)
     with pytest.raises(InputError, match="expected contiguous float64"):
-        body.linearise(x, v, THETA, out=rows[:, 1:])
+        body.linearise(x, v, theta_for(body), out=rows[:, 1:])
 
 
 # Second derivatives ---------------------------------------------------------------------------
@@ -251,9 +270,9 @@ def second_derivative(body: Body, at: Curvature, of: str, by: str, d: np.ndarray
 )
 def test_curvature_gives_the_slopes_of_the_weighted_slopes(body, of, by, rng):
     x, v, w = deformed(body, rng), velocities(body, rng), velocities(body, rng)
-    at = body.curvature(x, v, w, THETA)
+    at = body.curvature(x, v, w, theta_for(body))
     slope = weighted_slopes(body, w)[of]
-    point = {"position": x, "velocity": v, "theta": THETA}
+    point = {"position": x, "velocity": v, "theta": theta_for(body)}
 
     def moved(new: np.ndarray) -> np.ndarray:
         return slope(*(point | {by: new}).values())
@@ -261,7 +280,7 @@ def test_curvature_gives_the_slopes_of_the_weighted_slopes(body, of, by, rng):
     if body.material is MATERIALS["linear"] and of == "position" and by != "theta":
         assert not getattr(at, f"{of}_{by}").any()
         return
-    scale = {"position": LENGTH_M, "velocity": 1.0, "theta": THETA}[by]
+    scale = {"position": LENGTH_M, "velocity": 1.0, "theta": theta_for(body)}[by]
     assert_derivative(
         moved,
         lambda d: second_derivative(body, at, of, by, d),
@@ -274,14 +293,14 @@ def test_curvature_gives_the_slopes_of_the_weighted_slopes(body, of, by, rng):
 
 def test_curvature_gives_the_slope_by_the_parameters(body, rng):
     x, v, w = deformed(body, rng), velocities(body, rng), velocities(body, rng)
-    expected = weighted_slopes(body, w)["theta"](x, v, THETA)
-    np.testing.assert_allclose(body.curvature(x, v, w, THETA).theta, expected, rtol=1e-10)
+    expected = weighted_slopes(body, w)["theta"](x, v, theta_for(body))
+    np.testing.assert_allclose(body.curvature(x, v, w, theta_for(body)).theta, expected, rtol=1e-10)
 
 
 def test_force_is_linear_in_the_velocity(body, rng):
     """So that ∂²φ/∂v² is zero and not among the outputs."""
     x, v = deformed(body, rng), velocities(body, rng)
-    slopes = (body.linearise(x, scale * v, THETA).by_velocity for scale in (1.0, 5.0))
+    slopes = (body.linearise(x, scale * v, theta_for(body)).by_velocity for scale in (1.0, 5.0))
     np.testing.assert_array_equal(*slopes)
 
 
@@ -323,11 +342,11 @@ def test_fields_of_the_wrong_shape_are_refused(make_body):
     body = make_body()
     x = body.nodes_m
     with pytest.raises(InputError, match=r"shapes \(26, 3\); expected \(27, 3\) or \(T, 27, 3\)"):
-        body.energy(x[:-1], *LAME)
+        body.energy(x[:-1], **elastic(body))
     with pytest.raises(InputError, match="hold 2 states; expected one"):
-        body.elastic_force(np.stack([x, x]), *LAME)
+        body.elastic_force(np.stack([x, x]), **elastic(body))
     with pytest.raises(InputError, match="with the same T in all"):
-        body.force(np.stack([x, x]), np.zeros_like(x), THETA)
+        body.force(np.stack([x, x]), np.zeros_like(x), theta_for(body))
 
 
 def test_volume_ratio_is_one_at_rest_and_the_cube_of_a_stretch(make_body):
@@ -360,10 +379,17 @@ def test_pattern_finds_entries_of_either_triangle_and_nothing_outside(make_body)
 
 def assert_same(a: Body, b: Body, rng: np.random.Generator, tolerance: float = 1e-12) -> None:
     x, v, w = deformed(a, rng, 3), velocities(a, rng, 3), velocities(a, rng, 3)
-    assert a.energy(x[0], *LAME) == pytest.approx(b.energy(x[0], *LAME), rel=tolerance)
-    assert relative_error(a.force(x, v, THETA), b.force(x, v, THETA)) <= tolerance
+    assert a.energy(x[0], **elastic(a)) == pytest.approx(
+        b.energy(x[0], **elastic(b)), rel=tolerance
+    )
+    assert (
+        relative_error(a.force(x, v, theta_for(body)), b.force(x, v, theta_for(body))) <= tolerance
+    )
     first, second = (
-        [*vars(body.linearise(x, v, THETA)).items(), *vars(body.curvature(x, v, w, THETA)).items()]
+        [
+            *vars(body.linearise(x, v, theta_for(body))).items(),
+            *vars(body.curvature(x, v, w, theta_for(body))).items(),
+        ]
         for body in (a, b)
     )
     for (name, found), (_, expected) in zip(first, second, strict=True):

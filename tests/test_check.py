@@ -18,7 +18,6 @@ from collocation_sysid.check.motion import motion_warnings
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.problem import load_problem
 from collocation_sysid.run import build_collocation
 
@@ -30,7 +29,7 @@ SILICONE = (
     "parameters.gamma_m_1_s.guess=0.1",
 )
 REGULAR = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 10
-COMPRESSIBLE = Theta(100.0, 100.0, 0.0, 0.0)
+COMPRESSIBLE = np.array([100.0, 100.0, 0.0, 0.0])
 
 
 def checked(folder: Path, *overrides: str) -> Findings:

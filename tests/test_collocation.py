@@ -10,6 +10,7 @@ from checks import assert_derivative, relative_error
 from problems_small import (
     GUESS,
     TRUTH,
+    as_theta,
     bar_in_two_hands,
     bar_let_go,
     cube_with_gaps,
@@ -24,7 +25,7 @@ from collocation_sysid.fem.batched.combine import combine_with_numpy
 from collocation_sysid.nlp import block_band
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import with_markers
 

@@ -161,7 +161,7 @@ def test_an_interruption_of_a_short_stage_is_an_answer_of_the_whole():
     assert solution.collocation is collocation
     assert len(solution.notes) == 1
     assert len(solution.positions_m[0]) == 20
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
 
 
 def test_what_a_stage_does_not_reach_the_last_one_reports():

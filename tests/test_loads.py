@@ -10,6 +10,7 @@ from problems_small import (
     EDGE_M,
     GRAVITY_M_S2,
     TRUTH,
+    as_theta,
     bar_in_two_hands,
     bar_let_go,
     box,
@@ -22,7 +23,6 @@ from problems_small import (
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Force, Grasp, PointMass, PoseSequence
 from collocation_sysid.experiment.force_files import read_forces
-from collocation_sysid.nlp.parameters import as_theta
 from collocation_sysid.nlp.rest import rest_state
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import simulate

@@ -6,13 +6,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from checks import assert_derivative, relative_error
+from materials_small import LAME, elastic
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS, material_named
 
-LAME = (200.0, 300.0)
 ROTATION_INVARIANT = [name for name in MATERIALS if name != "linear"]
 
 
@@ -110,15 +110,15 @@ def test_energy_written_by_the_user_works(small_mesh, evaluator, rng):
     body = Body(small_mesh, stiffening, density_kg_m3=30.0, evaluator=evaluator)
     x = small_mesh.points_m + rng.uniform(-0.003, 0.003, small_mesh.points_m.shape)
     assert_derivative(
-        lambda x: body.energy(x, *LAME),
-        lambda dx: -np.sum(body.elastic_force(x, *LAME) * dx),
+        lambda x: body.energy(x, **elastic(body)),
+        lambda dx: -np.sum(body.elastic_force(x, **elastic(body)) * dx),
         x,
         rng,
         scale=0.01,
     )
     # The same small-strain limit as the materials of the table.
     table = Body(small_mesh, "neo-hookean", density_kg_m3=30.0, evaluator=evaluator)
-    stiffness, expected = (b.stiffness(small_mesh.points_m, *LAME) for b in (body, table))
+    stiffness, expected = (b.stiffness(small_mesh.points_m, **elastic(b)) for b in (body, table))
     assert relative_error(stiffness.toarray(), expected.toarray()) < 1e-12
 
 

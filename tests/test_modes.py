@@ -13,13 +13,12 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.modes import Modes, natural_modes
-from collocation_sysid.nlp.parameters import Theta
 
-ELASTIC = Theta(200.0, 300.0, 0.0, 0.0)
+ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
 DENSITY = 30.0
 # A bar along x with square section; no Poisson effect, as in rod and beam theory.
 LENGTH_M, SIDE_M, YOUNG_PA = 0.2, 0.02, 600.0
-THIN = Theta(0.0, YOUNG_PA / 2, 0.0, 0.0)
+THIN = np.array([0.0, YOUNG_PA / 2, 0.0, 0.0])
 
 
 def bar(element: str = "tet4", divisions: tuple[int, ...] = (8, 1, 1)) -> Body:
@@ -32,13 +31,13 @@ def all_but(body: Body, held: np.ndarray) -> np.ndarray:
     return dofs_of(np.setdiff1d(np.arange(len(body.nodes_m)), held))
 
 
-def clamped(body: Body, theta: Theta = THIN, count: int = 6) -> Modes:
+def clamped(body: Body, theta: np.ndarray = THIN, count: int = 6) -> Modes:
     """Modes of the undeformed body with its nodes at x = 0 held."""
     free = all_but(body, nodes_where(body, 0, 0.0))
     return natural_modes(body, body.nodes_m, free, theta, count)
 
 
-def dense_frequencies(body: Body, x: np.ndarray, free: np.ndarray, theta: Theta) -> np.ndarray:
+def dense_frequencies(body: Body, x: np.ndarray, free: np.ndarray, theta: np.ndarray) -> np.ndarray:
     stiffness = body.stiffness(x, theta.lambda_pa, theta.mu_pa).toarray()[np.ix_(free, free)]
     squares = scipy.linalg.eigh(stiffness, np.diag(body.dof_mass[free]), eigvals_only=True)
     return np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
@@ -119,7 +118,7 @@ def test_a_body_released_in_a_mode_oscillates_with_its_frequency_and_damping(
     assert ratio == pytest.approx(modes.damping_ratios(theta)[mode], rel=5e-3, abs=1e-4)
 
 
-def replace_damping(gamma_r_s: float, gamma_m_1_s: float) -> Theta:
+def replace_damping(gamma_r_s: float, gamma_m_1_s: float) -> np.ndarray:
     return ELASTIC._replace(gamma_r_s=gamma_r_s, gamma_m_1_s=gamma_m_1_s)
 
 

@@ -13,7 +13,6 @@ from collocation_sysid.nlp.numerical_damping import (
     principal_root,
     substeps_needed,
 )
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.schemes import SCHEMES
 
 EULER, MIDPOINT, BDF2 = (SCHEMES[name] for name in ("backward-euler", "midpoint", "bdf2"))
@@ -64,7 +63,7 @@ def test_errors_vanish_with_the_schemes_order(name: str, damping_ratio: float):
 @pytest.mark.parametrize("name", SCHEMES)
 @pytest.mark.parametrize("gamma_m_1_s", [0.0, 5.0])
 def test_a_simulation_damps_as_much_as_predicted(name: str, gamma_m_1_s: float):
-    theta = Theta(200.0, 300.0, 0.0, gamma_m_1_s)
+    theta = np.array([200.0, 300.0, 0.0, gamma_m_1_s])
     released, modes = released_in_a_mode(theta, 0)
     omega, ratio = oscillation(released, modes, 0, theta, name)
     true_omega = modes.angular_frequencies_rad_s[0]

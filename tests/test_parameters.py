@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from checks import assert_derivative
+from problems_small import as_theta
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.nlp.parameters import Parameter, Parameters, Theta, as_theta
+from collocation_sysid.nlp.parameters import Parameter, Parameters
 
 DAMPING = (Parameter("gamma_r_s", 0.02, 1e-5, 1.0), Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0))
 LAME = Parameters(
@@ -92,7 +93,7 @@ def test_a_prior_pulls_on_the_logarithm():
 
 
 def test_theta_from_guesses_a_mapping_or_four_numbers():
-    expected = Theta(400.0, 400.0, 0.01, 2.0)
+    expected = np.array([400.0, 400.0, 0.01, 2.0])
     by_name = {"gamma_m_1_s": 2.0, "gamma_r_s": 0.01, "young_pa": 1000.0, "poisson": 0.25}
     assert as_theta(by_name) == pytest.approx(expected)
     assert as_theta([400, 400, 0.01, 2]) == expected

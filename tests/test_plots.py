@@ -25,7 +25,6 @@ from collocation_sysid.methods.solution import Iteration, Solution, Status, Timi
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
 from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
 from collocation_sysid.output.pictures import (
     Confidence,
@@ -50,7 +49,7 @@ from collocation_sysid.output.pictures.spectrum import spectral_density
 from collocation_sysid.output.replay import Replay
 from collocation_sysid.output.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
 
-THETA = Theta(**TRUTH)
+THETA = np.array([*TRUTH.values()])
 TIMES = 0.01 * np.arange(20.0)
 
 
@@ -61,7 +60,7 @@ def history(count=5):
             loss=10.0 ** (3 - k),
             rms_m=10.0 ** (-2 - k),
             violation_n=0.0 if k == 0 else 10.0**-k,
-            theta=Theta(200.0 * 2 ** (count - 1 - k), 300.0, 0.009, 1.0),
+            theta=np.array([200.0 * 2 ** (count - 1 - k), 300.0, 0.009, 1.0]),
             time_s=float(k),
         )
         for k in range(count)

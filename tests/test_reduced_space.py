@@ -13,6 +13,7 @@ from problems_small import (
     GUESS,
     SMALL_EXPERIMENTS,
     TRUTH,
+    as_theta,
     bar_in_two_hands,
     hung_cube,
     measured,
@@ -29,7 +30,7 @@ from collocation_sysid.methods.secant import updated, with_curvature
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import with_markers
 
@@ -252,7 +253,7 @@ def test_the_iteration_limit_is_a_status():
     solution = solve(cube(), ReducedSpaceOptions(max_iterations=3))
     assert solution.status is Status.ITERATION_LIMIT
     assert solution.iterations <= 4
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
 
 
 @pytest.mark.parametrize("number", [2, 5])
@@ -263,7 +264,7 @@ def test_an_interruption_keeps_the_best_iterate(number: int):
 
     solution = solve(cube(), watch=interrupt)
     assert solution.status is Status.INTERRUPTED
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
     assert np.isfinite(solution.z).all()
 
 
@@ -331,8 +332,8 @@ def test_the_history_is_what_was_watched_and_ends_at_the_answer():
     numbers = [iteration.number for iteration in seen]
     assert numbers == sorted(numbers)
     assert numbers[-1] <= solution.iterations
-    np.testing.assert_allclose(seen[0].theta, as_theta(GUESS))
-    np.testing.assert_allclose(seen[-1].theta, solution.theta)
+    np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
+    np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
     assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurements)
 
 

@@ -6,11 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checks import observed_order
-from problems_small import TRUTH, box, hung_cube, nodes_where, smooth_poses, vertex_markers
+from problems_small import (
+    TRUTH,
+    as_theta,
+    box,
+    hung_cube,
+    nodes_where,
+    smooth_poses,
+    vertex_markers,
+)
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp
-from collocation_sysid.nlp.parameters import as_theta
 from collocation_sysid.nlp.schemes import SCHEMES, STATIC, Stencil, scheme_named
 from collocation_sysid.nlp.simulation import simulate
 

@@ -15,6 +15,7 @@ from problems_small import (
     GUESS,
     SMALL_EXPERIMENTS,
     TRUTH,
+    as_theta,
     bar_in_two_hands,
     bar_let_go,
     cube_with_unknowns,
@@ -35,7 +36,7 @@ from collocation_sysid.methods.shooting import (
 )
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.statistics.sensitivity import sensitivities
 
@@ -163,7 +164,7 @@ def test_it_starts_from_given_parameters():
     start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((11, 81))])
     solution = solve(cube(), watch=seen.append, start=start)
     assert solution.iterations < 4
-    np.testing.assert_allclose(seen[0].theta, list(TRUTH.values()))
+    np.testing.assert_allclose([*seen[0].parameters.values()], list(TRUTH.values()))
 
 
 # Simulations that fail
@@ -222,7 +223,7 @@ def test_limits_keep_the_best_simulation(gradient, limit: dict, status: Status):
     solution = solve(cube(), ShootingOptions(gradient, **limit))
     assert solution.status is status
     assert solution.iterations <= 3
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
     assert solution.max_violation_relative < 1e-9
 
 
@@ -234,7 +235,7 @@ def test_an_interruption_keeps_the_best_simulation(gradient):
 
     solution = solve(cube(), ShootingOptions(gradient), interrupt)
     assert solution.status is Status.INTERRUPTED
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)

@@ -2,14 +2,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems_small import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, measured, released_cube
+from problems_small import (
+    GUESS,
+    SMALL_EXPERIMENTS,
+    TRUTH,
+    as_theta,
+    hung_cube,
+    measured,
+    released_cube,
+)
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.multipliers import constraint_multipliers
 from collocation_sysid.nlp import tangent
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.setting import Setting
 from collocation_sysid.nlp.stopwatch import Stopwatch

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from checks import assert_derivative, observed_order
+from materials_small import LAME, elastic, theta_for
 from problem_files import AT_TRUTH, TRUTH, run_command, settings
 from scipy.sparse.linalg import eigsh, spsolve
 from scipy.spatial.transform import Rotation
@@ -25,8 +26,6 @@ from collocation_sysid.problem import load_problem
 from collocation_sysid.synthesis import write_data
 
 TET10 = element_named("tet10")
-LAME = (200.0, 300.0)
-THETA = np.array([*LAME, 0.009, 1.0])
 LENGTH_M = 0.03  # a large change of a position
 
 
@@ -131,12 +130,16 @@ def test_mass_is_kept_and_positive_everywhere(patch):
 def test_force_and_stiffness_are_slopes_of_the_energy(material, rng):
     body = small_body(material)
     x = deformed(body, rng, 1)[0]
-    force, K = body.elastic_force(x, *LAME), body.stiffness(x, *LAME)
+    force, K = body.elastic_force(x, **elastic(body)), body.stiffness(x, **elastic(body))
     assert_derivative(
-        lambda x: body.energy(x, *LAME), lambda d: -np.sum(force * d), x, rng, scale=LENGTH_M
+        lambda x: body.energy(x, **elastic(body)),
+        lambda d: -np.sum(force * d),
+        x,
+        rng,
+        scale=LENGTH_M,
     )
     assert_derivative(
-        lambda x: body.elastic_force(x, *LAME).ravel(),
+        lambda x: body.elastic_force(x, **elastic(body)).ravel(),
         lambda d: -K @ d.ravel(),
         x,
         rng,
@@ -147,7 +150,7 @@ def test_force_and_stiffness_are_slopes_of_the_energy(material, rng):
 def test_first_and_second_derivatives_are_slopes(rng):
     body = small_body()
     x, v, w = deformed(body, rng, 1), *rng.standard_normal((2, 1, 3 * len(body.nodes_m)))
-    at, curvature = body.linearise(x, v, THETA), body.curvature(x, v, w, THETA)
+    at, curvature = body.linearise(x, v, theta_for(body)), body.curvature(x, v, w, theta_for(body))
 
     def weighted(matrix, d):
         return body.pattern.matrix(matrix[0]) @ d.ravel()
@@ -155,9 +158,9 @@ def test_first_and_second_derivatives_are_slopes(rng):
     for name, point, scale, rule in (
         ("position", x, LENGTH_M, lambda d: weighted(at.by_position, d)),
         ("velocity", v, 1.0, lambda d: weighted(at.by_velocity, d)),
-        ("theta", THETA, THETA, lambda d: at.by_theta[0] @ d),
+        ("theta", theta_for(body), theta_for(body), lambda d: at.by_theta[0] @ d),
     ):
-        state = {"position": x, "velocity": v, "theta": THETA}
+        state = {"position": x, "velocity": v, "theta": theta_for(body)}
         assert_derivative(
             lambda new, name=name, state=state: body.force(*(state | {name: new}).values())[0],
             rule,
@@ -166,7 +169,7 @@ def test_first_and_second_derivatives_are_slopes(rng):
             scale=scale,
         )
     assert_derivative(
-        lambda x: weighted(body.linearise(x, v, THETA).by_position, w),
+        lambda x: weighted(body.linearise(x, v, theta_for(body)).by_position, w),
         lambda d: weighted(curvature.position_position, d),
         x,
         rng,
@@ -174,7 +177,7 @@ def test_first_and_second_derivatives_are_slopes(rng):
         scale=LENGTH_M,
     )
     assert_derivative(
-        lambda v: weighted(body.linearise(x, v, THETA).by_position, w),
+        lambda v: weighted(body.linearise(x, v, theta_for(body)).by_position, w),
         lambda d: weighted(curvature.position_velocity, d),
         v,
         rng,
@@ -185,9 +188,13 @@ def test_first_and_second_derivatives_are_slopes(rng):
 def test_evaluators_agree(material, rng):
     simd, casadi = (small_body(material, name) for name in ("simd", "casadi"))
     x, (v, w) = deformed(simd, rng), rng.standard_normal((2, 2, 3 * len(simd.nodes_m)))
-    assert simd.energy(x[0], *LAME) == pytest.approx(casadi.energy(x[0], *LAME), rel=1e-12)
+    assert simd.energy(x[0], **elastic(simd)) == pytest.approx(
+        casadi.energy(x[0], **elastic(casadi)), rel=1e-12
+    )
     for method, fields in (("linearise", (x, v)), ("curvature", (x, v, w))):
-        found, expected = (getattr(body, method)(*fields, THETA) for body in (simd, casadi))
+        found, expected = (
+            getattr(body, method)(*fields, theta_for(body)) for body in (simd, casadi)
+        )
         for name, values in vars(expected).items():
             difference = abs(getattr(found, name) - values).max()
             assert difference <= 1e-12 * abs(values).max(), name
@@ -198,14 +205,14 @@ def test_rigid_motion_causes_no_force(material, rng):
     body = small_body(material)
     turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
     moved = body.nodes_m @ turn.T + [0.3, 0.2, -0.1]
-    scale = abs(body.elastic_force(deformed(body, rng)[0], *LAME)).max()
-    assert abs(body.elastic_force(moved, *LAME)).max() < 1e-12 * scale
+    scale = abs(body.elastic_force(deformed(body, rng)[0], **elastic(body))).max()
+    assert abs(body.elastic_force(moved, **elastic(body))).max() < 1e-12 * scale
 
 
 def test_only_rigid_motion_is_without_energy_even_for_a_single_element():
     one = TetMesh([[0, 0, 0], [0.1, 0, 0], [0.02, 0.1, 0], [0.01, 0.03, 0.1]], [[0, 1, 2, 3]])
     body = Body(one, density_kg_m3=30.0, element="tet10")
-    spectrum = np.linalg.eigvalsh(body.stiffness(body.nodes_m, *LAME).toarray())
+    spectrum = np.linalg.eigvalsh(body.stiffness(body.nodes_m, **elastic(body)).toarray())
     assert abs(spectrum[:6]).max() < 1e-13 * spectrum[-1]
     assert spectrum[6] > 1e-3 * spectrum[-1]
 
@@ -218,14 +225,14 @@ def test_a_uniform_strain_leaves_inner_nodes_in_equilibrium(small_mesh, material
     body = Body(small_mesh, material, density_kg_m3=30.0, element="tet10")
     F = np.eye(3) + rng.uniform(-0.15, 0.15, (3, 3))
     x = body.nodes_m @ F.T
-    force = body.elastic_force(x, *LAME)
+    force = body.elastic_force(x, **elastic(body))
     assert len(inner_nodes(body)) > 20
     assert abs(force[inner_nodes(body)]).max() < 1e-13 * abs(force).max()
     np.testing.assert_allclose(body.volume_ratios(x), np.linalg.det(F), rtol=1e-12)
     # The energy is that of the same strain in linear elements, whatever their number of nodes.
     linear = Body(small_mesh, material, density_kg_m3=30.0)
-    expected = linear.energy(x[: len(small_mesh.points_m)], *LAME)
-    assert body.energy(x, *LAME) == pytest.approx(expected, rel=1e-12)
+    expected = linear.energy(x[: len(small_mesh.points_m)], **elastic(linear))
+    assert body.energy(x, **elastic(body)) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_quadratic_displacement_is_reproduced(patch, rng):
@@ -234,7 +241,7 @@ def test_a_quadratic_displacement_is_reproduced(patch, rng):
     Q = rng.standard_normal((3, 3, 3))
     Q = Q + np.swapaxes(Q, 1, 2)
     X = patch.nodes_m
-    force = patch.elastic_force(X + np.einsum("ijk,nj,nk->ni", Q, X, X) / 2, *LAME)
+    force = patch.elastic_force(X + np.einsum("ijk,nj,nk->ni", Q, X, X) / 2, **elastic(patch))
     divergence = (lambda_pa + mu_pa) * np.einsum("jji->i", Q) + mu_pa * np.einsum("ijj->i", Q)
     mean_shape = over_the_volume(TET10.shape_functions)  # −1/20 at corners, 1/5 at mid nodes
     shares = np.zeros(len(X))

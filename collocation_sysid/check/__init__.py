@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..fem.body import Body
+from ..fem.moduli import engineering
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
 from ..nlp.schemes import scheme_named
@@ -51,7 +53,7 @@ class Findings:
     worst_elements : tuple of ElementShape, worst first
     cells_across : float
         Elements that share the body's thickness.
-    guess : mapping of the physical parameters, E and ν to their values at the guess
+    guess : mapping of the constants, and of E and ν at small strain, to their values at the guess
     samples, missing : int
         Marker samples that are there and that are not, of all experiments.
     largest_marker_distance_m : float
@@ -113,7 +115,7 @@ def check_problem(problem: Problem) -> Findings:
     """Validate a loaded problem further and measure it."""
     collocation = build_collocation(problem)
     parameters, body = problem.parameters, problem.body
-    theta = parameters.theta(parameters.guess_q)
+    theta = body.theta(parameters.guesses)
     z, start_notes = initial_variables(collocation)
     positions = collocation.unpack(z)[1]
     short = build_collocation(shortened(problem, SAMPLES))
@@ -127,8 +129,8 @@ def check_problem(problem: Problem) -> Findings:
     recordings = _recordings(problem, collocation, positions)
     scheme = scheme_named(collocation.scheme)
     motions = tuple(
-        motion_of(segment.experiment, scheme, segment.dynamics.step_s, theta)
-        for segment in collocation.segments
+        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(parameters.guesses))
+        for s in collocation.segments
     )
     extents = np.ptp(body.mesh.bounds_m, axis=0)
     diagonal_m = float(np.linalg.norm(extents))
@@ -154,7 +156,7 @@ def check_problem(problem: Problem) -> Findings:
         median_element_quality=quality.quality_median,
         worst_elements=worst,
         cells_across=shape.cells_across,
-        guess={"young_pa": theta.young_pa, "poisson": theta.poisson, **theta._asdict()},
+        guess=_guess(body, theta),
         experiments=len(problem.experiments),
         timesteps=sum(segment.grid_rows for segment in collocation.segments),
         samples=sum(recording.samples for recording in recordings),
@@ -175,6 +177,14 @@ def check_problem(problem: Problem) -> Findings:
         notes=tuple(notes),
         warnings=tuple(warnings),
     )
+
+
+def _guess(body: Body, theta: Array) -> dict[str, float]:
+    found = {}
+    for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
+        young, poisson = engineering(*lame)
+        found |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
+    return found | dict(zip(body.constants, theta.tolist(), strict=True))
 
 
 def _recordings(

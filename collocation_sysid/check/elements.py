@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Array
 from ..fem.body import Body
 from ..fem.mesh import TetMesh
-from ..nlp.parameters import Theta
+from ..fem.moduli import engineering
 
 # Mean-ratio quality below which an element's shape functions are poor.
 FLAT = 0.1
@@ -88,7 +88,7 @@ def slenderness(mesh: TetMesh) -> Slenderness:
 
 
 def element_warnings(
-    body: Body, theta: Theta, shape: Slenderness, worst: ElementShape
+    body: Body, theta: Array, shape: Slenderness, worst: ElementShape
 ) -> list[str]:
     """What the elements will do to the answer, one sentence each."""
     warnings = []
@@ -100,9 +100,10 @@ def element_warnings(
         )
     if body.element.name != LINEAR:
         return warnings
-    if theta.poisson > LOCKING_POISSON:
+    poisson = max(engineering(*lame)[1] for lame in body.lame(theta).values())
+    if poisson > LOCKING_POISSON:
         warnings.append(
-            f"Poisson's ratio is {theta.poisson:.3g} at the guess and linear tetrahedra lock above "
+            f"Poisson's ratio is {poisson:.3g} at the guess and linear tetrahedra lock above "
             f"{LOCKING_POISSON:g}, so that the stiffness found will be too low: {REMEDY}"
         )
     if shape.length_m > SLENDER * shape.thickness_m and shape.cells_across < CELLS_ACROSS:

@@ -14,7 +14,6 @@ from ..fem.pattern import dofs_of
 from ..nlp.modes import Modes, natural_modes
 from ..nlp.newton import Solver
 from ..nlp.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
-from ..nlp.parameters import Theta
 from ..nlp.rest import rest_state
 from ..nlp.schemes import Scheme
 
@@ -38,7 +37,7 @@ class ModeFinding:
     samples_per_period, steps_per_period : float
         Of the recording, and of the time grid.
     damping_ratio : float
-        Rayleigh damping's ζ = γ_r ω / 2 + γ_m / 2ω at the guess.
+        Of the material, at the guess.
     numerical_damping_ratio : float
         What the scheme adds.
     period_error : float
@@ -88,7 +87,7 @@ class Motion:
         return self.modes[0] if self.modes else None
 
 
-def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Theta) -> Motion:
+def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> Motion:
     """Modes of one experiment at θ while it is held least, and what the scheme does to them.
 
     Of those times the last counts, when all point masses have joined.
@@ -101,7 +100,7 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Thet
     free = dofs_of(np.flatnonzero(~held[least]))
     mass = np.repeat(experiment.node_mass_kg(time_s)[0], 3)
     modes = natural_modes(experiment.body, x, free, theta, COUNT, mass)
-    found = _mode_findings(modes, experiment, scheme, step_s, theta)
+    found = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
     if found:
         omega = float(modes.angular_frequencies_rad_s[0])
@@ -120,7 +119,7 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Thet
 
 
 def _state(
-    experiment: Experiment, held: NDArray[np.bool_], time_s: float, theta: Theta
+    experiment: Experiment, held: NDArray[np.bool_], time_s: float, theta: Array
 ) -> tuple[Array, str]:
     if held.any():
         try:
@@ -132,10 +131,10 @@ def _state(
 
 
 def _mode_findings(
-    modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float, theta: Theta
+    modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
 ) -> tuple[ModeFinding, ...]:
     findings = []
-    for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios(theta), strict=True):
+    for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
         numerical = numerical_mode(scheme, 2 * np.pi * frequency, step_s)
         findings.append(
             ModeFinding(

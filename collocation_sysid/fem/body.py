@@ -2,28 +2,37 @@
 
 Signs: Ψ(x) elastic energy, f_e = −∂Ψ/∂x, K = ∂²Ψ/∂x² = −∂f_e/∂x, and the internal force
 
-    f(x, v; θ) = f_e(x) − γ_r K(x) v − γ_m M v.
+    f(x, v; θ) = f_e(x) + f_d(x, v) − γ_m M v,   f_d = −γ_r K(x) v for Rayleigh's damping law.
+
+A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
+part in turn: its material's, its damping law's, and its γ_m.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..arrays import Array
-from ..errors import InputError
+from ..arrays import Array, Index
+from ..errors import InputError, hint_at
 from .batched import Batch, Evaluator, available_threads, choose_evaluator, make_evaluator
+from .constants import Constant
+from .damping import Damping
 from .elements import Element, element_named, reference_geometry
-from .expressions import KERNELS
-from .materials import Energy, material_named
+from .expressions import KERNELS, Law
+from .materials import Energy, Material
 from .mesh import TetMesh
+from .moduli import Source, elastic_names, source_of
 from .nodes import Nodes
 from .pattern import SymmetricPattern, element_destinations
+from .regions import Part, Region, parts_of
 from .selection import Selection
 
 Theta = Sequence[float] | Array
@@ -36,9 +45,9 @@ class Linearisation:
     Attributes
     ----------
     force : (T, 3n) f(x, v; θ) [N]
-    by_position : (T, m) lower triangles of ∂f/∂x = −K − γ_r D_vK [N/m]
-    by_velocity : (T, m) lower triangles of ∂f/∂v = −γ_r K − γ_m M [N·s/m]
-    by_theta : (T, 3n, 4) ∂f/∂(λ, μ, γ_r, γ_m)
+    by_position : (T, m) lower triangles of ∂f/∂x; for Rayleigh's damping −K − γ_r D_vK [N/m]
+    by_velocity : (T, m) lower triangles of ∂f/∂v; for Rayleigh's −γ_r K − γ_m M [N·s/m]
+    by_theta : (T, 3n, k) ∂f/∂θ
     """
 
     force: Array
@@ -54,9 +63,9 @@ class Curvature:
     Attributes
     ----------
     position_position, position_velocity : (T, m) lower triangles
-    position_theta, velocity_theta : (T, 3n, 4)
-    theta_theta : (T, 4, 4)
-    theta : (T, 4) first derivative ∂φ/∂θ
+    position_theta, velocity_theta : (T, 3n, k)
+    theta_theta : (T, k, k)
+    theta : (T, k) first derivative ∂φ/∂θ
     """
 
     position_position: Array
@@ -73,13 +82,18 @@ class Body:
     Parameters
     ----------
     mesh : TetMesh
-    material : str or callable, default "neo-hookean"
-        A name in `materials.MATERIALS` or an energy function ``(F, λ, μ) -> ψ`` in CasADi SX.
+    material : str, Material or callable, default "neo-hookean"
+        A name in `materials.MATERIALS`, or an energy function ``(F, **constants) -> ψ`` in CasADi
+        SX, see `Material.of`.
     density_kg_m3, mass_kg : float
-        Exactly one of them; the density is uniform.
+        Exactly one of them. Regions may have densities of their own; the mass is that of all.
     element : str, default "tet4"
         A name in `elements.ELEMENTS`. "tet10" puts a node on every edge of the mesh: some eight
         times the unknowns, and far better in bending or when nearly incompressible.
+    damping : str or Damping, default "rayleigh"
+        A name in `damping.DAMPINGS`.
+    regions : sequence of Region
+        Parts that differ.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated, see `batched`.
     threads : int, optional
@@ -87,6 +101,10 @@ class Body:
 
     Attributes
     ----------
+    parts : tuple of Part
+        What no region claims, then the regions.
+    constants : dict of name to Constant
+        What θ holds, in its order.
     nodes_m : (n, 3) undeformed node positions
         The mesh's nodes, then, for "tet10", the middle of each of `mesh.edges`.
     cells : (E, nodes per element) node numbers
@@ -96,36 +114,53 @@ class Body:
     Raises
     ------
     InputError
-        For unknown names or a mass that is not positive.
+        For unknown names, a mass that is not positive, or regions that overlap.
     """
 
     def __init__(
         self,
         mesh: TetMesh,
-        material: str | Energy = "neo-hookean",
+        material: str | Energy | Material = "neo-hookean",
         density_kg_m3: float | None = None,
         element: str = "tet4",
         *,
         mass_kg: float | None = None,
+        damping: str | Damping = "rayleigh",
+        regions: Sequence[Region] = (),
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
         self.mesh = mesh
-        self.material: Energy = material_named(material) if isinstance(material, str) else material
+        self.parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions)
+        self.constants: dict[str, Constant] = {
+            part.full_name(c.name): c for part in self.parts for c in part.constants
+        }
         self.element: Element = element_named(element)
         self.nodes = Nodes.of_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
-        self.cells: NDArray[np.int64] = self.nodes.cells
+        self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
         self.evaluator = choose_evaluator(evaluator)
-        density = _density(mesh.volume_m3, density_kg_m3, mass_kg)
-        shares = density * mesh.volumes_m3[:, None] * self.element.mass_shares
-        self.node_mass: Array = np.zeros(len(self.nodes_m))
-        np.add.at(self.node_mass, self.cells, shares)
+        self._part_masses = [self._lumped(part) for part in self.parts]
+        self.node_mass: Array = np.sum(self._part_masses, axis=0)
         self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
-        self._evaluators: dict[str, Evaluator] = {}
+        self._evaluators: dict[str, list[Evaluator]] = {}
 
-    def select(self, selection: Selection) -> NDArray[np.int64]:
+    def __repr__(self) -> str:
+        materials = ", ".join(f"{p.name or 'body'}: {p.material.name}" for p in self.parts)
+        return (
+            f"Body({len(self.nodes_m)} nodes, {len(self.cells)} {self.element.name}, "
+            f"{self.mass_kg:.4g} kg, {materials})"
+        )
+
+    def _lumped(self, part: Part) -> Array:
+        """(n,) lumped mass of a part."""
+        shares = self.mesh.volumes_m3[part.cells, None] * self.element.mass_shares
+        mass = np.zeros(len(self.nodes_m))
+        np.add.at(mass, self.cells[part.cells], part.density_kg_m3 * shares)
+        return mass
+
+    def select(self, selection: Selection) -> Index:
         """Return the nodes of a `selection.Selection`, sorted.
 
         Boxes and balls act on all nodes. Indices and point arrays are of the mesh's nodes; a node
@@ -153,23 +188,106 @@ class Body:
         """Sparsity of the stiffness matrix."""
         return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
 
+    # Constants ------------------------------------------------------------------------------
+
+    def sources(self, known: Sequence[str]) -> list[Source]:
+        """For each part, which of the names that are known give its constants.
+
+        Raises
+        ------
+        InputError
+            If a constant is missing or given twice.
+        """
+        return [
+            source_of(
+                part.name, part.material, part.constants[len(part.material.constants) :], known
+            )
+            for part in self.parts
+        ]
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names that a parameter may have: constants, what may stand for them, and shared ones."""
+        names = []
+        for part in self.parts:
+            owns = [c.name for c in part.constants] + list(elastic_names(part.material))
+            names += [part.full_name(own) for own in owns] + owns
+        return tuple(dict.fromkeys(names))
+
+    def assembled(self, values: Mapping[str, Any]) -> list[Any]:
+        """θ from values by the user's names: numbers, or CasADi expressions.
+
+        Raises
+        ------
+        InputError
+            If a constant is missing or given twice.
+        """
+        theta = []
+        for part, source in zip(self.parts, self.sources(list(values)), strict=True):
+            found = source.constants(values)
+            theta += [found[c.name] for c in part.constants]
+        return theta
+
+    def theta(self, values: Mapping[str, float]) -> Array:
+        """(k,) constants from values by the user's names; values of other bodies do not matter.
+
+        Raises
+        ------
+        InputError
+            If one is missing or given twice.
+        """
+        return np.array([float(value) for value in self.assembled(values)])
+
+    def lame(self, theta: Theta) -> dict[str, tuple[float, float]]:
+        """Small-strain (λ, μ) [Pa] of each part by its name."""
+        found = {}
+        for part, mine in zip(self.parts, self.split(np.asarray(theta, dtype=float)), strict=True):
+            values = part.material.lame(mine[: len(part.material.constants)]).full().ravel()
+            found[part.name] = (float(values[0]), float(values[1]))
+        return found
+
+    def split(self, theta: Any) -> list[Any]:
+        """θ, numbers or a CasADi expression, part by part."""
+        return [theta[a:b] for a, b in pairwise(self._starts)]
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        """Where the constants of each part begin in θ, and where the last end."""
+        return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
+
+    def _elastic(self, constants: Mapping[str, float]) -> Array:
+        """θ without damping."""
+        for name in constants:
+            if name not in self.parameter_names:
+                hint = hint_at(name, self.parameter_names)
+                raise InputError(
+                    f"no constant {name!r}; expected {', '.join(self.constants)}{hint}"
+                )
+        stored = {p.full_name(c.name) for p in self.parts for c in p.material.constants}
+        return self.theta({**dict.fromkeys(set(self.constants) - stored, 0.0), **constants})
+
     # One state ------------------------------------------------------------------------------
 
-    def energy(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> float:
-        """Elastic energy Ψ [J] at (n, 3) node positions [m]."""
-        x = self._state(positions)
-        return float(self._evaluate("energy", [x], (lambda_pa, mu_pa, 0.0))[0, 0])
+    def energy(self, positions: ArrayLike, **constants: float) -> float:
+        """Elastic energy Ψ [J] at (n, 3) node positions [m].
 
-    def elastic_force(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> Array:
-        """Elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m]."""
+        The constants are the material's, or moduli in their place: ``young_pa=1e4, poisson=0.3``.
+        """
         x = self._state(positions)
-        force = self._evaluate("force", [x, np.zeros_like(x)], (lambda_pa, mu_pa, 0.0))
+        return float(self._evaluate("energy", [x], self._elastic(constants))[0, 0])
+
+    def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
+        """Elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m]; see `energy`."""
+        x = self._state(positions)
+        force = self._evaluate("force", [x, np.zeros_like(x)], self._elastic(constants))
         return force.reshape(-1, 3)
 
-    def stiffness(self, positions: ArrayLike, lambda_pa: float, mu_pa: float) -> sp.csc_array:
-        """Stiffness K = ∂²Ψ/∂x², (3n, 3n) sparse [N/m]; row 3i + j is coordinate j of node i."""
-        x = self._state(positions)
-        theta = (lambda_pa, mu_pa, 0.0, 0.0)
+    def stiffness(self, positions: ArrayLike, **constants: float) -> sp.csc_array:
+        """Stiffness K = ∂²Ψ/∂x², (3n, 3n) sparse [N/m]; row 3i + j is coordinate j of node i.
+
+        See `energy` for the constants.
+        """
+        x, theta = self._state(positions), self._elastic(constants)
         return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
 
     # Many states ----------------------------------------------------------------------------
@@ -186,13 +304,13 @@ class Body:
         Parameters
         ----------
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
-        theta : (λ [Pa], μ [Pa], γ_r [s], γ_m [1/s])
+        theta : (k,) in the order of `constants`
         dof_mass : (3n,) or (T, 3n), optional
             The M that γ_m damps, where more than the body's own mass moves [kg].
         """
         x, v = self._states(positions, velocities)
         mass = self.dof_mass if dof_mass is None else dof_mass
-        return self._evaluate("force", [x, v], theta[:3]) - theta[3] * mass * v
+        return self._evaluate("force", [x, v], theta) - self._drag(theta) * mass * v
 
     def linearise(
         self,
@@ -207,23 +325,24 @@ class Body:
         The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
         """
         x, v = self._states(positions, velocities)
-        rows = self._evaluate("linearisation", [x, v], theta[:3], out)
+        rows = self._evaluate("linearisation", [x, v], theta, out)
         size, entries = self.pattern.size, self.pattern.entries
         force, by_position, by_velocity, by_theta = np.split(
             rows, np.cumsum([size, entries, entries]), axis=1
         )
-        mass = self.dof_mass if dof_mass is None else dof_mass
-        drag = mass * v
-        force -= theta[3] * drag
-        by_velocity[:, self.pattern.diagonal] -= theta[3] * mass
-        by_theta = by_theta.reshape(len(x), size, 4)
-        by_theta[:, :, 3] = -drag
+        moving = self.dof_mass if dof_mass is None else dof_mass
+        drag = self._drag(theta)
+        force -= drag * moving * v
+        by_velocity[:, self.pattern.diagonal] -= drag * moving
+        by_theta = by_theta.reshape(len(x), size, -1)
+        for column, share in self._drag_shares.items():
+            by_theta[:, :, column] = -share * moving * v
         return Linearisation(force, by_position, by_velocity, by_theta)
 
     @property
     def linearisation_width(self) -> int:
         """Length of one timestep's row of `linearise`."""
-        return 5 * self.pattern.size + 2 * self.pattern.entries
+        return (1 + len(self.constants)) * self.pattern.size + 2 * self.pattern.entries
 
     def curvature(
         self,
@@ -236,20 +355,38 @@ class Body:
     ) -> Curvature:
         """Second derivatives of wᵀ f at T states, see `Curvature`; `weights` like `positions`."""
         x, v, w = self._states(positions, velocities, weights)
-        rows = self._evaluate("curvature", [x, v, w], theta[:3], out)
-        size, entries = self.pattern.size, self.pattern.entries
+        rows = self._evaluate("curvature", [x, v, w], theta, out)
+        size, entries, k = self.pattern.size, self.pattern.entries, len(self.constants)
         xx, xv, x_theta, v_theta, theta_theta, by_theta = np.split(
-            rows, np.cumsum([entries, entries, 4 * size, 4 * size, 16]), axis=1
+            rows, np.cumsum([entries, entries, k * size, k * size, k * k]), axis=1
         )
-        x_theta, v_theta = (part.reshape(len(x), size, 4) for part in (x_theta, v_theta))
-        v_theta[:, :, 3] = -(self.dof_mass if dof_mass is None else dof_mass) * w
-        by_theta[:, 3] = np.einsum("ti,ti->t", v_theta[:, :, 3], v)
-        return Curvature(xx, xv, x_theta, v_theta, theta_theta.reshape(len(x), 4, 4), by_theta)
+        x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
+        moving = self.dof_mass if dof_mass is None else dof_mass
+        for column, share in self._drag_shares.items():
+            v_theta[:, :, column] = -share * moving * w
+            by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
+        return Curvature(xx, xv, x_theta, v_theta, theta_theta.reshape(len(x), k, k), by_theta)
 
     @property
     def curvature_width(self) -> int:
         """Length of one timestep's row of `curvature`."""
-        return 8 * self.pattern.size + 2 * self.pattern.entries + 20
+        k = len(self.constants)
+        return 2 * k * self.pattern.size + 2 * self.pattern.entries + k * (k + 1)
+
+    @cached_property
+    def _drag_shares(self) -> dict[int, Array]:
+        """Place of each part's γ_m in θ, and the (3n,) shares of the mass at a dof it damps.
+
+        Mass that is tied to a node is damped as the part's own there.
+        """
+        return {
+            end - 1: np.repeat(mass / self.node_mass, 3)
+            for end, mass in zip(self._starts[1:], self._part_masses, strict=True)
+        }
+
+    def _drag(self, theta: Theta) -> Array:
+        """(3n,) γ_m of every dof."""
+        return np.sum([theta[k] * share for k, share in self._drag_shares.items()], axis=0)
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
@@ -288,17 +425,24 @@ class Body:
     def _evaluate(
         self, name: str, fields: Sequence[Array], theta: Theta, out: Array | None = None
     ) -> Array:
+        if len(theta) != len(self.constants):
+            raise InputError(
+                f"{len(theta)} constants given, expected {len(self.constants)}: "
+                f"{', '.join(self.constants)}"
+            )
         if name not in self._evaluators:
-            batch = self._batch(name)
-            self._evaluators[name] = make_evaluator(batch, self.evaluator)
+            batches = [self._batch(name, k) for k in range(len(self.parts))]
+            self._evaluators[name] = [make_evaluator(b, self.evaluator) for b in batches]
         width = self._width(name)
         shape = (len(fields[0]), width)
         if out is None:
             out = np.empty(shape)
         elif out.shape != shape or out.dtype != float or not out.flags.c_contiguous:
             raise InputError(f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}")
-        values = np.array(theta, dtype=float)
-        self._evaluators[name](fields, values, out, self.threads)
+        shares = self.split(np.asarray(theta, dtype=float))
+        for k, evaluate in enumerate(self._evaluators[name]):
+            values = shares[k][: self.parts[k].of_points].copy()
+            evaluate(fields, values, out, self.threads, add=k > 0)
         return out
 
     def _width(self, name: str) -> int:
@@ -309,40 +453,34 @@ class Body:
             "curvature": self.curvature_width,
         }[name]
 
-    def _batch(self, name: str) -> Batch:
-        """Lay a kernel's outputs out in one row: vectors, lower triangles, 4 columns for θ."""
-        kernel = KERNELS[name](self.element, self.material)
-        vector, lower = element_destinations(self.pattern, self.cells)
-        columns = np.arange(3)  # the kernel's λ, μ, γ_r; column 3 is γ_m, which needs no elements
-        by_theta = (columns[:, None] + 4 * vector[:, None, :]).reshape(len(self.cells), -1)
-        square = np.broadcast_to((columns[:, None] + 4 * columns).ravel(), (len(self.cells), 9))
-        whole = np.zeros((len(self.cells), 1), dtype=np.int64)
+    def _batch(self, name: str, number: int) -> Batch:
+        """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
+        part = self.parts[number]
+        kernel = KERNELS[name](self.element, Law(part.material, part.damping))
+        cells = self.cells[part.cells]
+        vector, lower = element_destinations(self.pattern, cells)
+        total, count = len(self.constants), len(cells)
+        # γ_m comes after the constants of the points and needs no elements.
+        columns = self._starts[number] + np.arange(part.of_points)
+        by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
+        square = (columns[:, None] + total * columns).ravel()
+        whole = np.zeros((count, 1), dtype=np.int64)
         places = {
             "energy": (whole, 1),
             "force": (vector, self.pattern.size),
             "by_position": (lower, self.pattern.entries),
             "by_velocity": (lower, self.pattern.entries),
-            "by_theta": (by_theta, 4 * self.pattern.size),
+            "by_theta": (by_theta, total * self.pattern.size),
             "position_position": (lower, self.pattern.entries),
             "position_velocity": (lower, self.pattern.entries),
-            "position_theta": (by_theta, 4 * self.pattern.size),
-            "velocity_theta": (by_theta, 4 * self.pattern.size),
-            "theta_theta": (square, 16),
-            "gradient_theta": (np.broadcast_to(columns, (len(self.cells), 3)), 4),
+            "position_theta": (by_theta, total * self.pattern.size),
+            "velocity_theta": (by_theta, total * self.pattern.size),
+            "theta_theta": (np.broadcast_to(square, (count, len(square))), total**2),
+            "gradient_theta": (np.broadcast_to(columns, (count, len(columns))), total),
         }
         used = [places[output] for output in kernel.contractions]
         starts = np.cumsum([0] + [length for _, length in used])
         destinations = np.hstack(
             [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
         )
-        return Batch(kernel, self.cells, self.geometry, destinations, self._width(name))
-
-
-def _density(volume_m3: float, density_kg_m3: float | None, mass_kg: float | None) -> float:
-    if (density_kg_m3 is None) == (mass_kg is None):
-        raise InputError("give exactly one of density_kg_m3 and mass_kg")
-    density = density_kg_m3 if density_kg_m3 is not None else (mass_kg or 0.0) / volume_m3
-    if not density > 0:
-        name = "density_kg_m3" if density_kg_m3 is not None else "mass_kg"
-        raise InputError(f"{name} must be positive")
-    return density
+        return Batch(kernel, cells, self.geometry[part.cells], destinations, self._width(name))

@@ -7,12 +7,12 @@ x        3·nodes       node positions, node-major xyz [m]
 v        3·nodes       node velocities [m/s]
 w        3·nodes       weights on the node forces (Lagrange multipliers)
 geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume [m³]
-theta    3             λ [Pa], μ [Pa], γ_r [s]
+theta    k             constants of the material, then of the damping law
 ======== ============= ==============================================================
 
 and outputs that are summed over points and elements. Symmetric matrices are given by their
-lower triangles, column after column. With S = −V ∂ψ/∂F − γ_r V (∂²ψ/∂F²):Ḟ the force on node a
-is S ∇N_a, so that f = −∂Ψ/∂x − γ_r K v.
+lower triangles, column after column. With S = −V (∂ψ/∂F + P_d), P_d the stress of the damping law,
+the force on node a is S ∇N_a; for Rayleigh's f = −∂Ψ/∂x − γ_r K v.
 
 Up to that last product a kernel knows only F, Ḟ and the like: 9 or 9 × 9 numbers whatever the
 element, its *pieces*. How they meet the shape gradients is told by a `Contraction`, which an
@@ -28,10 +28,9 @@ from typing import Literal
 
 import casadi as ca
 
+from .damping import Damping
 from .elements import Element
-from .materials import Energy
-
-THETA = ("lambda_pa", "mu_pa", "gamma_r_s")
+from .materials import Material
 
 # What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
 # to the lower triangle of (3·nodes, 3·nodes).
@@ -90,7 +89,7 @@ class _Point:
     volume: ca.SX
 
 
-def _point(nodes: int) -> _Point:
+def _point(nodes: int, constants: int) -> _Point:
     geometry = ca.SX.sym("geometry", 3 * nodes + 1)
     return _Point(
         nodes=nodes,
@@ -98,7 +97,7 @@ def _point(nodes: int) -> _Point:
         v=ca.SX.sym("v", 3 * nodes),
         w=ca.SX.sym("w", 3 * nodes),
         geometry=geometry,
-        theta=ca.SX.sym("theta", len(THETA)),
+        theta=ca.SX.sym("theta", constants),
         gradients=_gradients(geometry, nodes),
         volume=geometry[3 * nodes],
     )
@@ -160,42 +159,64 @@ class _Stress:
     stress: ca.SX
 
 
-def _stress(point: _Point, energy: Energy) -> _Stress:
-    lambda_pa, mu_pa, gamma_r = point.theta[0], point.theta[1], point.theta[2]
+@dataclass(frozen=True, eq=False)
+class Law:
+    """What a quadrature point obeys: a material and a damping law.
+
+    θ holds the material's constants, then those of the damping law.
+    """
+
+    material: Material
+    damping: Damping
+
+    @property
+    def constants(self) -> int:
+        """Length of θ."""
+        return len(self.material.constants) + len(self.damping.constants)
+
+    def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
+        """Energy density at F (9)."""
+        return self.material.psi(ca.reshape(F, 3, 3), theta[: len(self.material.constants)])
+
+    def viscous(self, elastic: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
+        """Damping stress (9), from the elastic one as an expression in F."""
+        own = theta[len(self.material.constants) :]
+        named = {c.name: own[k] for k, c in enumerate(self.damping.constants)}
+        return self.damping.stress(elastic, F, rate, **named)
+
+
+def _stress(point: _Point, law: Law) -> _Stress:
     F, rate = ca.SX.sym("F", 9), ca.SX.sym("rate", 9)
-    psi = point.volume * energy(ca.reshape(F, 3, 3), lambda_pa, mu_pa)
-    elastic = ca.gradient(psi, F)
-    viscous = gamma_r * ca.jtimes(elastic, F, rate)
-    return _Stress(F, rate, -elastic - viscous)
+    elastic = ca.gradient(point.volume * law.psi(F, point.theta), F)
+    return _Stress(F, rate, -elastic - law.viscous(elastic, F, rate, point.theta))
 
 
-def energy_kernel(element: Element, energy: Energy) -> PointKernel:
+def energy_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic energy Ψ of the point [J]."""
-    point = _point(element.nodes)
-    F = ca.reshape(_material_gradient(point, point.x), 3, 3)
-    psi = point.volume * energy(F, point.theta[0], point.theta[1])
+    point = _point(element.nodes, law.constants)
+    psi = point.volume * law.psi(_material_gradient(point, point.x), point.theta)
     return _kernel("energy", point, ("x",), {"energy": ("none", psi)})
 
 
-def force_kernel(element: Element, energy: Energy) -> PointKernel:
-    """Elastic and stiffness-proportional damping force on the nodes [N]."""
-    point = _point(element.nodes)
-    law = _stress(point, energy)
-    force = _at(point, law, law.stress)
+def force_kernel(element: Element, law: Law) -> PointKernel:
+    """Elastic and damping force on the nodes [N]."""
+    point = _point(element.nodes, law.constants)
+    at = _stress(point, law)
+    force = _at(point, at, at.stress)
     return _kernel("force", point, ("x", "v"), {"force": ("nodes", force)})
 
 
-def linearisation_kernel(element: Element, energy: Energy) -> PointKernel:
-    """Force with its derivatives by position (−K − γ_r D_vK), velocity (−γ_r K) and θ."""
-    point = _point(element.nodes)
-    law = _stress(point, energy)
+def linearisation_kernel(element: Element, law: Law) -> PointKernel:
+    """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
+    point = _point(element.nodes, law.constants)
+    at = _stress(point, law)
     pieces = [
-        law.stress,
-        ca.jacobian(law.stress, law.F),
-        ca.jacobian(law.stress, law.rate),
-        ca.jacobian(law.stress, point.theta),
+        at.stress,
+        ca.jacobian(at.stress, at.F),
+        ca.jacobian(at.stress, at.rate),
+        ca.jacobian(at.stress, point.theta),
     ]
-    stress, by_f, by_rate, by_theta = (_at(point, law, piece) for piece in pieces)
+    stress, by_f, by_rate, by_theta = (_at(point, at, piece) for piece in pieces)
     outputs: dict[str, tuple[Contraction, ca.SX]] = {
         "force": ("nodes", stress),
         "by_position": ("pairs", by_f),
@@ -205,20 +226,20 @@ def linearisation_kernel(element: Element, energy: Energy) -> PointKernel:
     return _kernel("linearisation", point, ("x", "v"), outputs)
 
 
-def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
+def curvature_kernel(element: Element, law: Law) -> PointKernel:
     """Second derivatives of φ = wᵀ f(x, v; θ), and ∂φ/∂θ, which the chain rule needs.
 
-    ∂²φ/∂v² vanishes and ∂²φ/∂x∂v = −γ_r D_wK is symmetric, so two lower triangles hold the
-    position–velocity part.
+    ∂²φ/∂v² vanishes and ∂²φ/∂x∂v (Rayleigh: −γ_r D_wK) is symmetric, so two lower triangles hold
+    the position–velocity part.
     """
-    point = _point(element.nodes)
-    law = _stress(point, energy)
+    point = _point(element.nodes, law.constants)
+    at = _stress(point, law)
     W = ca.SX.sym("W", 9)
-    power = ca.dot(law.stress, W)
-    by_f, by_rate, by_theta = (ca.gradient(power, z) for z in (law.F, law.rate, point.theta))
+    power = ca.dot(at.stress, W)
+    by_f, by_rate, by_theta = (ca.gradient(power, z) for z in (at.F, at.rate, point.theta))
     pieces = [
-        ca.jacobian(by_f, law.F),
-        ca.jacobian(by_f, law.rate),
+        ca.jacobian(by_f, at.F),
+        ca.jacobian(by_f, at.rate),
         ca.jacobian(by_f, point.theta),
         ca.jacobian(by_rate, point.theta),
         ca.jacobian(by_theta, point.theta),
@@ -226,7 +247,7 @@ def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
     ]
     w_gradient = _material_gradient(point, point.w)
     xx, xv, x_theta, v_theta, theta_theta, first = (
-        ca.substitute(_at(point, law, piece), W, w_gradient) for piece in pieces
+        ca.substitute(_at(point, at, piece), W, w_gradient) for piece in pieces
     )
     outputs: dict[str, tuple[Contraction, ca.SX]] = {
         "position_position": ("pairs", xx),
@@ -239,16 +260,16 @@ def curvature_kernel(element: Element, energy: Energy) -> PointKernel:
     return _kernel("curvature", point, ("x", "v", "w"), outputs)
 
 
-def _at(point: _Point, law: _Stress, expression: ca.SX) -> ca.SX:
+def _at(point: _Point, at: _Stress, expression: ca.SX) -> ca.SX:
     """Evaluate an expression in (F, Ḟ) at the point's node positions and velocities."""
     return ca.substitute(
         expression,
-        ca.vertcat(law.F, law.rate),
+        ca.vertcat(at.F, at.rate),
         ca.vertcat(_material_gradient(point, point.x), _material_gradient(point, point.v)),
     )
 
 
-KERNELS: dict[str, Callable[[Element, Energy], PointKernel]] = {
+KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {
     "energy": energy_kernel,
     "force": force_kernel,
     "linearisation": linearisation_kernel,

@@ -1,20 +1,123 @@
-"""Hyperelastic materials: one strain-energy density each, in CasADi SX.
+"""Hyperelastic materials: a strain-energy density and its constants, in CasADi SX.
 
-A material is a function ``energy(F, lambda_pa, mu_pa) -> ψ`` [J/m³] of the 3 × 3 deformation
-gradient. Every one here has ψ(I) = 0, no stress at F = I, and the small-strain stiffness of
-linear elasticity with the same Lamé parameters, so λ and μ mean the same in all of them.
-To add one, write the function and enter it in `MATERIALS`, or pass it to `Body` directly.
+A `Material` is a function ``energy(F, **constants) -> ψ`` [J/m³] of the 3 × 3 deformation gradient
+with ψ(I) = 0 and no stress at F = I. Its constants are the function's arguments. Any such function
+is one: `Material.of(function)`, or pass it to `Body`.
+
+Those written in (λ, μ) have the small-strain stiffness of linear elasticity with these. Those
+written in isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂ have the volumetric term
+½ κ (J − 1)². Ogden's is left out: its derivatives by principal stretches are not exact where
+stretches coincide.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, hint_at
+from .constants import Constant, constant_named
 
-Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
+Energy = Callable[..., ca.SX]
+
+# Share of the stiffness that energy and stress of an undeformed material may be off by.
+AT_REST = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A strain-energy density and the constants that it needs.
+
+    Attributes
+    ----------
+    name : str
+    energy : callable
+        ``energy(F, **constants) -> ψ``.
+    constants : tuple of Constant
+        In the order of θ.
+    """
+
+    name: str
+    energy: Energy = field(repr=False)
+    constants: tuple[Constant, ...]
+
+    @classmethod
+    def of(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
+        """A material of a function; its arguments after F name the constants.
+
+        Parameters
+        ----------
+        energy : callable
+            ``energy(F, mu_pa, …) -> ψ`` in CasADi operations.
+        name : str, optional
+            The function's by default.
+        *constants : Constant
+            Bounds, symbols and scales where the names alone do not tell.
+
+        Raises
+        ------
+        InputError
+            If it has no constants, or the undeformed material has energy or stress.
+        """
+        name = name or getattr(energy, "__name__", "energy").replace("_", "-")
+        told = {constant.name: constant for constant in constants}
+        arguments = list(inspect.signature(energy).parameters)[1:]
+        if not arguments:
+            raise InputError(
+                f"material {name!r} has no constants; expected a function of the deformation "
+                "gradient and named constants, such as energy(F, lambda_pa, mu_pa)"
+            )
+        if unused := sorted(set(told) - set(arguments)):
+            raise InputError(
+                f"material {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
+            )
+        material = cls(name, energy, tuple(told.get(a) or constant_named(a) for a in arguments))
+        material._check_at_rest()
+        return material
+
+    def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
+        """The energy density with the constants given as a vector, in their order."""
+        named = {c.name: values[k] for k, c in enumerate(self.constants)}
+        return ca.SX(self.energy(F, **named))
+
+    @cached_property
+    def lame(self) -> ca.Function:
+        """Small-strain (λ, μ) from the constants: C₁₁₂₂ and C₁₂₁₂ at F = I."""
+        F, values = ca.SX.sym("F", 9), ca.SX.sym("values", len(self.constants))
+        tangent, _ = ca.hessian(self.psi(ca.reshape(F, 3, 3), values), F)
+        entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
+        at_rest = ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel())))
+        return ca.Function("lame", [values], [ca.simplify(at_rest)])
+
+    def _check_at_rest(self) -> None:
+        F, values = ca.SX.sym("F", 9), ca.SX.sym("values", len(self.constants))
+        try:
+            psi = self.psi(ca.reshape(F, 3, 3), values)
+            tangent, stress = ca.hessian(psi, F)
+        except Exception as error:
+            raise InputError(
+                f"material {self.name!r} cannot be evaluated ({error}); expected a function of "
+                "CasADi operations that returns one energy density"
+            ) from error
+        law = ca.Function("law", [F, values], [psi, stress, tangent])
+        some = [float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants]
+        energy, force, stiffness = (o.full() for o in law(np.eye(3).ravel(), some))
+        size = np.abs(stiffness).max()
+        for what, unit, found in (("energy", "J/m³", energy), ("stress", "Pa", force)):
+            worst = np.abs(found).max()
+            if not worst <= AT_REST * size:
+                raise InputError(
+                    f"material {self.name!r} has the {what} {worst:.3g} {unit} undeformed, with "
+                    f"{self._said(some)}; expected none at F = I: subtract it"
+                )
+
+    def _said(self, values: list[float]) -> str:
+        return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
 
 
 def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
@@ -43,48 +146,91 @@ def st_venant_kirchhoff(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
-def mooney_rivlin(
-    F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX, second_invariant_share: float = 0.25
-) -> ca.SX:
-    """ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + ½ κ (J − 1)², compressible Mooney–Rivlin.
-
-    Isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂; C₁₀ + C₀₁ = μ/2, of which C₀₁ has
-    `second_invariant_share`; κ = λ + ⅔ μ (Bonet & Wood 2008, sec. 6.5).
-    """
-    j = ca.det(F)
-    C = F.T @ F
-    first = ca.trace(C)
-    second = 0.5 * (first**2 - ca.sumsqr(C))
-    c01 = 0.5 * mu_pa * second_invariant_share
-    c10 = 0.5 * mu_pa - c01
-    bulk = lambda_pa + 2.0 / 3.0 * mu_pa
-    shrink = ca.exp(ca.log(j) * (-2.0 / 3.0))
-    return c10 * (shrink * first - 3) + c01 * (shrink**2 * second - 3) + 0.5 * bulk * (j - 1) ** 2
-
-
 def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     """ψ = ½ λ (tr ε)² + μ ε:ε with ε = sym F − I. Small rotations only: it resists turning."""
     strain = 0.5 * (F + F.T) - ca.SX.eye(3)
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
-MATERIALS: dict[str, Energy] = {
-    "neo-hookean": neo_hookean,
-    "stable-neo-hookean": stable_neo_hookean,
-    "st-venant-kirchhoff": st_venant_kirchhoff,
-    "mooney-rivlin": mooney_rivlin,
-    "linear": linear_elastic,
+def mooney_rivlin(F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+    """ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U; μ = 2 (C₁₀ + C₀₁) (Bonet & Wood 2008, sec. 6.5)."""
+    first, second = _isochoric_invariants(F)
+    return c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
+
+
+def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+    """ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3; μ = 2 C₁₀ (Yeoh 1993)."""
+    past = _isochoric_invariants(F)[0] - 3
+    return past * (c10_pa + past * (c20_pa + past * c30_pa)) + _volumetric(F, kappa_pa)
+
+
+def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+    """ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U: no stretch has an Ī₁ beyond 3 + J_m (Gent 1996)."""
+    past = _isochoric_invariants(F)[0] - 3
+    return -0.5 * mu_pa * gent_limit * ca.log(1 - past / gent_limit) + _volumetric(F, kappa_pa)
+
+
+def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+    """ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U, five terms of the inverse Langevin function.
+
+    C is such that μ is the shear modulus at small strain (Arruda & Boyce 1993, eq. 22).
+    """
+    first = _isochoric_invariants(F)[0]
+    series, slope = ca.SX(0), ca.SX(0)
+    for i, share in enumerate((1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1):
+        weight = share / chain_stretch ** (2 * i - 2)
+        series += weight * (first**i - 3**i)
+        slope += 2 * weight * i * 3 ** (i - 1)
+    return mu_pa * series / slope + _volumetric(F, kappa_pa)
+
+
+def _isochoric_invariants(F: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Ī₁ and Ī₂."""
+    C = F.T @ F
+    first = ca.trace(C)
+    second = 0.5 * (first**2 - ca.sumsqr(C))
+    shrink = ca.exp(ca.log(ca.det(F)) * (-2.0 / 3.0))
+    return shrink * first, shrink**2 * second
+
+
+def _volumetric(F: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+    """U = ½ κ (J − 1)²."""
+    return 0.5 * kappa_pa * (ca.det(F) - 1) ** 2
+
+
+def _known(name: str, energy: Energy) -> Material:
+    arguments = list(inspect.signature(energy).parameters)[1:]
+    return Material(name, energy, tuple(map(constant_named, arguments)))
+
+
+MATERIALS: dict[str, Material] = {
+    name: _known(name, energy)
+    for name, energy in {
+        "neo-hookean": neo_hookean,
+        "stable-neo-hookean": stable_neo_hookean,
+        "st-venant-kirchhoff": st_venant_kirchhoff,
+        "mooney-rivlin": mooney_rivlin,
+        "yeoh": yeoh,
+        "gent": gent,
+        "arruda-boyce": arruda_boyce,
+        "linear": linear_elastic,
+    }.items()
 }
 
 
-def material_named(name: str) -> Energy:
-    """Look a material up in `MATERIALS`.
+def as_material(given: str | Energy | Material) -> Material:
+    """A material from a name in `MATERIALS`, an energy function, or itself.
 
     Raises
     ------
     InputError
-        If there is none of that name.
+        If there is none of that name, or see `Material.of`.
     """
-    if name not in MATERIALS:
-        raise InputError(f"no material {name!r}; available: {', '.join(MATERIALS)}")
-    return MATERIALS[name]
+    if isinstance(given, Material):
+        return given
+    if not isinstance(given, str):
+        return Material.of(given)
+    if given not in MATERIALS:
+        known = ", ".join(MATERIALS)
+        raise InputError(f"no material {given!r}; available: {known}{hint_at(given, MATERIALS)}")
+    return MATERIALS[given]

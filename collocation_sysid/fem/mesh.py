@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from .mesh_checks import (
     MeshQuality,
-    checked_point_arrays,
+    checked_arrays,
     checked_points,
     checked_tetrahedra,
     cleaned,
@@ -46,6 +46,8 @@ class TetMesh:
         Nodes of each element, counted from 0.
     point_arrays : mapping of name to (n, ...) array, optional
         Values per node, such as the 0/1 masks that a `Named` selection looks up.
+    cell_arrays : mapping of name to (E, ...) array, optional
+        The same per element.
 
     Attributes
     ----------
@@ -66,6 +68,7 @@ class TetMesh:
     points_m: np.ndarray
     tetrahedra: np.ndarray
     point_arrays: dict[str, np.ndarray]
+    cell_arrays: dict[str, np.ndarray]
     file_index: np.ndarray
     file_node_count: int
     notes: tuple[str, ...]
@@ -75,15 +78,18 @@ class TetMesh:
         points_m: ArrayLike,
         tetrahedra: ArrayLike,
         point_arrays: Mapping[str, ArrayLike] | None = None,
+        cell_arrays: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         given = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(given))
-        arrays = checked_point_arrays(point_arrays or {}, len(given))
+        arrays = checked_arrays(point_arrays or {}, len(given), "point", "nodes")
+        of_cells = checked_arrays(cell_arrays or {}, len(elements), "cell", "elements")
         points, elements, used, notes = cleaned(given, elements)
         self._set(
             points_m=_read_only(points),
             tetrahedra=_read_only(elements),
             point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
+            cell_arrays={name: _read_only(values) for name, values in of_cells.items()},
             file_index=_read_only(used),
             file_node_count=len(given),
             notes=notes,
@@ -103,7 +109,9 @@ class TetMesh:
         Quadratic tetrahedra are taken by their corners: the body's element decides about nodes
         on edges. Slightly curved sides are straightened and noted.
 
-        Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`.
+        Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`; cell
+        arrays, cell sets and physical groups of the tetrahedra become `cell_arrays`, and those
+        groups' nodes `point_arrays` too.
 
         Parameters
         ----------
@@ -117,9 +125,9 @@ class TetMesh:
             If the file cannot be read, holds no tetrahedra, their sides are curved by more than
             5 % of their length, or its mesh is refused.
         """
-        points_m, tetrahedra, arrays, notes = read_tetrahedra(path, length_unit)
+        points_m, tetrahedra, of_points, of_cells, notes = read_tetrahedra(path, length_unit)
         try:
-            mesh = cls(points_m, tetrahedra, arrays)
+            mesh = cls(points_m, tetrahedra, of_points, of_cells)
         except InputError as error:
             raise error.located(path) from None
         mesh._set(notes=(*notes, *mesh.notes))
@@ -165,7 +173,7 @@ class TetMesh:
 
     def write(self, path: str | Path) -> None:
         """Write the mesh, in metres, to any format meshio knows by the file's ending."""
-        write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays)
+        write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays, self.cell_arrays)
 
     def select(self, selection: Selection) -> np.ndarray:
         """Return the nodes of a `selection.Selection`, as sorted int64 indices.
@@ -178,6 +186,11 @@ class TetMesh:
     def volumes_m3(self) -> np.ndarray:
         """Volume of each element, (E,), all positive."""
         return _read_only(signed_volumes(self.points_m, self.tetrahedra))
+
+    @cached_property
+    def centres_m(self) -> np.ndarray:
+        """Centre of each element, (E, 3)."""
+        return _read_only(self.points_m[self.tetrahedra].mean(axis=1))
 
     @property
     def volume_m3(self) -> float:

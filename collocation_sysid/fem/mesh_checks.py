@@ -57,14 +57,16 @@ def refuse_unknown_nodes(cells: np.ndarray, node_count: int) -> None:
         )
 
 
-def checked_point_arrays(arrays: Mapping[str, ArrayLike], node_count: int) -> dict[str, np.ndarray]:
-    """Return the arrays, each of which must have a value per node."""
+def checked_arrays(
+    arrays: Mapping[str, ArrayLike], count: int, kind: str, of: str
+) -> dict[str, np.ndarray]:
+    """Return the arrays, each of which must have `count` values: as many as there are `of`."""
     checked = {name: np.asarray(values) for name, values in arrays.items()}
     for name, values in checked.items():
-        if values.ndim == 0 or len(values) != node_count:
+        if values.ndim == 0 or len(values) != count:
             raise InputError(
-                f'point array "{name}" has shape {values.shape}; '
-                f"its first length must be the number of nodes, {node_count}"
+                f'{kind} array "{name}" has shape {values.shape}; '
+                f"its first length must be the number of {of}, {count}"
             )
     return checked
 

@@ -31,7 +31,7 @@ def length_in_metres(length_unit: str) -> float:
 
 def read_tetrahedra(
     path: str | Path, length_unit: str = "m"
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
     """Read the tetrahedra of a file, quadratic ones by their corners; other cells are left out.
 
     Returns
@@ -40,7 +40,9 @@ def read_tetrahedra(
     tetrahedra : (E, 4)
         E > 0.
     point_arrays : dict of name to (n, ...) array
-        The file's point data, and its point sets as booleans.
+        The file's point data, and its point sets and physical groups as booleans.
+    cell_arrays : dict of name to (E, ...) array
+        The same of the tetrahedra.
     notes : tuple of str
         Which cells were left out and which sides straightened, if any.
 
@@ -63,10 +65,13 @@ def read_tetrahedra(
             notes += straightened(points_m, np.concatenate(quadratic))
         except InputError as error:
             raise error.located(path) from None
+    groups = _physical_groups(data)
+    nodes = {name: _nodes_of(data, per_block) for name, per_block in groups.items()}
     return (
         points_m,
         np.concatenate([block.data[:, :4] for block in blocks]),
-        {**_point_sets(data), **data.point_data},
+        {**nodes, **_point_sets(data), **data.point_data},
+        _of_tetrahedra(data, {**groups, **_cell_sets(data), **data.cell_data}),
         notes,
     )
 
@@ -99,18 +104,21 @@ def write_tetrahedra(
     points_m: np.ndarray,
     tetrahedra: np.ndarray,
     point_arrays: Mapping[str, np.ndarray] | None = None,
+    cell_arrays: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Write a mesh, in metres, to any format meshio knows by the file's ending."""
     import meshio  # slow to import
 
-    # Few formats have a boolean type.
-    arrays: dict[str, Any] = {
-        name: values.astype(np.uint8) if values.dtype == bool else values
-        for name, values in (point_arrays or {}).items()
-    }
-    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data=arrays)
+    of_points: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
+    of_cells: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
+    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], of_points, of_cells)
     with _one_error(path, "written"):
         meshio.write(path, mesh)
+
+
+def _numbers(values: np.ndarray) -> np.ndarray:
+    """Few formats have a boolean type."""
+    return values.astype(np.uint8) if values.dtype == bool else values
 
 
 def _read(path: str | Path) -> Any:
@@ -150,6 +158,53 @@ def _point_sets(data: Any) -> dict[str, np.ndarray]:
         sets[name] = np.zeros(len(data.points), dtype=bool)
         sets[name][np.asarray(nodes, dtype=np.int64)] = True
     return sets
+
+
+def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
+    """Cell sets as booleans, block by block."""
+    sets = {}
+    for name, per_block in (data.cell_sets or {}).items():
+        sets[name] = [np.zeros(len(block.data), dtype=bool) for block in data.cells]
+        for mask, cells in zip(sets[name], per_block, strict=False):
+            if cells is not None:
+                mask[np.asarray(cells, dtype=np.int64)] = True
+    return sets
+
+
+def _physical_groups(data: Any) -> dict[str, list[np.ndarray]]:
+    """Physical groups of a .msh file by name, or "physical_<tag>", as booleans block by block."""
+    tags = [np.asarray(block).ravel() for block in data.cell_data.get("gmsh:physical", ())]
+    if not tags:
+        return {}
+    names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
+    groups: dict[str, list[np.ndarray]] = {}
+    for dimension in range(4):
+        here = [np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)]
+        for tag in np.unique(np.concatenate(here)):
+            if tag > 0:
+                name = names.get((int(tag), dimension), f"physical_{tag}")
+                groups[name] = [block == tag for block in here]
+    return groups
+
+
+def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
+    """Nodes of cells chosen block by block, as booleans."""
+    chosen = np.zeros(len(data.points), dtype=bool)
+    for block, mask in zip(data.cells, masks, strict=True):
+        chosen[np.asarray(block.data)[mask].ravel()] = True
+    return chosen
+
+
+def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The tetrahedra's part of arrays given block by block; those that are of none are left out."""
+    tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
+    kept = {}
+    for name, per_block in arrays.items():
+        parts = [np.asarray(p) for p, wanted in zip(per_block, tetrahedra, strict=True) if wanted]
+        whole = np.concatenate(parts)
+        if whole.dtype != bool or whole.any():
+            kept[name] = whole
+    return kept
 
 
 def _fan(polygons: np.ndarray) -> np.ndarray:

@@ -1,8 +1,11 @@
-"""Node selections: which nodes of a mesh or body are grasped, loaded or observed."""
+"""Selections: which nodes are grasped, loaded or observed, and which cells make up a region.
+
+A cell is in a box or a ball when its centre is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,6 +14,7 @@ import numpy as np
 from ..errors import InputError
 
 if TYPE_CHECKING:
+    from .mesh import TetMesh
     from .nodes import Nodes
 
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
@@ -43,11 +47,21 @@ class Box:
 
     def resolve(self, nodes: Nodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
-        slack = _round_off_m(nodes)
-        above = nodes.points_m >= np.subtract(self.low_m, slack)
-        below = nodes.points_m <= np.add(self.high_m, slack)
+        return _chosen(self._holds(nodes.points_m), nodes, str(self))
+
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Return the selected cells, sorted."""
+        return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
+
+    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        slack = _round_off_m(points_m)
+        above = points_m >= np.subtract(self.low_m, slack)
+        below = points_m <= np.add(self.high_m, slack)
+        return np.all(above & below, axis=1)
+
+    def __str__(self) -> str:
         low, high = (", ".join(f"{x:g}" for x in corner) for corner in (self.low_m, self.high_m))
-        return _chosen(np.all(above & below, axis=1), nodes, f"the box from ({low}) to ({high}) m")
+        return f"the box from ({low}) to ({high}) m"
 
 
 @dataclass(frozen=True)
@@ -64,19 +78,32 @@ class Ball:
 
     def resolve(self, nodes: Nodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
-        distance = np.linalg.norm(nodes.points_m - np.array(self.center_m), axis=1)
+        nearest = (
+            f"; the nearest node is {self._distance_m(nodes.points_m).min():.4g} m from its centre"
+        )
+        return _chosen(self._holds(nodes.points_m), nodes, str(self), nearest)
+
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Return the selected cells, sorted."""
+        return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
+
+    def _distance_m(self, points_m: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points_m - np.array(self.center_m), axis=1)
+
+    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        return self._distance_m(points_m) <= self.radius_m + _round_off_m(points_m)
+
+    def __str__(self) -> str:
         center = ", ".join(f"{x:g}" for x in self.center_m)
-        what = f"the ball of radius {self.radius_m:g} m about ({center}) m"
-        nearest = f"; the nearest node is {distance.min():.4g} m from its centre"
-        return _chosen(distance <= self.radius_m + _round_off_m(nodes), nodes, what, nearest)
+        return f"the ball of radius {self.radius_m:g} m about ({center}) m"
 
 
 @dataclass(frozen=True)
 class Indices:
-    """Nodes by number, counted from 0, as the mesh file (or the given array) numbers them.
+    """Nodes or cells by number, counted from 0, as the mesh file (or the given array) has them.
 
-    These differ from the rows of `mesh.points_m` where nodes were dropped. Only corners can be
-    given: a node on an edge is selected when both of the edge's ends are.
+    Numbers of nodes differ from the rows of `mesh.points_m` where nodes were dropped. Only corners
+    can be given: a node on an edge is selected when both of the edge's ends are.
     """
 
     indices: Sequence[int]
@@ -106,54 +133,88 @@ class Indices:
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, wanted))
         return _chosen(chosen, nodes, "an empty list of indices")
 
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Return the selected cells, sorted."""
+        count = len(mesh.tetrahedra)
+        outside = [index for index in self.indices if not 0 <= index < count]
+        if outside:
+            raise InputError(
+                f"indices: cell {outside[0]} does not exist; the mesh has {count} tetrahedra, "
+                f"numbered 0 to {count - 1}"
+            )
+        chosen = np.isin(np.arange(count), self.indices)
+        return _chosen_cells(chosen, mesh, "an empty list of indices")
+
 
 @dataclass(frozen=True)
 class Named:
-    """The nodes where a point array of the mesh, of booleans or of zeros and ones, is true.
+    """Where a point array of the mesh, or for cells a cell array, is true: booleans or 0 and 1.
 
-    A node on an edge is selected when both of the edge's ends are.
+    A node on an edge is selected when both of the edge's ends are. The physical groups of a .msh
+    file are both: arrays by their names.
     """
 
     name: str
 
     def resolve(self, nodes: Nodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
-        mesh = nodes.mesh
-        if self.name not in mesh.point_arrays:
-            names = ", ".join(f'"{name}"' for name in mesh.point_arrays)
+        what = f'point array "{self.name}"'
+        mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
+        return _chosen(nodes.with_mid_nodes(mask), nodes, what)
+
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Return the selected cells, sorted."""
+        what = f'cell array "{self.name}"'
+        return _chosen_cells(self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what), mesh, what)
+
+    def _mask(self, arrays: Mapping[str, np.ndarray], count: int, what: str) -> np.ndarray:
+        kind = what.split(" ", 1)[0]
+        if self.name not in arrays:
+            names = ", ".join(f'"{name}"' for name in arrays)
             available = f"it has {names}" if names else "it has none"
-            raise InputError(f'the mesh has no point array "{self.name}"; {available}')
-        values = mesh.point_arrays[self.name]
-        if values.size != len(mesh.points_m):
+            raise InputError(f"the mesh has no {what}; {available}")
+        values = arrays[self.name]
+        if values.size != count:
+            each = {"point": "node", "cell": "cell"}[kind]
             raise InputError(
-                f'point array "{self.name}" has {values.size // len(mesh.points_m)} values per '
-                "node; a selection needs one, 0 or 1"
+                f"{what} has {values.size // count} values per {each}; a selection needs one, "
+                "0 or 1"
             )
         values = values.ravel()
         odd = values[~np.isin(values, (0, 1))]
         if len(odd):
-            raise InputError(
-                f'point array "{self.name}" holds {odd[0]}; a selection needs only 0 and 1'
-            )
-        chosen = nodes.with_mid_nodes(values.astype(bool))
-        return _chosen(chosen, nodes, f'point array "{self.name}"')
+            raise InputError(f"{what} holds {odd[0]}; a selection needs only 0 and 1")
+        return values.astype(bool)
 
 
 Selection = Box | Ball | Indices | Named
 
 
-def _chosen(mask: np.ndarray, nodes: Nodes, what: str, nearest: str = "") -> np.ndarray:
+def _chosen_cells(mask: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
     if not mask.any():
-        span = zip("xyz", *nodes.mesh.bounds_m, strict=True)  # no mid node lies beyond
-        body = ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in span)
         raise InputError(
-            f"{what} selects none of the {len(mask)} nodes{nearest}; the body spans {body}"
+            f"{what} selects none of the {len(mask)} cells, by their centres; the body spans "
+            f"{_span(mesh.bounds_m)}"
         )
     return np.flatnonzero(mask).astype(np.int64)
 
 
-def _round_off_m(nodes: Nodes) -> float:
-    return ROUND_OFF * float(np.linalg.norm(np.ptp(nodes.points_m, axis=0)))
+def _chosen(mask: np.ndarray, nodes: Nodes, what: str, nearest: str = "") -> np.ndarray:
+    if not mask.any():
+        span = _span(nodes.mesh.bounds_m)  # no mid node lies beyond
+        raise InputError(
+            f"{what} selects none of the {len(mask)} nodes{nearest}; the body spans {span}"
+        )
+    return np.flatnonzero(mask).astype(np.int64)
+
+
+def _span(bounds_m: np.ndarray) -> str:
+    axes = zip("xyz", *bounds_m, strict=True)
+    return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
+
+
+def _round_off_m(points_m: np.ndarray) -> float:
+    return ROUND_OFF * float(np.linalg.norm(np.ptp(points_m, axis=0)))
 
 
 def _is_number(value: object) -> bool:

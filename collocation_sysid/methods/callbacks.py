@@ -289,7 +289,7 @@ class Monitor(ca.Callback):
             loss=float(value[0]) / self.collocation.loss_scale,
             rms_m=self.collocation.rms_m(z),
             violation_n=float(violation),
-            theta=self.collocation.theta(z),
+            parameters=self.collocation.values(z),
             time_s=time.perf_counter() - self.began,
         )
         self.history.append(iteration)

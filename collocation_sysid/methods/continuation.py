@@ -227,7 +227,6 @@ def _continued(
     collocation: Collocation, q: Array, positions: list[Array], own: list[Array]
 ) -> Array:
     """Variables z from the first rows of positions: simulated on, or carried by the grasp."""
-    theta = collocation.parameters.theta(q)
     settings = collocation.settings(np.concatenate([q, *own]))
     whole = []
     for segment, setting, x, phi in zip(
@@ -235,8 +234,8 @@ def _continued(
     ):
         known = x[: segment.grid_rows]
         if len(known) < segment.grid_rows:
-            carried = carried_rigidly(segment, theta)
-            known, _ = march_on(segment.corrected(phi), setting.dynamics, theta, known)
+            carried = carried_rigidly(segment, setting.theta)
+            known, _ = march_on(segment.corrected(phi), setting.dynamics, setting.theta, known)
             known = np.concatenate([known, carried[len(known) :]])
         whole.append(known)
     return collocation.pack(q, whole, own)

@@ -23,12 +23,13 @@ def constraint_multipliers(
         Where a timestep's equations are singular.
     """
     q, positions = collocation.unpack(z)
-    theta = collocation.parameters.theta(q)
     parts = []
     own = collocation.unpack_own(z)
     for segment, x, phi in zip(collocation.segments, positions, own, strict=True):
         gradient = collocation.loss_scale * segment.observation.gradient(x, phi)[0]
-        y = BlockSolver(segment, stopwatch=stopwatch).backward(x, theta, gradient)
+        y = BlockSolver(segment, stopwatch=stopwatch).backward(
+            x, segment.constants.theta(q), gradient
+        )
         y *= segment.force_n
         parts.append(y[segment.dynamics.first_row :, segment.row_dofs].ravel())
     multipliers = np.concatenate(parts)

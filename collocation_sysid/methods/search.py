@@ -12,6 +12,7 @@ from scipy.optimize import lsq_linear
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
+from ..fem.constants import unit_of
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.stopwatch import Stopwatch
@@ -84,7 +85,6 @@ SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
 LOCAL = 0.1
 # Doublings of the moduli where not even the first rows can be simulated at the guess.
 STIFFENINGS = 10
-MODULI = ("lambda_pa", "mu_pa", "young_pa")
 
 
 class Search:
@@ -184,7 +184,9 @@ class Search:
             The failure, where they cannot be raised further.
         """
         names = [item.name for item in self.collocation.parameters.free]
-        moduli = np.array([name in MODULI for name in names], dtype=bool)
+        moduli = np.array(
+            [unit_of(i.name) == "Pa" and i.scale == "log" for i in self.collocation.parameters.free]
+        )
         q, upper = self.p[: len(names)], self.upper[: len(names)]
         stiffer = np.minimum(q + np.log(2) * moduli, upper)
         started = self.collocation.parameters.guess_q
@@ -352,7 +354,7 @@ class Search:
             loss=loss,
             rms_m=float(np.sqrt(distances.mean())) if len(distances) else 0.0,
             violation_n=violation_n,
-            theta=self.collocation.parameters.theta(q),
+            parameters=self.collocation.parameters.values(q),
             time_s=time.perf_counter() - self.began,
         )
         self.history.append(line)

@@ -227,8 +227,7 @@ class _Search:
         collocation = self.collocation
         if self.best is None:
             q, own = collocation.split(self.first)
-            theta = collocation.parameters.theta(q)
-            x = [carried_rigidly(segment, theta) for segment in collocation.segments]
+            x = [carried_rigidly(s, s.constants.theta(q)) for s in collocation.segments]
             return collocation.pack(q, x, own), np.zeros(collocation.constraints)
         try:
             return self.best.z, constraint_multipliers(collocation, self.best.z, self.stopwatch)
@@ -352,7 +351,7 @@ class _Search:
             loss=shot.objective / self.collocation.loss_scale,
             rms_m=self.collocation.rms_m(shot.z),
             violation_n=max(float(np.abs(r).max(initial=0.0)) for r in violations),
-            theta=self.collocation.theta(shot.z),
+            parameters=self.collocation.values(shot.z),
             time_s=time.perf_counter() - self.began,
         )
         self.history.append(line)

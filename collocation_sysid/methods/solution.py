@@ -12,7 +12,6 @@ import numpy as np
 
 from ..arrays import Array
 from ..nlp.collocation import Collocation, Violation
-from ..nlp.parameters import Theta
 from ..nlp.stopwatch import Stopwatch
 
 
@@ -64,13 +63,13 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Iteration:
-    """One line of the history."""
+    """One line of the history; the parameters by the user's names."""
 
     number: int
     loss: float
     rms_m: float
     violation_n: float
-    theta: Theta
+    parameters: dict[str, float]
     time_s: float
 
 
@@ -128,13 +127,13 @@ class Solution:
 
     @property
     def q(self) -> Array:
-        """(nq,) logarithms of the estimated parameters."""
+        """(nq,) the estimated parameters in the solver's coordinates."""
         return self.z[: self.collocation.nq]
 
     @property
-    def theta(self) -> Theta:
-        """(λ, μ, γ_r, γ_m)."""
-        return self.collocation.theta(self.z)
+    def theta(self) -> Array:
+        """(k,) constants of the first experiment's body, see `Body.constants`."""
+        return self.collocation.segments[0].body.theta(self.parameters)
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -145,7 +145,7 @@ class Stages:
             loss=nlp.objective(z) / nlp.loss_scale,
             rms_m=nlp.rms_m(z),
             violation_n=self.slack().newtons,
-            theta=nlp.theta(z),
+            parameters=nlp.values(z),
             time_s=time.perf_counter() - self.began,
         )
         self.history.append(line)

@@ -9,7 +9,6 @@ from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march
 from ..nlp.newton import Solver
-from ..nlp.parameters import Theta
 from ..nlp.rest import start_state
 from ..nlp.segment import Segment
 
@@ -21,9 +20,9 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     rest shape carried rigidly by the grasp takes its place: collocation needs no feasible start.
     """
     q = collocation.parameters.guess_q
-    theta = collocation.parameters.theta(q)
     positions, notes = [], []
     for segment in collocation.segments:
+        theta = segment.constants.theta(q)
         try:
             positions.append(march(segment.experiment, segment.dynamics, theta))
         except SimulationError as error:
@@ -35,7 +34,7 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     return collocation.pack(q, positions), notes
 
 
-def carried_rigidly(segment: Segment, theta: Theta) -> Array:
+def carried_rigidly(segment: Segment, theta: Array) -> Array:
     """(N, 3n) start shape moved with the first grasp, held nodes where their grasps are."""
     experiment, t_s = segment.experiment, segment.dynamics.t_s
     try:

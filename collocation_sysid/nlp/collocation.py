@@ -6,7 +6,7 @@
 Variables z, in this order:
 
 =================  =========================================================================
-q                  ln of each estimated parameter, in the order of `Parameters.free`
+q                  of each estimated parameter, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
 φ_e                the own unknowns of experiment e, see `nlp.local`; experiment by experiment
@@ -35,7 +35,7 @@ import scipy.sparse as sp
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
-from .parameters import Parameters, Theta
+from .parameters import Parameters
 from .segment import Segment
 from .setting import Setting
 
@@ -100,9 +100,9 @@ class Collocation:
         self.scheme = scheme
         self.substeps = substeps
         self.nq = len(parameters.free)
-        theta = parameters.theta(parameters.guess_q)
+        parameters.fit({id(e.body): e.body for e in fitted}.values())
         self.segments = [
-            Segment(experiment, scheme, substeps, theta, self.nq, explicit_grasps, huber)
+            Segment(experiment, scheme, substeps, parameters, explicit_grasps, huber)
             for experiment in fitted
         ]
         sizes = [segment.variables for segment in self.segments]
@@ -180,10 +180,7 @@ class Collocation:
     def settings(self, p: Array) -> list[Setting]:
         """Physical parameters of each experiment at p."""
         q, own = self.split(p)
-        return [
-            segment.setting(self.parameters, q, phi)
-            for segment, phi in zip(self.segments, own, strict=True)
-        ]
+        return [segment.setting(q, phi) for segment, phi in zip(self.segments, own, strict=True)]
 
     def prior(self, p: Array) -> tuple[Array, Array]:
         """Residuals of the priors at p, and their slopes; φ counts in its deviations."""
@@ -423,6 +420,6 @@ class Collocation:
             samples += segment.experiment.markers.samples
         return float(np.sqrt(squares / max(1.0, samples)))
 
-    def theta(self, z: Array) -> Theta:
-        """Physical parameters of z."""
-        return self.parameters.theta(z[: self.nq])
+    def values(self, z: Array) -> dict[str, float]:
+        """The parameters of z by the user's names."""
+        return self.parameters.values(z[: self.nq])

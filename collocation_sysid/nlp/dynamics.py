@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
-from .parameters import Theta
 from .schemes import Scheme, scheme_named
 
 
@@ -156,11 +155,11 @@ class Dynamics:
                 result[: len(rows) - lag] += column * rows[lag:]
         return result
 
-    def residual(self, x: Array, theta: Theta) -> Array:
+    def residual(self, x: Array, theta: Array) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
         return self.assemble_residual(x, self.internal_force(x, theta))
 
-    def internal_force(self, x: Array, theta: Theta) -> Array:
+    def internal_force(self, x: Array, theta: Array) -> Array:
         """Internal forces (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
         damped = self.weighed_kg[self.first_row :]
         return self.body.force(*self.evaluation_states(x), theta, damped)
@@ -183,7 +182,7 @@ class Dynamics:
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
         return acceleration * self.mass_kg
 
-    def linearise(self, x: Array, theta: Theta, out: Array | None = None) -> Linearisation:
+    def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
         """Forces and derivatives at the evaluation states of x (N, 3n)."""
         damped = self.weighed_kg[self.first_row :]
         return self.body.linearise(*self.evaluation_states(x), theta, out, damped)

@@ -12,7 +12,6 @@ from ..experiment.experiment import Experiment
 from .dynamics import Dynamics
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
-from .parameters import Theta
 from .rest import start_state
 from .stopwatch import Stopwatch
 
@@ -22,7 +21,7 @@ Progress = Callable[[float], None]
 def march(
     experiment: Experiment,
     dynamics: Dynamics,
-    theta: Theta,
+    theta: Array,
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
 ) -> Array:
@@ -43,7 +42,7 @@ def march(
 def march_on(
     experiment: Experiment,
     dynamics: Dynamics,
-    theta: Theta,
+    theta: Array,
     known: Array | None = None,
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
@@ -111,7 +110,7 @@ def _predicted(x: Array, first_step: Array) -> Array:
 class _Row:
     """Row t of the discrete equations as a function of x_t alone."""
 
-    def __init__(self, dynamics: Dynamics, theta: Theta, x: Array, forces: Array, t: int) -> None:
+    def __init__(self, dynamics: Dynamics, theta: Array, x: Array, forces: Array, t: int) -> None:
         self.dynamics, self.theta = dynamics, theta
         table, step = dynamics.tables, dynamics.step_s
         self.mass, self.damped = dynamics.mass_kg[t], dynamics.weighed_kg[t]

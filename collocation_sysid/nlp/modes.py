@@ -1,8 +1,9 @@
 """Small oscillations of a body about a state: natural frequencies, shapes and their damping.
 
-Free dofs obey M ẍ + C ẋ + K x = 0 with the stiffness K at that state, the lumped mass M and
-Rayleigh's C = γ_r K + γ_m M, so that each mode K φ = ω² M φ oscillates for itself with the
-damping ratio ζ = γ_r ω / 2 + γ_m / 2ω.
+Free dofs obey M ẍ + C ẋ + K x = 0 with the stiffness K at that state, the lumped mass M and the
+damping C. A mode K φ = ω² M φ has the damping ratio ζ = φᵀC φ / 2ω φᵀM φ; where Rayleigh's
+C = γ_r K + γ_m M is the same throughout the body that is γ_r ω / 2 + γ_m / 2ω, and the mode
+oscillates for itself.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from ..arrays import Array, Index
 from ..fem.body import Body
 from .factorisation import Factor, Factoriser
-from .parameters import Theta
 
 # ω² below this share of the largest K_ii / M_ii is zero up to rounding.
 RIGID = 1e-12
@@ -36,6 +36,7 @@ class Modes:
     Attributes
     ----------
     frequencies_hz : (k,) undamped natural frequencies ω / 2π
+    damping_ratios : (k,) ζ; 1 and above does not oscillate
     shapes : (k, n, 3) displacements, φᵀ M φ = 1 kg (unit m); held nodes rest
     not_oscillating : int
         Modes left out because nothing drives them back: six rigid ones of a body nobody holds,
@@ -43,6 +44,7 @@ class Modes:
     """
 
     frequencies_hz: Array
+    damping_ratios: Array
     shapes: Array
     not_oscillating: int = 0
 
@@ -51,17 +53,12 @@ class Modes:
         """(k,) ω."""
         return 2 * np.pi * self.frequencies_hz
 
-    def damping_ratios(self, theta: Theta) -> Array:
-        """(k,) ζ = γ_r ω / 2 + γ_m / 2ω; 1 and above does not oscillate."""
-        omega = self.angular_frequencies_rad_s
-        return theta.gamma_r_s * omega / 2 + theta.gamma_m_1_s / (2 * omega)
-
 
 def natural_modes(
     body: Body,
     x: ArrayLike,
     free_dofs: Index,
-    theta: Theta,
+    theta: Array,
     count: int = 6,
     dof_mass: Array | None = None,
 ) -> Modes:
@@ -73,8 +70,7 @@ def natural_modes(
     x : (n, 3) or (3n,) array
         The state; it should be an equilibrium.
     free_dofs : (k,) sorted dofs that are not held
-    theta : Theta
-        Only the elastic parameters count.
+    theta : (k,) constants of the body
     count : int
         Modes wanted; there may be fewer.
     dof_mass : (3n,) array, optional
@@ -86,8 +82,8 @@ def natural_modes(
     """
     mass = (body.dof_mass if dof_mass is None else dof_mass)[free_dofs]
     state = np.asarray(x, dtype=float).reshape(-1, 3)
-    elastic = Theta(theta.lambda_pa, theta.mu_pa, 0.0, 0.0)
-    lower = -body.linearise(state, np.zeros_like(state), elastic).by_position[0]
+    at = body.linearise(state, np.zeros_like(state), theta, dof_mass=dof_mass)
+    lower, damping = -at.by_position[0], -at.by_velocity[0]
     stiffness = sp.csc_array(body.pattern.matrix(lower)[:, free_dofs][free_dofs])
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
     wanted = count + RIGID_MOTIONS
@@ -100,10 +96,12 @@ def natural_modes(
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), body.pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T
-    frequencies = np.sqrt(squares[oscillating]) / (2 * np.pi)
+    omega, shapes = np.sqrt(squares[oscillating])[:count], shapes[:count]
+    drag = np.einsum("ki,ki->k", shapes, (body.pattern.matrix(damping) @ shapes.T).T)
     return Modes(
-        frequencies[:count],
-        shapes[:count].reshape(-1, len(body.nodes_m), 3),
+        omega / (2 * np.pi),
+        drag / (2 * omega),
+        shapes.reshape(-1, len(body.nodes_m), 3),
         int((~oscillating).sum()),
     )
 

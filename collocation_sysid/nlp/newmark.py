@@ -13,7 +13,6 @@ from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
-from .parameters import Theta
 from .rest import start_state
 
 Progress = Callable[[float], None]
@@ -32,7 +31,7 @@ class _State:
 @one_blas_thread()
 def newmark(
     experiment: Experiment,
-    theta: Theta,
+    theta: Array,
     steps_per_sample: int,
     options: NewtonOptions | None,
     progress: Progress | None,
@@ -56,7 +55,7 @@ def newmark(
 class _Stepper:
     """Newmark steps of one experiment."""
 
-    def __init__(self, experiment: Experiment, theta: Theta, options: NewtonOptions | None) -> None:
+    def __init__(self, experiment: Experiment, theta: Array, options: NewtonOptions | None) -> None:
         self.experiment, self.theta = experiment, theta
         self.body = experiment.body
         self.options = options or NewtonOptions()

@@ -1,65 +1,88 @@
-"""The four material parameters: guesses, bounds, priors, and the coordinates they are solved in.
+"""What is estimated: guesses, bounds, priors, ties, and the coordinates they are solved in.
 
-The solver works on q, the logarithms of the parameters that are not fixed, in the order of
-`Parameters.free`. Whatever the user's elastic pair, the physics sees
-
-    θ = (λ [Pa], μ [Pa], γ_r [s], γ_m [1/s]),
-
-and the map q → θ with its derivatives is a CasADi expression.
+The solver works on q, one number for each parameter that is free, in the order of
+`Parameters.free`: the logarithm of a positive parameter, or a linear one over what it may change
+by in a step. Parameters have the names of the model's constants, or of moduli that stand for them;
+`ThetaMap` leads from q to the constants θ of a body, with derivatives by CasADi.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError
+from ..errors import InputError, hint_at
+from ..fem.body import Body
+from ..fem.constants import Scale, bare, constant_named
+from ..fem.moduli import ENGINEERING, engineering
 
-LAME = ("lambda_pa", "mu_pa")
-ENGINEERING = ("young_pa", "poisson")
-DAMPING = ("gamma_r_s", "gamma_m_1_s")
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter to estimate, as a user states it; what is left out follows from its constant.
+
+    Attributes
+    ----------
+    guess : float
+    lower, upper : float, optional
+        Bounds.
+    prior : (mean, deviation), optional
+        A normal prior: on the logarithm, with a relative deviation; of a linear parameter, with
+        an absolute one.
+    scale : {"log", "linear"}, optional
+        Whether the logarithm of a positive number is estimated, or any number.
+    typical : float, optional
+        What a linear parameter may change by in a step; its guess where its constant tells none.
+    """
+
+    guess: float
+    lower: float | None = None
+    upper: float | None = None
+    prior: tuple[float, float] | None = None
+    scale: Scale | None = None
+    typical: float | None = None
 
 
-class Theta(NamedTuple):
-    """Physical parameters in the order every kernel expects."""
+@dataclass(frozen=True)
+class Tied:
+    """A parameter that is a multiple of another.
 
-    lambda_pa: float
-    mu_pa: float
-    gamma_r_s: float
-    gamma_m_1_s: float
+    Attributes
+    ----------
+    to : str
+    ratio : float
+    """
 
-    @property
-    def young_pa(self) -> float:
-        """Young's modulus E = μ (3λ + 2μ) / (λ + μ)."""
-        return self.mu_pa * (3 * self.lambda_pa + 2 * self.mu_pa) / (self.lambda_pa + self.mu_pa)
-
-    @property
-    def poisson(self) -> float:
-        """Poisson's ratio ν = λ / 2(λ + μ)."""
-        return self.lambda_pa / (2 * (self.lambda_pa + self.mu_pa))
+    to: str
+    ratio: float = 1.0
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter to estimate.
+    """One parameter of a problem.
 
     Attributes
     ----------
     name : str
-        With its unit, as in the problem file.
+        With its unit, and the region in front if it has one.
     guess : float
     lower, upper : float
-        Bounds, positive.
+        Bounds; positive for a logarithm.
     fixed : bool
         Kept at `guess`.
-    prior : tuple (mean, relative standard deviation) or None
-        A normal prior on the logarithm: ((ln value − ln mean) / deviation)² joins the loss.
+    prior : tuple (mean, deviation) or None
+        A normal prior: ((ln value − ln mean) / deviation)² joins the loss, or for a linear
+        parameter ((value − mean) / deviation)².
+    scale : {"log", "linear"}
+    unit : float
+        What a linear parameter changes by where its q changes by one.
+    tied : Tied or None
+        Follows another parameter; guess and bounds then do not count.
     """
 
     name: str
@@ -68,15 +91,21 @@ class Parameter:
     upper: float = np.inf
     fixed: bool = False
     prior: tuple[float, float] | None = None
+    scale: Scale = "log"
+    unit: float = 1.0
+    tied: Tied | None = None
 
     def __post_init__(self) -> None:
-        if self.fixed:
-            if not (np.isfinite(self.guess) and self.guess >= 0):
-                raise InputError(f"fixed = {self.guess:g}, expected a number >= 0", None, self.name)
+        if self.tied is not None:
             return
-        if not 0 < self.lower < self.upper:
+        if self.fixed:
+            self._check_fixed()
+            return
+        least = 0.0 if self.scale == "log" else -np.inf
+        if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
             raise InputError(
-                f"lower = {self.lower:g}, upper = {self.upper:g}, expected 0 < lower < upper",
+                f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
+                f"{'0 < ' if self.scale == 'log' else ''}lower < upper",
                 None,
                 self.name,
             )
@@ -86,94 +115,164 @@ class Parameter:
                 None,
                 self.name,
             )
-        if self.prior is not None and not (self.prior[0] > 0 and self.prior[1] > 0):
+        self._refuse_beyond(self.upper, "upper")
+        if self.prior is not None and not (
+            self.prior[1] > 0 and (self.prior[0] > 0 or self.scale == "linear")
+        ):
             raise InputError(
                 f"prior = {self.prior}, expected positive mean and deviation", None, self.name
             )
 
+    def _check_fixed(self) -> None:
+        least = constant_named(self.name).least
+        if not (np.isfinite(self.guess) and self.guess >= least):
+            expected = "a number" if least < 0 else "a number >= 0"
+            raise InputError(f"fixed = {self.guess:g}, expected {expected}", None, self.name)
+        self._refuse_beyond(self.guess, "fixed")
 
-@dataclass(frozen=True)
-class Parameters:
-    """All four parameters, two elastic ones in either convention and two of damping.
+    def _refuse_beyond(self, value: float, what: str) -> None:
+        if not value < (limit := constant_named(self.name).below):
+            why = ": an incompressible body has no finite λ" if bare(self.name) == "poisson" else ""
+            raise InputError(
+                f"{what} = {value:g}, expected less than {limit:g}{why}", None, self.name
+            )
+
+    def q(self, value: float) -> float:
+        """The solver's coordinate of a value."""
+        return float(np.log(value)) if self.scale == "log" else value / self.unit
+
+    def value(self, q: float) -> float:
+        """The value at a solver's coordinate."""
+        return float(np.exp(q)) if self.scale == "log" else q * self.unit
+
+    def per_value(self, value: float) -> float:
+        """Derivative of the value by q."""
+        return value if self.scale == "log" else self.unit
+
+
+def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
+    """A parameter as stated, completed by what its constant says.
 
     Raises
     ------
     InputError
-        For missing or mixed names, or a Poisson's ratio that can leave (0, 0.5).
+        For a guess out of bounds, or a linear parameter without a size.
+    """
+    constant = constant_named(name)
+    if isinstance(given, Tied):
+        return Parameter(name, 0.0, tied=given)
+    if not isinstance(given, Unknown):
+        return Parameter(name, float(given), fixed=True)
+    scale = given.scale or constant.scale
+    low, high = constant.bounds
+    if scale == "linear" and constant.scale == "log":
+        low = -high
+    if scale == "log" and low <= 0:
+        low = 1e-9 * high
+    typical = given.typical or constant.typical or abs(given.guess)
+    if scale == "linear" and not typical > 0:
+        raise InputError(
+            "guess = 0 of a linear parameter does not tell its size; expected typical, what it "
+            "may change by in a step",
+            None,
+            name,
+        )
+    try:
+        return Parameter(
+            name,
+            float(given.guess),
+            low if given.lower is None else float(given.lower),
+            high if given.upper is None else float(given.upper),
+            prior=given.prior,
+            scale=scale,
+            unit=float(typical) if scale == "linear" else 1.0,
+        )
+    except InputError as error:
+        if given.lower is not None and given.upper is not None:
+            raise
+        message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
+        raise InputError(message, None, name) from error
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """All parameters of a problem.
+
+    Raises
+    ------
+    InputError
+        For a name given twice, or a tie to a parameter that is not there or is tied itself.
     """
 
     items: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        names = tuple(item.name for item in self.items)
-        if names not in (LAME + DAMPING, ENGINEERING + DAMPING):
-            raise InputError(
-                f"parameters are {', '.join(names) or 'none'}; expected "
-                f"{', '.join(LAME + DAMPING)}, or young_pa, poisson in place of the first two"
-            )
+        object.__setattr__(self, "items", tuple(self.items))
+        for name in self.names:
+            if self.names.count(name) > 1:
+                raise InputError("given twice, expected one value", None, name)
+        rooted = [item.name for item in self.items if item.tied is None]
         for item in self.items:
-            top = item.guess if item.fixed else item.upper
-            if item.name == "poisson" and not top < 0.5:
+            if item.tied is not None and item.tied.to not in rooted:
                 raise InputError(
-                    f"{'fixed' if item.fixed else 'upper'} = {top:g}, expected less than 0.5: "
-                    "an incompressible body has no finite λ",
+                    f"tied to {item.tied.to!r}, expected a parameter that is estimated or fixed: "
+                    f"{', '.join(rooted)}{hint_at(item.tied.to, rooted)}",
                     None,
-                    "poisson",
+                    item.name,
                 )
+
+    @classmethod
+    def of(cls, given: Mapping[str, Unknown | Tied | float]) -> Parameters:
+        """Parameters by name; a number is a fixed value."""
+        return cls(tuple(parameter(name, value) for name, value in given.items()))
 
     @property
     def names(self) -> tuple[str, ...]:
         """The user's names, in order."""
         return tuple(item.name for item in self.items)
 
-    @property
+    @cached_property
     def free(self) -> tuple[Parameter, ...]:
         """Those that are estimated, in the order of q."""
-        return tuple(item for item in self.items if not item.fixed)
+        return tuple(item for item in self.items if not item.fixed and item.tied is None)
 
     @property
     def guess_q(self) -> Array:
-        """(nq,) logarithms of the guesses."""
-        return np.log([item.guess for item in self.free])
+        """(nq,) coordinates of the guesses."""
+        return np.array([item.q(item.guess) for item in self.free])
 
     @property
     def bounds_q(self) -> tuple[Array, Array]:
         """(nq,) lower and upper bounds of q."""
         return (
-            np.log([item.lower for item in self.free]),
-            np.log([item.upper for item in self.free]),
+            np.array([item.q(item.lower) for item in self.free]),
+            np.array([item.q(item.upper) for item in self.free]),
         )
 
-    @cached_property
-    def _map(self) -> ca.Function:
-        q = ca.SX.sym("q", len(self.free))
-        values: dict[str, ca.SX | float] = {item.name: item.guess for item in self.items}
+    def expressions(self, q: ca.SX) -> dict[str, ca.SX]:
+        """Every parameter as an expression in q, by name."""
+        found = {item.name: ca.SX(item.guess) for item in self.items}
         for k, item in enumerate(self.free):
-            values[item.name] = ca.exp(q[k])
-        if ENGINEERING[0] in values:
-            young, poisson = values["young_pa"], values["poisson"]
-            first = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-            second = young / (2 * (1 + poisson))
-        else:
-            first, second = values["lambda_pa"], values["mu_pa"]
-        theta = ca.vertcat(first, second, values["gamma_r_s"], values["gamma_m_1_s"])
-        jacobian = ca.jacobian(theta, q)
-        hessians = [ca.densify(ca.hessian(theta[k], q)[0]) for k in range(4)]
-        return ca.Function("theta", [q], [ca.SX(theta), ca.densify(jacobian), *hessians])
-
-    def theta(self, q: Sequence[float] | Array) -> Theta:
-        """Physical parameters at q (nq,)."""
-        return Theta(*self._map(np.asarray(q))[0].full().ravel().tolist())
-
-    def theta_derivatives(self, q: Array) -> tuple[Array, Array]:
-        """∂θ/∂q (4, nq) and ∂²θ/∂q² (4, nq, nq)."""
-        _, jacobian, *hessians = self._map(np.asarray(q))
-        return jacobian.full(), np.array([h.full() for h in hessians])
+            found[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
+        for item in self.items:
+            if item.tied is not None:
+                found[item.name] = item.tied.ratio * found[item.tied.to]
+        return found
 
     def values(self, q: Sequence[float] | Array) -> dict[str, float]:
-        """The user's parameters at q, by name."""
-        estimated = dict(zip((item.name for item in self.free), np.exp(q), strict=True))
-        return {item.name: float(estimated.get(item.name, item.guess)) for item in self.items}
+        """Every parameter at q, by name."""
+        found = {item.name: float(item.guess) for item in self.items}
+        for item, coordinate in zip(self.free, q, strict=True):
+            found[item.name] = item.value(float(coordinate))
+        for item in self.items:
+            if item.tied is not None:
+                found[item.name] = item.tied.ratio * found[item.tied.to]
+        return found
+
+    @property
+    def guesses(self) -> dict[str, float]:
+        """Every parameter at its guess, by name."""
+        return self.values(self.guess_q)
 
     def prior(self, q: Array) -> tuple[Array, Array]:
         """Residuals of the priors (nq,), zero where there is none, and their slopes (nq,)."""
@@ -181,8 +280,8 @@ class Parameters:
         for k, item in enumerate(self.free):
             if item.prior is not None:
                 mean, deviation = item.prior
-                residuals[k] = (q[k] - np.log(mean)) / deviation
-                slopes[k] = 1 / deviation
+                slopes[k] = (1.0 if item.scale == "log" else item.unit) / deviation
+                residuals[k] = (q[k] - item.q(mean)) * slopes[k]
         return residuals, slopes
 
     def with_guess(self, values: Mapping[str, float]) -> Parameters:
@@ -194,33 +293,129 @@ class Parameters:
             For a name that is not among them, or a guess out of bounds.
         """
         if unknown := sorted(set(values) - set(self.names)):
-            raise InputError(f"no parameter {unknown[0]!r}; there are {', '.join(self.names)}")
+            raise InputError(
+                f"no parameter {unknown[0]!r}; there are {', '.join(self.names)}"
+                f"{hint_at(unknown[0], self.names)}"
+            )
         return Parameters(
             tuple(replace(i, guess=values[i.name]) if i.name in values else i for i in self.items)
         )
 
+    def with_fixed(self, values: Mapping[str, float]) -> Parameters:
+        """The same parameters, some of them fixed."""
+        return Parameters(
+            tuple(
+                Parameter(i.name, values[i.name], fixed=True) if i.name in values else i
+                for i in self.items
+            )
+        )
 
-def as_theta(parameters: Parameters | Mapping[str, float] | Sequence[float]) -> Theta:
-    """Physical parameters from guesses, a mapping by name, or (λ, μ, γ_r, γ_m).
+    def fit(self, bodies: Iterable[Body]) -> None:
+        """Refuse parameters that do not give the constants of the bodies.
+
+        Raises
+        ------
+        InputError
+            For a name that none of them knows, a constant that is missing or given twice.
+        """
+        bodies = list(bodies)
+        known = [name for body in bodies for name in body.parameter_names]
+        for name in self.names:
+            if name not in known:
+                expected = ", ".join(dict.fromkeys(n for body in bodies for n in body.constants))
+                raise InputError(
+                    f"no such parameter; the model's are {expected}{hint_at(name, known)}",
+                    None,
+                    name,
+                )
+        used = {n for body in bodies for s in body.sources(self.names) for n in s.names.values()}
+        used |= {item.tied.to for item in self.items if item.tied is not None}
+        for name in self.names:
+            if name not in used:
+                raise InputError(
+                    "no part of the model uses it: every region has a value of its own", None, name
+                )
+
+
+class ThetaMap:
+    """The constants θ of a body, and moduli derived from them, as functions of q.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    body : Body
 
     Raises
     ------
     InputError
-        If names or numbers are missing.
+        If a constant is missing or given twice.
     """
-    if isinstance(parameters, Parameters):
-        return parameters.theta(parameters.guess_q)
-    if isinstance(parameters, Mapping):
-        elastic = LAME if LAME[0] in parameters else ENGINEERING
-        missing = [name for name in elastic + DAMPING if name not in parameters]
-        if missing:
-            raise InputError(f"parameters lack {', '.join(missing)}")
-        return as_theta(
-            Parameters(
-                tuple(Parameter(n, float(parameters[n]), fixed=True) for n in elastic + DAMPING)
+
+    def __init__(self, parameters: Parameters, body: Body) -> None:
+        q = ca.SX.sym("q", len(parameters.free))
+        theta = ca.vertcat(*body.assembled(parameters.expressions(q)))
+        self._theta = _with_derivatives("theta", q, theta)
+        self.derived_names, derived = _derived(parameters.names, body, theta)
+        self._derived = _with_derivatives("derived", q, derived)
+
+    def theta(self, q: Sequence[float] | Array) -> Array:
+        """(k,) constants at q."""
+        return self._theta(np.asarray(q))[0].full().ravel()
+
+    def derivatives(self, q: Array) -> tuple[Array, Array]:
+        """∂θ/∂q (k, nq) and ∂²θ/∂q² (k, nq, nq)."""
+        _, jacobian, *hessians = self._theta(np.asarray(q))
+        size = len(q)
+        return jacobian.full(), np.array([h.full() for h in hessians]).reshape(-1, size, size)
+
+    def derived(self, q: Array) -> tuple[Array, Array]:
+        """Values of `derived_names`, and their derivatives by q."""
+        values, jacobian, *_ = self._derived(np.asarray(q))
+        return values.full().ravel(), jacobian.full()
+
+
+def _with_derivatives(name: str, q: ca.SX, values: ca.SX) -> ca.Function:
+    jacobian = ca.densify(ca.jacobian(values, q))
+    hessians = [ca.densify(ca.hessian(values[k], q)[0]) for k in range(values.shape[0])]
+    return ca.Function(name, [q], [ca.densify(values), jacobian, *hessians])
+
+
+def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str, ...], ca.SX]:
+    """(E, ν) of every part at small strain; (λ, μ) of those that are given by (E, ν)."""
+    found: dict[str, ca.SX] = {}
+    for part, share in zip(body.parts, body.split(theta), strict=True):
+        lame = part.material.lame(share[: len(part.material.constants)])
+        young, poisson = engineering(lame[0], lame[1])
+        moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
+        for own, value in moduli.items():
+            full = part.full_name(own)
+            given = full in names or own in names
+            wanted = own in ENGINEERING or {part.full_name(ENGINEERING[0]), ENGINEERING[0]} & set(
+                names
             )
+            if wanted and not given:
+                found[full] = value
+    return tuple(found), ca.vertcat(*found.values()) if found else ca.SX(0, 1)
+
+
+def theta_of(
+    body: Body, given: Parameters | Mapping[str, float] | Sequence[float] | Array
+) -> Array:
+    """Constants of a body from guesses, values by name, or θ itself.
+
+    Raises
+    ------
+    InputError
+        If names or numbers are missing, or unknown.
+    """
+    if isinstance(given, Parameters):
+        return body.theta(given.guesses)
+    if isinstance(given, Mapping):
+        Parameters.of(given).fit([body])
+        return body.theta(given)
+    if len(given) != len(body.constants):
+        raise InputError(
+            f"{len(given)} parameters given, expected {len(body.constants)}: "
+            f"{', '.join(body.constants)}"
         )
-    if len(parameters) != len(Theta._fields):
-        expected = ", ".join(Theta._fields)
-        raise InputError(f"{len(parameters)} parameters given, expected four: {expected}")
-    return Theta(*map(float, parameters))
+    return np.array(given, dtype=float)

@@ -9,13 +9,12 @@ from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, Solver, simulation_error
-from .parameters import Theta
 
 
 @one_blas_thread()
 def rest_state(
     experiment: Experiment,
-    theta: Theta,
+    theta: Array,
     time_s: float | None = None,
     start: Array | None = None,
     solver: Solver | None = None,
@@ -34,17 +33,16 @@ def rest_state(
     t_s = np.atleast_1d(experiment.t_s[0] if time_s is None else time_s)
     body = experiment.body
     load = external_force(experiment, float(t_s[0]))
-    elastic = Theta(theta.lambda_pa, theta.mu_pa, 0.0, 0.0)
     still = np.zeros((1, body.pattern.size))
     x = experiment.rigid_positions(t_s).ravel() if start is None else start.copy()
     x[solver.held] = experiment.grasped(t_s)[1].ravel()[solver.held]
 
     def solve(x: Array, share: float) -> Array:
         def residual(state: Array) -> Array:
-            return body.force(state, still, elastic)[0] + share * load
+            return body.force(state, still, theta)[0] + share * load
 
         def linearise(state: Array) -> tuple[Array, Array]:
-            forces = body.linearise(state, still, elastic)
+            forces = body.linearise(state, still, theta)
             return forces.force[0] + share * load, -forces.by_position[0]
 
         return solver.newton(x, residual, linearise, keep_definite=True)
@@ -63,7 +61,7 @@ def rest_state(
     return x
 
 
-def start_state(experiment: Experiment, theta: Theta, solver: Solver) -> tuple[Array, Array]:
+def start_state(experiment: Experiment, theta: Array, solver: Solver) -> tuple[Array, Array]:
     """x_0 and v_0, each (3n,), after the experiment's start rule."""
     velocity = experiment.start_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()

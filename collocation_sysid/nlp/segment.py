@@ -20,7 +20,7 @@ from .dynamics import Dynamics
 from .hessian_layout import HessianLayout
 from .local import Local
 from .observation import Observation
-from .parameters import Parameters, Theta
+from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
 from .setting import Setting
 
@@ -33,10 +33,8 @@ class Segment:
     experiment : Experiment
     scheme : str
     substeps : int
-    theta : Theta
-        Where the constraints are scaled.
-    nq : int
-        Number of estimated parameters.
+    parameters : Parameters
+        At their guess the constraints are scaled.
     explicit_grasps : bool
         Grasped nodes get rows of their own instead of bounds. Those that are held only for a
         while always do.
@@ -45,6 +43,8 @@ class Segment:
 
     Attributes
     ----------
+    constants : ThetaMap
+        The body's constants as functions of q.
     local : Local
         The experiment's own unknowns φ.
     rows_per_time : int
@@ -57,14 +57,14 @@ class Segment:
         experiment: Experiment,
         scheme: str,
         substeps: int,
-        theta: Theta,
-        nq: int,
+        parameters: Parameters,
         explicit_grasps: bool = False,
         huber: float | None = None,
     ) -> None:
         self.experiment = experiment
-        self.nq = nq
+        self.nq = len(parameters.free)
         self.body = experiment.body
+        self.constants = ThetaMap(parameters, self.body)
         self.dynamics = Dynamics.of(experiment, scheme, substeps)
         grid = self.dynamics.t_s
         self.local = Local.of(experiment)
@@ -90,7 +90,9 @@ class Segment:
         self.length_m = float(
             np.linalg.norm(np.diff(self.body.nodes_m[self.body.mesh.edges], axis=1), axis=2).mean()
         )
-        self.force_n = self.length_m * self._typical_stiffness(theta)
+        self.force_n = self.length_m * self._typical_stiffness(
+            self.constants.theta(parameters.guess_q)
+        )
 
     @property
     def grid_rows(self) -> int:
@@ -139,9 +141,9 @@ class Segment:
         """Positions in (q, φ) of the parameters that change the motion."""
         return np.concatenate([np.arange(self.nq), self.nq + self.local.moving])
 
-    def setting(self, parameters: Parameters, q: Array, phi: Array) -> Setting:
+    def setting(self, q: Array, phi: Array) -> Setting:
         """The physical parameters at (q, φ)."""
-        theta_q, theta_qq = parameters.theta_derivatives(q)
+        theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
         gravity_phi_phi = np.zeros((3, 0, 0))
         moving = self.local.moving
@@ -149,9 +151,8 @@ class Segment:
             gravity, first, second = self.local.gravity(phi)
             dynamics = dynamics.under_gravity(gravity - self.local.gravity_m_s2)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
-        return Setting(
-            parameters.theta(q), theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi
-        )
+        theta = self.constants.theta(q)
+        return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi)
 
     def corrected(self, phi: Array) -> Experiment:
         """The experiment in the body's frame: gravity turned by φ."""
@@ -397,7 +398,7 @@ class Segment:
         starts = (np.arange(self.grid_rows) - self.dynamics.first_row) * self.rows_per_time
         return np.maximum(starts, -1) if self.dynamics.first_row else starts
 
-    def _typical_stiffness(self, theta: Theta) -> float:
+    def _typical_stiffness(self, theta: Array) -> float:
         """Mean of |∂c_t/∂x_t| on the diagonal, at the undeformed shape [N/m]."""
         at_rest = self.body.nodes_m[None]
         forces = self.body.linearise(at_rest, np.zeros_like(at_rest), theta)

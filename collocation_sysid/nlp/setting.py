@@ -8,7 +8,6 @@ import numpy as np
 
 from ..arrays import Array
 from .dynamics import Dynamics
-from .parameters import Theta
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,13 +16,13 @@ class Setting:
 
     Attributes
     ----------
-    theta : Theta
-    theta_q, theta_qq : (4, nq) and (4, nq, nq) derivatives of θ
+    theta : (k,) constants of the body
+    theta_q, theta_qq : (k, nq) and (k, nq, nq) derivatives of θ
     dynamics : Dynamics under that gravity
     gravity_phi, gravity_phi_phi : (3, m) and (3, m, m) derivatives of gravity by the φ that turn it
     """
 
-    theta: Theta
+    theta: Array
     theta_q: Array
     theta_qq: Array
     dynamics: Dynamics
@@ -35,7 +34,7 @@ class Setting:
 
         Parameters
         ----------
-        by_theta : (…, 3n, 4) of the internal forces
+        by_theta : (…, 3n, k) of the internal forces
         weighed_kg : (…, 3n) mass that gravity pulls at
         """
         of_q = by_theta @ self.theta_q

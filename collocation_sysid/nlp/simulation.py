@@ -15,7 +15,7 @@ from .dynamics import Dynamics
 from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
-from .parameters import Parameters, as_theta
+from .parameters import Parameters, theta_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Trajectory:
 
 def simulate(
     experiment: Experiment,
-    parameters: Parameters | Mapping[str, float] | Sequence[float],
+    parameters: Parameters | Mapping[str, float] | Sequence[float] | Array,
     integrator: str = "newmark",
     timestep_s: float | None = None,
     substeps: int = 1,
@@ -50,7 +50,7 @@ def simulate(
     Parameters
     ----------
     experiment : Experiment
-    parameters : Parameters (their guesses), a mapping by name, or (λ, μ, γ_r, γ_m)
+    parameters : Parameters (their guesses), values by name, or θ in the order of the body
     integrator : str
         "newmark", or a scheme of `schemes.SCHEMES` on the collocation grid.
     timestep_s : float, optional
@@ -72,7 +72,7 @@ def simulate(
     SimulationError
         When a step fails even after halvings; names time and element.
     """
-    theta = as_theta(parameters)
+    theta = theta_of(experiment.body, parameters)
     if timestep_s is not None and not timestep_s > 0:
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if substeps < 1:

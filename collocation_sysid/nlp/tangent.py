@@ -27,7 +27,6 @@ from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
-from .parameters import Theta
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
@@ -178,7 +177,7 @@ class BlockSolver:
             yield row
 
     @one_blas_thread()
-    def backward(self, x: Array, theta: Theta, gradient: Array) -> Array:
+    def backward(self, x: Array, theta: Array, gradient: Array) -> Array:
         """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].
 
         Dofs that a passing grasp holds have zeros.
@@ -244,7 +243,7 @@ class BlockSolver:
         return self._matrix @ columns
 
     def _steps(
-        self, x: Array, theta: Theta, backward: bool = False, first: int = 0
+        self, x: Array, theta: Array, backward: bool = False, first: int = 0
     ) -> Iterator[_Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
         dynamics, body = self.dynamics, self.body

@@ -21,8 +21,8 @@ from ..arrays import Array
 from ..fem.batched import Batch, Evaluator, make_evaluator
 from ..fem.body import Body
 from ..fem.elements import Element
-from ..fem.expressions import THETA, PointKernel
-from ..fem.materials import Energy
+from ..fem.expressions import PointKernel
+from ..fem.materials import Material
 
 NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
@@ -34,47 +34,52 @@ class ElementFields:
     Attributes
     ----------
     body : Body
-    lambda_pa, mu_pa : float
+    theta : (k,) its constants
     """
 
     body: Body
-    lambda_pa: float
-    mu_pa: float
-    _evaluator: Evaluator
+    theta: Array
+    _evaluators: Sequence[Evaluator]
     _volumes: Array
 
     @classmethod
-    def of(cls, body: Body, lambda_pa: float, mu_pa: float) -> ElementFields:
-        """Compile the fields of a body's material."""
-        kernel = field_kernel(body.element, body.material)
-        cells = len(body.cells)
-        # Every element has a place of its own, where its points add up.
-        places = len(NAMES) * np.arange(cells)[:, None] + np.arange(len(NAMES))
-        batch = Batch(kernel, body.cells, body.geometry, places, len(NAMES) * cells)
+    def of(cls, body: Body, theta: Array) -> ElementFields:
+        """Compile the fields of a body's materials."""
+        evaluators = []
+        for part in body.parts:
+            kernel = field_kernel(body.element, part.material)
+            # Every element has a place of its own, where its points add up.
+            places = len(NAMES) * part.cells[:, None] + np.arange(len(NAMES))
+            width = len(NAMES) * len(body.cells)
+            batch = Batch(kernel, body.cells[part.cells], body.geometry[part.cells], places, width)
+            evaluators.append(make_evaluator(batch, body.evaluator))
         volumes = body.geometry[:, :, -1].sum(axis=1)
-        return cls(body, lambda_pa, mu_pa, make_evaluator(batch, body.evaluator), volumes)
+        return cls(body, theta, evaluators, volumes)
 
     def at(self, positions_m: ArrayLike) -> dict[str, Array]:
         """The fields by `NAMES`, (T, E) each, at positions (T, n, 3).
 
         An inverted element has no logarithm of its J: what needs one is NaN there.
         """
-        x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, self.body.nodes_m.size)
+        body = self.body
+        x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
         sums = np.empty((len(x), len(NAMES) * len(self._volumes)))
-        theta = np.array([self.lambda_pa, self.mu_pa, 0.0])
-        self._evaluator([x], theta, sums, self.body.threads)
+        shares = body.split(self.theta)
+        for k, (part, evaluate) in enumerate(zip(body.parts, self._evaluators, strict=True)):
+            constants = np.array(shares[k][: len(part.material.constants)], dtype=float)
+            evaluate([x], constants, sums, body.threads, add=k > 0)
         means = sums.reshape(len(x), -1, len(NAMES)) / self._volumes[:, None]
         return {name: means[:, :, k] for k, name in enumerate(NAMES)}
 
 
-def field_kernel(element: Element, energy: Energy) -> PointKernel:
+def field_kernel(element: Element, material: Material) -> PointKernel:
     """The fields at a quadrature point times its volume, see `expressions` for the inputs."""
     x = ca.SX.sym("x", 3 * element.nodes)
     geometry = ca.SX.sym("geometry", 3 * element.nodes + 1)
-    theta = ca.SX.sym("theta", len(THETA))
+    theta = ca.SX.sym("theta", len(material.constants))
     gradients = ca.reshape(geometry[:-1], 3, element.nodes)
     f = ca.vec(ca.reshape(x, 3, element.nodes) @ gradients.T)
-    values = ca.substitute(ca.vertcat(*_point_fields(energy, theta)), _F, f)
+    values = ca.substitute(ca.vertcat(*_point_fields(material, theta)), _F, f)
     pieces = ca.densify(geometry[-1] * values)
     inputs: Sequence[ca.SX] = (x, geometry, theta)
     function = ca.Function(
@@ -86,11 +91,11 @@ def field_kernel(element: Element, energy: Energy) -> PointKernel:
 _F = ca.SX.sym("F", 9)
 
 
-def _point_fields(energy: Energy, theta: ca.SX) -> tuple[ca.SX, ...]:
+def _point_fields(material: Material, theta: ca.SX) -> tuple[ca.SX, ...]:
     """J, ψ and the von Mises stress at the deformation gradient `_F`, column after column."""
     f = ca.reshape(_F, 3, 3)
     j = ca.det(f)
-    psi = energy(f, theta[0], theta[1])
+    psi = material.psi(f, theta)
     cauchy = ca.reshape(ca.gradient(psi, _F), 3, 3) @ f.T / j
     deviator = cauchy - ca.trace(cauchy) / 3 * ca.SX.eye(3)
     return j, psi, ca.sqrt(1.5 * ca.sumsqr(deviator))

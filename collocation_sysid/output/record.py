@@ -24,11 +24,12 @@ from ..rollout import Rollout
 from ..run import Run
 from ..statistics.estimates import Estimate
 from ..statistics.identifiability import verdicts
+from ..statistics.linearised import Derived
 from .fields import ElementFields
 from .replay import Replay
 from .writers import run_folder, write_frames
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
@@ -64,7 +65,7 @@ def _write_pictures(finished: Run, seen: Sequence[Replay], place: Path) -> None:
 
 
 def _write_all_frames(solution: Solution, place: Path) -> None:
-    collocation, theta = solution.collocation, solution.theta
+    collocation = solution.collocation
     segments = collocation.segments
     for segment, positions, violations in zip(
         segments, solution.positions_m, collocation.violations_n(solution.z), strict=True
@@ -82,7 +83,7 @@ def _write_all_frames(solution: Solution, place: Path) -> None:
             body.element,
             body.nodes_m,
             {"residual_force_n": residual.reshape(positions.shape)},
-            fields=ElementFields.of(body, theta.lambda_pa, theta.mu_pa),
+            fields=ElementFields.of(body, body.theta(solution.parameters)),
         )
 
 
@@ -113,7 +114,9 @@ def _natural_hz(experiment: Experiment, solution: Solution) -> Array | None:
         return None
     scheme = scheme_named(solution.collocation.scheme)
     try:
-        motion = motion_of(experiment, scheme, experiment.timestep_s, solution.theta)
+        motion = motion_of(
+            experiment, scheme, experiment.timestep_s, experiment.body.theta(solution.parameters)
+        )
     except SimulationError:
         return None
     return np.array([mode.frequency_hz for mode in motion.modes])
@@ -191,7 +194,7 @@ def result(finished: Run) -> dict[str, Any]:
                 "loss": line.loss,
                 "rms_m": line.rms_m,
                 "violation_n": line.violation_n,
-                "theta": list(line.theta),
+                "parameters": line.parameters,
                 "time_s": line.time_s,
             }
             for line in solution.history
@@ -230,7 +233,7 @@ def _parameters(finished: Run) -> dict[str, Any]:
         item.name: {
             "value": values[item.name],
             "guess": item.guess,
-            "fixed": item.fixed,
+            "fixed": item.fixed or item.tied is not None,
             **_error_bar(estimates.get(item.name, Estimate(values[item.name]))),
         }
         for item in parameters.items
@@ -239,8 +242,10 @@ def _parameters(finished: Run) -> dict[str, Any]:
 
 def _derived(finished: Run) -> dict[str, Any]:
     if finished.uncertainty is None:
-        theta = finished.solution.theta
-        return {"young_pa": {"value": theta.young_pa}, "poisson": {"value": theta.poisson}}
+        solution = finished.solution
+        constants = (segment.constants for segment in solution.collocation.segments)
+        derived = Derived.of(constants, solution.q)
+        return {name: {"value": value} for name, value in derived.values.items()}
     return {
         name: {"value": estimate.value, **_error_bar(estimate)}
         for name, estimate in finished.uncertainty.derived.items()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from ..methods.solution import Iteration
-from ..nlp.parameters import Theta
 from .pictures import Confidence, album, save_pictures
 from .replay import damaged, read_run
 
@@ -37,6 +36,6 @@ def _iteration(line: dict[str, Any]) -> Iteration:
         line["loss"],
         line["rms_m"],
         line["violation_n"],
-        Theta(*line["theta"]),
+        line["parameters"],
         line["time_s"],
     )

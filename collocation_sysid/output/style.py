@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
 
+from ..fem.constants import symbol_of
+
 # Okabe & Ito's palette, distinguishable with any colour vision.
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -29,17 +31,16 @@ COLUMN_MM = 85.0
 PAGE_MM = 178.0
 RESOLUTION_DPI = 200
 
-# Symbol and unit of every parameter.
-SYMBOLS = {
-    "lambda_pa": (r"$\lambda$", "Pa"),
-    "mu_pa": (r"$\mu$", "Pa"),
-    "young_pa": ("$E$", "Pa"),
-    "poisson": (r"$\nu$", ""),
-    "gamma_r_s": (r"$\gamma_r$", "s"),
-    "gamma_m_1_s": (r"$\gamma_m$", "1/s"),
-}
 
 _GREY = "#606060"
+
+
+def mathematical(name: str) -> str:
+    """The symbol of a parameter as matplotlib sets it, with its region behind."""
+    symbol, _, region = symbol_of(name).partition(" ")
+    letter, _, index = symbol.partition("_")
+    written = rf"${letter}_{{\mathrm{{{index}}}}}$" if index else f"${symbol}$"
+    return f"{written} {region}".strip()
 
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:

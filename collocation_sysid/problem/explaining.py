@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -141,13 +141,16 @@ def _inside(place: Any, part: Part) -> Any:
 def _field(key: Sequence[Part]) -> tuple[FieldInfo | None, int]:
     """The deepest field of the schema on the way to a key, and how many parts lead to it."""
     model: type[BaseModel] | None = ProblemFile
-    field, depth = None, 0
+    field, depth, named = None, 0, False
     for count, part in enumerate(key, start=1):
         if isinstance(part, int):
             continue
+        if field is not None and get_origin(field.annotation) is dict and not named:
+            named = True  # a name of the user's, such as a parameter's
+            continue
         if model is None or part not in model.model_fields:
             break
-        field, depth = model.model_fields[part], count
+        field, depth, named = model.model_fields[part], count, False
         model = _model_in(field.annotation)
     return field, depth
 

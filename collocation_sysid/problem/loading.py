@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -11,22 +11,12 @@ from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
 from ..fem.mesh import TetMesh
-from ..nlp.parameters import DAMPING, ENGINEERING, LAME, Parameter, Parameters
+from ..nlp.parameters import Parameters, Tied, Unknown
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file
-from .schema import ObjectSection, ParameterSection, ParametersSection, ProblemFile
+from .schema import ObjectSection, ParameterSection, ProblemFile
 
 T = TypeVar("T")
-
-# Bounds of parameters that state none: wide enough for foams and rubbers alike.
-DEFAULT_BOUNDS = {
-    "lambda_pa": (1.0, 1e9),
-    "mu_pa": (1.0, 1e9),
-    "young_pa": (1.0, 1e9),
-    "poisson": (1e-3, 0.495),
-    "gamma_r_s": (1e-7, 10.0),
-    "gamma_m_1_s": (1e-4, 1e4),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +70,7 @@ def load_problem(
     folder = path.parent
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
     body = _located(path, "object", lambda: _load_body(file.object, mesh))
-    parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters))
+    parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))
     experiments, notes = [], list(mesh.notes)
     for section in file.experiment:
         reader = RecordingReader(section, folder, body, parameters, simulation)
@@ -124,25 +114,27 @@ def _load_body(section: ObjectSection, mesh: TetMesh) -> Body:
     )
 
 
-def _load_parameters(section: ParametersSection) -> Parameters:
-    elastic = LAME if section.lambda_pa is not None else ENGINEERING
-    return Parameters(
-        tuple(_load_parameter(name, getattr(section, name)) for name in elastic + DAMPING)
-    )
+def _load_parameters(given: Mapping[str, ParameterSection | float], body: Body) -> Parameters:
+    parameters = Parameters.of({name: _stated(section) for name, section in given.items()})
+    parameters.fit([body])
+    return parameters
 
 
-def _load_parameter(name: str, section: ParameterSection) -> Parameter:
+def _stated(section: ParameterSection | float) -> Unknown | Tied | float:
+    """A parameter as the file states it."""
+    if not isinstance(section, ParameterSection):
+        return section
     if section.fixed is not None:
-        return Parameter(name, section.fixed, fixed=True)
+        return section.fixed
+    if section.tied_to is not None:
+        return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
     assert section.guess is not None  # by the schema
-    low, high = DEFAULT_BOUNDS[name]
-    prior = None if section.prior is None else (section.prior.mean, section.prior.relative)
-    try:
-        return Parameter(
-            name, section.guess, section.lower or low, section.upper or high, prior=prior
-        )
-    except InputError as error:
-        if section.lower is not None and section.upper is not None:
-            raise
-        message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
-        raise InputError(message, None, name) from error
+    prior = section.prior
+    return Unknown(
+        section.guess,
+        section.lower,
+        section.upper,
+        None if prior is None else (prior.mean, prior.relative or prior.deviation or 0.0),
+        section.scale,
+        section.typical,
+    )

@@ -92,15 +92,29 @@ def _apply(content: dict[str, Any], override: str) -> None:
             f"found {override!r}, expected key=value such as parameters.mu_pa.guess=200", "--set"
         )
     place: Any = content
-    for part in parts[:-1]:
+    *leading, last = _as_written(content, parts)
+    for part in leading:
         place = _descend(place, part, key)
-    last = parts[-1]
     if isinstance(place, list):
         place[_index(place, last, key)] = _value(value, key)
     elif isinstance(place, dict):
         place[last] = _value(value, key)
     else:
         raise _no_table(place, key)
+
+
+def _as_written(content: Any, parts: list[str]) -> list[str]:
+    """The parts of a key, those joined that the file has as one key, such as "core.mu_pa"."""
+    joined, place = [], content
+    while parts:
+        count = 1
+        if isinstance(place, dict):
+            several = range(len(parts), 1, -1)
+            count = next((n for n in several if ".".join(parts[:n]) in place), 1)
+        joined.append(".".join(parts[:count]))
+        parts = parts[count:]
+        place = place.get(joined[-1]) if isinstance(place, dict) else None
+    return joined
 
 
 def _descend(place: Any, part: str, key: str) -> Any:

@@ -31,7 +31,7 @@ from ..experiment import (
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
 from ..nlp.newton import Solver
-from ..nlp.parameters import Parameters
+from ..nlp.parameters import Parameters, theta_of
 from ..nlp.rest import start_state
 from .recording_schema import (
     EstimateSection,
@@ -329,7 +329,7 @@ class RecordingReader:
         return experiment
 
     def _start_shape(self, experiment: Experiment) -> Array:
-        theta = self.parameters.theta(self.parameters.guess_q)
+        theta = theta_of(self.body, self.parameters)
         try:
             x, _ = start_state(experiment, theta, Solver(experiment))
         except SimulationError:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from ..checked import Flag, NotNegative, Positive, Text, Whole
+from ..checked import Finite, Flag, Positive, Text, Whole
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..methods import METHODS
@@ -57,55 +57,85 @@ class ObjectSection(Section):
 
 
 class PriorSection(Section):
-    """A normal prior on the logarithm of a parameter."""
+    """A normal prior: on the logarithm of a positive parameter, or on a linear one."""
 
-    mean: Positive
-    relative: Positive = Field(description="Relative standard deviation, such as 0.2 for 20 %.")
+    mean: Finite
+    relative: Positive | None = Field(
+        None, description="Relative standard deviation, such as 0.2 for 20 %."
+    )
+    deviation: Positive | None = Field(
+        None, description="Standard deviation of a linear parameter, in its unit."
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> PriorSection:
+        require_one(self, "relative", "deviation")
+        return self
 
 
 class ParameterSection(Section):
-    """One parameter: estimated from a guess within bounds, or fixed."""
+    """One parameter: estimated from a guess within bounds, fixed, or tied to another."""
 
-    guess: Positive | None = None
-    lower: Positive | None = None
-    upper: Positive | None = None
-    fixed: NotNegative | None = Field(None, description="Value that is not estimated.")
+    guess: Finite | None = None
+    lower: Finite | None = None
+    upper: Finite | None = None
+    fixed: Finite | None = Field(None, description="Value that is not estimated.")
     prior: PriorSection | None = None
+    scale: Literal["log", "linear"] | None = Field(
+        None, description="Estimate the logarithm, or the number itself, which may be negative."
+    )
+    typical: Positive | None = Field(
+        None, description="What a linear parameter may change by in a step."
+    )
+    tied_to: Text | None = Field(None, description="Parameter that this one is a multiple of.")
+    ratio: Finite | None = Field(None, description="The multiple, 1 by default.")
 
     @model_validator(mode="after")
-    def _guess_or_fixed(self) -> ParameterSection:
-        require_one(self, "guess", "fixed")
-        useless = given_keys(self, "lower", "upper", "prior")
-        if self.fixed is not None and useless:
+    def _one_kind(self) -> ParameterSection:
+        require_one(self, "guess", "fixed", "tied_to")
+        of_kind = {
+            "guess": ("lower", "upper", "prior", "scale", "typical"),
+            "fixed": (),
+            "tied_to": ("ratio",),
+        }
+        kind = next(key for key in of_kind if getattr(self, key) is not None)
+        others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
+        if useless := given_keys(self, *(n for n in type(self).model_fields if n in others)):
+            instead = "guess in its place to estimate the parameter"
             raise ValueError(
-                f"found fixed beside {', '.join(useless)}; expected fixed alone, or guess in its "
-                "place to estimate the parameter"
+                f"found {kind} beside {', '.join(useless)}; expected {kind} alone, or {instead}"
             )
         return self
 
 
-class ParametersSection(Section):
-    """λ and μ, or E and ν, and the two dampings."""
+def _parameter_form(value: Any) -> str:
+    return "<table>" if isinstance(value, dict) else "<value>"
 
-    lambda_pa: ParameterSection | None = Field(None, description="First Lamé parameter λ [Pa].")
-    mu_pa: ParameterSection | None = Field(None, description="Shear modulus μ [Pa].")
-    young_pa: ParameterSection | None = Field(None, description="Young's modulus E [Pa].")
-    poisson: ParameterSection | None = Field(None, description="Poisson's ratio ν.")
-    gamma_r_s: ParameterSection = Field(description="Stiffness-proportional damping γ_r [s].")
-    gamma_m_1_s: ParameterSection = Field(description="Mass-proportional damping γ_m [1/s].")
 
-    @model_validator(mode="after")
-    def _one_pair(self) -> ParametersSection:
-        given = given_keys(self, "lambda_pa", "mu_pa", "young_pa", "poisson")
-        if given not in (["lambda_pa", "mu_pa"], ["young_pa", "poisson"]):
-            raise ValueError(
-                f"the elastic parameters are {', '.join(given) or 'missing'}; "
-                "expected lambda_pa and mu_pa, or young_pa and poisson"
-            )
-        for name in ("mu_pa", "young_pa"):
-            if name in given and getattr(self, name).fixed == 0:
-                raise ValueError(f"found {name} = {{ fixed = 0 }}; expected a stiffness above 0")
-        return self
+def _flat(given: Any, front: str = "") -> Any:
+    """Regions' parameters, ``core.mu_pa``, also where they are written as tables in a table."""
+    if not isinstance(given, dict):
+        return given
+    flat: dict[str, Any] = {}
+    for name, value in given.items():
+        nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
+        inner = _flat(value, f"{front}{name}.") if nested and value else {f"{front}{name}": value}
+        if twice := set(inner) & set(flat):
+            raise ValueError(f"{twice.pop()!r} is given twice; expected one value")
+        flat |= inner
+    return flat
+
+
+Parameters = Annotated[
+    dict[
+        str,
+        Annotated[
+            Annotated[ParameterSection, Tag("<table>")] | Annotated[Finite, Tag("<value>")],
+            Discriminator(_parameter_form),
+        ],
+    ],
+    BeforeValidator(_flat),
+]
 
 
 class TranscriptionSection(Section):
@@ -227,7 +257,9 @@ class ProblemFile(Section):
 
     title: str = ""
     object: ObjectSection
-    parameters: ParametersSection
+    parameters: Parameters = Field(
+        description="Names of the model's constants, each with a guess, a fixed value or a tie."
+    )
     experiment: list[ExperimentSection] = Field(
         min_length=1, description="At least one [[experiment]] table, one for each recording."
     )
@@ -246,10 +278,11 @@ class ProblemFile(Section):
 
     @model_validator(mode="after")
     def _profiles_are_of_estimated_parameters(self) -> ProblemFile:
-        given = {
-            name: getattr(self.parameters, name) for name in type(self.parameters).model_fields
-        }
-        free = [name for name, section in given.items() if section and section.fixed is None]
+        free = [
+            name
+            for name, section in self.parameters.items()
+            if isinstance(section, ParameterSection) and section.guess is not None
+        ]
         for name in self.uncertainty.profile:
             if name not in free:
                 raise ValueError(

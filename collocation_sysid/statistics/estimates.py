@@ -1,7 +1,8 @@
 """Values with error bars, in the user's parameters and in the other elastic convention.
 
-The logarithm of a parameter is taken as normal (or Student's t), for Poisson's ratio
-ln ν/(½ − ν) = ln λ/μ is: intervals stay within what is physically possible. A number after ± is
+The logarithm of a positive parameter is taken as normal (or Student's t), for Poisson's ratio
+ln ν/(½ − ν) = ln λ/μ is: intervals stay within what is physically possible. A parameter that may
+be negative is taken as normal itself. A number after ± is
 given only where it tells something; else the estimate has a reason instead.
 """
 
@@ -13,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.parameters import ENGINEERING, LAME, Parameters, Theta
+from ..fem.constants import bare
+from ..nlp.parameters import Parameter, Parameters
+from .linearised import Derived
 
 Mask = NDArray[np.bool_]
 
@@ -74,41 +77,48 @@ def user_estimates(
     partners = np.abs(np.nan_to_num(correlation_of(of_q)))
     np.fill_diagonal(partners, 0.0)
     for k, item in enumerate(parameters.free):
-        value = float(np.exp(q[k]))
+        value = item.value(float(q[k]))
         if bounded[k]:
             found[item.name] = _at_bound(value)
             continue
         deviation = float(np.sqrt(of_q[k, k]))
-        estimate = _estimate(item.name, value, deviation, float(quantiles[k]))
+        estimate = _of_parameter(item, value, deviation, float(quantiles[k]))
         other = int(np.argmax(partners[k]))
+        relative = deviation * item.per_value(value) / max(abs(value), 1e-300)
         if estimate.std_error is None or estimate.ci95 is None:
             pass
         elif estimate.ci95[0] <= item.lower and estimate.ci95[1] >= item.upper:
             reason = "its 95 % interval covers the whole range between its bounds"
             estimate = Estimate(value, None, estimate.ci95, reason=reason)
-        elif partners[k, other] > CONFOUNDED and deviation > CONFOUNDED_DEVIATION:
+        elif partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION:
             reason = (
                 f"confounded with {parameters.free[other].name} "
                 f"(correlation {correlation_of(of_q)[k, other]:.3f})"
             )
             estimate = Estimate(value, None, estimate.ci95, reason=reason)
         found[item.name] = estimate
+    for item in parameters.items:
+        if item.tied is not None:
+            found[item.name] = _multiplied(found[item.tied.to], item.tied.ratio)
     return found
 
 
+def relative_slopes(parameters: Parameters, q: Array) -> Array:
+    """(nq,) derivative of each parameter by its q over its size: one for a logarithm."""
+    slopes = []
+    for item, coordinate in zip(parameters.free, q, strict=True):
+        value = item.value(float(coordinate))
+        slopes.append(item.per_value(value) / max(abs(value), 1e-300))
+    return np.array(slopes)
+
+
 def derived_estimates(
-    parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
+    derived: Derived, of_q: Array, bounded: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
-    """(E, ν) if the user works with (λ, μ) and the other way round, by the delta method."""
-    theta = parameters.theta(q)
-    theta_q, _ = parameters.theta_derivatives(q)
-    if parameters.names[:2] == LAME:
-        names, gradients = ENGINEERING, _engineering_by_lame(theta) @ theta_q[:2]
-    else:
-        names, gradients = LAME, theta_q[:2]
+    """Estimates of the moduli that follow from the parameters, by the delta method."""
     found = {}
-    for name, gradient in zip(names, gradients, strict=True):
-        value = float(getattr(theta, name))
+    for name, value in derived.values.items():
+        gradient = derived.by_q[name]
         used = np.flatnonzero(gradient)
         if bounded[used].any():
             found[name] = _at_bound(value)
@@ -121,6 +131,30 @@ def derived_estimates(
     return found
 
 
+def _of_parameter(item: Parameter, value: float, deviation: float, quantile: float) -> Estimate:
+    """An estimate whose q has this standard deviation."""
+    if item.scale == "log":
+        return _estimate(item.name, value, deviation, quantile)
+    if bare(item.name) == "poisson" and value > 0:
+        return _estimate(item.name, value, deviation * item.unit / value, quantile)
+    if not deviation <= UNDETERMINED:
+        return Estimate(value, reason="the data do not determine it")
+    spread = deviation * item.unit
+    return Estimate(value, spread, (value - quantile * spread, value + quantile * spread))
+
+
+def _multiplied(estimate: Estimate, ratio: float) -> Estimate:
+    """The estimate of a multiple."""
+    ends = estimate.ci95 and sorted((ratio * estimate.ci95[0], ratio * estimate.ci95[1]))
+    return Estimate(
+        ratio * estimate.value,
+        None if estimate.std_error is None else abs(ratio) * estimate.std_error,
+        None if not ends else (ends[0], ends[1]),
+        estimate.at_bound,
+        estimate.reason,
+    )
+
+
 def _at_bound(value: float) -> Estimate:
     return Estimate(
         value, at_bound=True, reason="it ended at a bound, or follows from one that did"
@@ -131,7 +165,7 @@ def _estimate(name: str, value: float, deviation: float, quantile: float) -> Est
     """An estimate whose logarithm has this standard deviation."""
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
-    if name == "poisson":
+    if bare(name) == "poisson":
         odds = value / (0.5 - value)
         low, high = _around(odds, deviation * 0.5 / (0.5 - value), quantile)
         low, high = 0.5 - 0.5 / (1 + low), 0.5 - 0.5 / (1 + high)
@@ -148,11 +182,3 @@ def _estimate(name: str, value: float, deviation: float, quantile: float) -> Est
 def _around(value: float, deviation: float, quantile: float) -> tuple[float, float]:
     spread = float(np.exp(min(quantile * deviation, UNDETERMINED)))
     return value / spread, value * spread
-
-
-def _engineering_by_lame(theta: Theta) -> Array:
-    """∂(E, ν)/∂(λ, μ)."""
-    first, second = theta.lambda_pa, theta.mu_pa
-    young = (second**2, 3 * first**2 + 4 * first * second + 2 * second**2)
-    poisson = (second / 2, -first / 2)
-    return np.array([young, poisson]) / (first + second) ** 2

@@ -1,8 +1,8 @@
 """What the data fix, and what they leave open, in words.
 
-Directions are those of the marginal covariance of the logarithms q. Scaled to unit variances it
-is the correlation matrix; an eigenvalue ε ≪ 1 belongs to a combination Σ w_k q_k, that is a
-product of powers of the parameters, which is known √ε times better than each of them alone.
+Directions are those of the marginal covariance of the parameters' logarithms. Scaled to unit
+variances it is the correlation matrix; an eigenvalue ε ≪ 1 belongs to a combination Σ w_k q_k, that
+is a product of powers of the parameters, which is known √ε times better than each of them alone.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.parameters import ENGINEERING, LAME
+from ..fem.constants import bare
+from ..fem.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
 from .uncertainty import Uncertainty
 
@@ -91,7 +92,7 @@ def _combination(
 
 
 def _other_convention(uncertainty: Uncertainty) -> list[str]:
-    if not {*LAME, *ENGINEERING} & set(uncertainty.names):
+    if not set(ELASTIC) & {bare(name) for name in uncertainty.names}:
         return []
     parts = []
     for name, estimate in uncertainty.derived.items():

@@ -6,8 +6,8 @@ possibly local ones of single experiments, such as the offset of a marker on the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..nlp.collocation import Collocation
+from ..nlp.parameters import ThetaMap
 from .sensitivity import marker_sensitivities
 
 Mask = NDArray[np.bool_]
@@ -74,6 +75,31 @@ class FitBlock:
 
 
 @dataclass(frozen=True, eq=False)
+class Derived:
+    """Moduli that follow from the estimated parameters.
+
+    Attributes
+    ----------
+    values : by name
+    by_q : by name, (shared,) derivatives
+    """
+
+    values: Mapping[str, float]
+    by_q: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, constants: Iterable[ThetaMap], q: Array) -> Derived:
+        """Those of several bodies."""
+        values: dict[str, float] = {}
+        by_q: dict[str, Array] = {}
+        for each in constants:
+            found, slopes = each.derived(q)
+            values |= dict(zip(each.derived_names, found.tolist(), strict=True))
+            by_q |= dict(zip(each.derived_names, slopes, strict=True))
+        return cls(values, by_q)
+
+
+@dataclass(frozen=True, eq=False)
 class LinearisedFit:
     """The least-squares problem at its answer.
 
@@ -81,13 +107,15 @@ class LinearisedFit:
     ----------
     blocks : tuple of FitBlock
         One per fitted experiment.
-    names : (p,) the shared parameters first, whose logarithms are q; then local ones, with their
-        unit in brackets: ``"gravity/offset Tip1 x [m]"``
+    names : (p,) the shared parameters first, which are q; then local ones, with their unit in
+        brackets: ``"gravity/offset Tip1 x [m]"``
     shared : int
         Number of shared parameters.
     prior_residual, prior_slope : (p,) in units of the prior's deviation, zero without a prior
     at_bound : (p,) bool
         Parameters that ended at a bound.
+    derived : Derived
+        What follows from the shared parameters.
     """
 
     blocks: tuple[FitBlock, ...]
@@ -96,6 +124,7 @@ class LinearisedFit:
     prior_residual: Array
     prior_slope: Array
     at_bound: Mask
+    derived: Derived = field(default_factory=lambda: Derived({}, {}))
 
     @property
     def measurements(self) -> int:
@@ -163,6 +192,7 @@ def linearised_fit(
         prior_residual=prior_residual,
         prior_slope=prior_slope,
         at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
+        derived=Derived.of((s.constants for s in collocation.segments), p[: collocation.nq]),
     )
 
 

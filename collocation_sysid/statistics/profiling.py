@@ -8,7 +8,7 @@ from ..errors import InputError
 from ..methods import METHODS
 from ..methods.solution import Solution
 from ..nlp.collocation import Collocation
-from ..nlp.parameters import Parameter, Parameters
+from ..nlp.parameters import Parameter
 from .linearised import LinearisedFit
 from .profile import Profile, profile
 from .uncertainty import Uncertainty, uncertainty_of
@@ -57,12 +57,7 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
     """Smallest loss with one parameter at a value, the search starting at the answer."""
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
-    held = Parameters(
-        tuple(
-            Parameter(i.name, value, fixed=True) if i.name == item.name else i
-            for i in started.items
-        )
-    )
+    held = started.with_fixed({item.name: value})
     collocation = Collocation(
         [segment.experiment for segment in before.segments],
         held,
@@ -75,7 +70,9 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
         return float("inf")
     prior = 0.0
     if item.prior is not None:
-        prior = (np.log(value / item.prior[0]) / item.prior[1]) ** 2
+        mean, deviation = item.prior
+        away = np.log(value / mean) if item.scale == "log" else value - mean
+        prior = (away / deviation) ** 2
     return _loss(found) + float(prior)
 
 

@@ -34,6 +34,7 @@ from .estimates import (
     Estimate,
     correlation_of,
     derived_estimates,
+    relative_slopes,
     user_estimates,
 )
 from .linearised import AT_BOUND, LinearisedFit, linearised_fit
@@ -67,14 +68,15 @@ class Uncertainty:
     Attributes
     ----------
     names : (nq,) estimated parameters, in the order of q
-    covariance : (nq, nq) of q, with local parameters free
+    covariance : (nq, nq) of the parameters' logarithms, with local parameters free
+        Of a parameter that may be negative, of its deviation over its size.
         NaN in rows and columns of parameters at a bound, the others' is as if those were fixed;
         infinite variance where the data do not determine a parameter.
     correlation : (nq, nq) NaN likewise
-    quantiles : (nq,) half widths of the 95 % intervals of q, in standard deviations
+    quantiles : (nq,) half widths of the 95 % intervals, in standard deviations
         1.96, or Student's for a variance that was estimated.
-    estimates : by name, all four parameters of the user
-    derived : by name, the elastic pair of the other convention
+    estimates : by name, all parameters of the user
+    derived : by name, the moduli of the other convention
     local : by name, standard deviation of each parameter of a single experiment
         In the unit it is estimated in, that is deviations of its prior; NaN at a bound.
     noise : {"given", "estimated"}
@@ -154,7 +156,7 @@ def uncertainty_of(
     ----------
     fit : LinearisedFit
     parameters : Parameters
-    q : (nq,) logarithms of the estimated parameters at the answer
+    q : (nq,) the estimated parameters in the solver's coordinates at the answer
     noise : {"given", "estimated"}
         Trust the markers' σ, or scale it by the residuals. Estimate it when σ is not known; only
         the ratios between markers matter then.
@@ -190,13 +192,14 @@ def uncertainty_of(
     of_q[lost] = of_q[:, lost] = np.nan
     of_q[lost, lost] = np.inf
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
+    sizes = relative_slopes(parameters, q)
     return Uncertainty(
         names=fit.names[:shared],
-        covariance=of_q,
+        covariance=of_q * np.outer(sizes, sizes),
         correlation=correlation_of(of_q),
         quantiles=quantiles,
         estimates=estimates,
-        derived=derived_estimates(parameters, q, of_q, bounded, quantiles),
+        derived=derived_estimates(fit.derived, of_q, bounded, quantiles),
         local=dict(
             zip(fit.names[shared:], np.sqrt(np.diag(of_all)[shared:]).tolist(), strict=True)
         ),

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..problem import Problem, ProblemFile, read_problem_file
+from ..problem.schema import ParameterSection
 
 KEY_LENGTH = 20
 
@@ -168,8 +169,8 @@ def _planned(
 ) -> PlannedRun:
     guess = {
         name: section.guess
-        for name in type(file.parameters).model_fields
-        if (section := getattr(file.parameters, name)) is not None and section.guess is not None
+        for name, section in file.parameters.items()
+        if isinstance(section, ParameterSection) and section.guess is not None
     }
     content = file.model_dump(mode="json", exclude_unset=True)
     content.setdefault("solver", {})["method"] = method

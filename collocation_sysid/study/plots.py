@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
+from ..fem.constants import unit_of
 from ..output.style import (
     BLACK,
     BLUE,
@@ -19,11 +20,11 @@ from ..output.style import (
     LINE_PT,
     PAGE_MM,
     SMALL_PT,
-    SYMBOLS,
     TEXT_PT,
     VERMILION,
     dress,
     log_axis,
+    mathematical,
     new_figure,
 )
 from .plan import short_keys
@@ -152,9 +153,9 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Fig
                     label="success" if success else "failure",
                 )  # fmt: skip
             axes.plot(1, 1, "+", color=BLACK, ms=6, label="truth" if known else "best answer")
-            dress(axes, method if axes is line[0] else "", "", SYMBOLS[second][0])
+            dress(axes, method if axes is line[0] else "", "", mathematical(second))
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
-        axes.set_xlabel(SYMBOLS[first][0], fontsize=TEXT_PT)
+        axes.set_xlabel(mathematical(first), fontsize=TEXT_PT)
     _ratio_axes(panels[0, 0], max(distance(row, centre) for row in rows))
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(
@@ -178,7 +179,7 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
 
 
 def _labelled(name: str) -> str:
-    symbol, unit = SYMBOLS[name]
+    symbol, unit = mathematical(name), unit_of(name)
     return f"{symbol} [{unit}]" if unit else symbol
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..fem.constants import symbol_of, unit_of
 from ..output.record import as_json
-from ..terminal import UNITS
 from .plan import PlannedRun, short_keys
 from .plots import comparison_plots, sweep_plots
 from .store import Record, RunStore, write_whole
@@ -177,7 +177,7 @@ def comparison_views(summaries: Sequence[Row]) -> list[View]:
         "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
     }
     for name in errors:
-        symbol, _ = UNITS[name.removeprefix("error_")]
+        symbol = symbol_of(name.removeprefix("error_"))
         success[f"Δ{symbol} %"] = _number(name, 100)
     quality = {
         "violation N": _number("violation_n", 1, ".1e"),
@@ -208,7 +208,7 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:
     places = {short: _swept(key) for key, short in short_keys(swept)}
     estimates: dict[str, Cell] = {}
     for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
-        symbol, unit = UNITS[name]
+        symbol, unit = symbol_of(name), unit_of(name)
         estimates[f"{symbol} {unit}".strip()] = _estimate(name)
     quality = {
         "status": _text("status"),

@@ -40,6 +40,8 @@ class Batch:
 class Evaluator(Protocol):
     """Sums a batch's kernel over elements and quadrature points, for each timestep."""
 
-    def __call__(self, fields: Sequence[Array], theta: Array, out: Array, threads: int) -> None:
-        """Overwrite `out` (T, width) from `fields`, each (T, 3n) contiguous, and θ (3,)."""
+    def __call__(
+        self, fields: Sequence[Array], theta: Array, out: Array, threads: int, add: bool = False
+    ) -> None:
+        """Overwrite `out` (T, width), or add to it, from `fields`, each (T, 3n), and θ (k,)."""
         ...

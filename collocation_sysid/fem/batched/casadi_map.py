@@ -29,10 +29,13 @@ class CasadiEvaluator:
             shape=(batch.width, len(destinations)),
         )
 
-    def __call__(self, fields: Sequence[Array], theta: Array, out: Array, threads: int) -> None:
-        """Add up the kernel over elements and points into `out` (T, width), overwriting it."""
+    def __call__(
+        self, fields: Sequence[Array], theta: Array, out: Array, threads: int, add: bool = False
+    ) -> None:
+        """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
             outputs = self._mapped.call([*inputs, self._geometry, theta])
             stacked = np.concatenate([value.full() for value in outputs])
-            out[t] = self._sum @ stacked.ravel(order="F")
+            total = self._sum @ stacked.ravel(order="F")
+            out[t] = out[t] + total if add else total

@@ -50,7 +50,7 @@ class SimdEvaluator:
         self._fields = len(kernel.fields)
         source = f"{kernel.contractions} {kernel.pieces.serialize()}"
         key = f"{lanes} {self._points} {hashlib.sha256(source.encode()).hexdigest()}"
-        signature = [ctypes.c_int64] * 5 + [ctypes.c_void_p] * (self._fields + 5)
+        signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
         self._run = CompiledFunction(
             lambda: _Emitter(kernel, self._points, lanes).emit(),
             "run",
@@ -58,8 +58,10 @@ class SimdEvaluator:
             signature,
         )
 
-    def __call__(self, fields: Sequence[Array], theta: Array, out: Array, threads: int) -> None:
-        """Add up the kernel over elements and points into `out` (T, width), overwriting it."""
+    def __call__(
+        self, fields: Sequence[Array], theta: Array, out: Array, threads: int, add: bool = False
+    ) -> None:
+        """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         addresses = [field.ctypes.data for field in fields]
         constants = [
             self._geometry.ctypes.data,
@@ -71,7 +73,8 @@ class SimdEvaluator:
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
-            self._run(start, stop, self._blocks, stride, self._width, *addresses, *constants)
+            sizes = start, stop, self._blocks, stride, self._width, int(add)
+            self._run(*sizes, *addresses, *constants)
 
         in_slices(run, len(out), threads)
 
@@ -83,7 +86,7 @@ def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray
 
 
 class _Emitter:
-    """Writes ``run(t0, t1, blocks, field_stride, out_stride, fields…, geometry, …, out)``."""
+    """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out)``."""
 
     def __init__(self, kernel: PointKernel, points: int, lanes: int) -> None:
         self.sx = kernel.pieces
@@ -100,7 +103,7 @@ class _Emitter:
         ).tolist()
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
-        kind = ir.FunctionType(ir.VoidType(), [I64] * 5 + [DOUBLES] * self.fields + constants)
+        kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
         self.run = ir.Function(self.module, kind, "run")
         for argument in self.run.args:
             if isinstance(argument.type, ir.PointerType):
@@ -113,9 +116,9 @@ class _Emitter:
 
     def emit(self) -> ir.Module:
         b, args = self.builder, self.run.args
-        t0, t1, blocks, field_stride, out_stride = args[:5]
-        field_rows = args[5 : 5 + self.fields]
-        geometry, nodes, destinations, theta, out = args[5 + self.fields :]
+        t0, t1, blocks, field_stride, out_stride, add = args[:6]
+        field_rows = args[6 : 6 + self.fields]
+        geometry, nodes, destinations, theta, out = args[6 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         total = self.output_offsets[-1]
         outputs = self._buffer(total, "outputs")
@@ -126,7 +129,8 @@ class _Emitter:
         with counting(b, t0, t1, "t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
-            self._clear(out_row, out_stride)
+            with b.if_then(b.icmp_signed("==", add, I64(0))):
+                self._clear(out_row, out_stride)
             with counting(b, I64(0), blocks, "block") as block:
                 here = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
                 self._gather(rows, here, gathered)

@@ -21,10 +21,10 @@ from ..style import (
     COLUMN_MM,
     SKY,
     SMALL_PT,
-    SYMBOLS,
     TEXT_PT,
     dress,
     framed_figure,
+    mathematical,
 )
 from .scene import round_length
 
@@ -170,7 +170,7 @@ class _Scale:
 
 
 def _label(name: str) -> str:
-    return SYMBOLS[name][0]
+    return mathematical(name)
 
 
 def correlation_matrix(found: Confidence) -> Figure:

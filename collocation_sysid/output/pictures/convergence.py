@@ -10,27 +10,27 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ...arrays import Array
+from ...fem.constants import unit_of
 from ...methods.solution import Iteration
-from ...nlp.parameters import DAMPING, LAME
 from ..style import (
     BLACK,
     BLUE,
     COLUMN_MM,
     CYCLE,
     LINE_PT,
-    SYMBOLS,
     TEXT_PT,
     VERMILION,
     dress,
     framed_figure,
     legend_above,
     log_axis,
+    mathematical,
 )
 
 
 def convergence(
     history: Sequence[Iteration],
-    names: Sequence[str] = LAME + DAMPING,
+    names: Sequence[str] | None = None,
     truth: Mapping[str, float] | None = None,
 ) -> Figure:
     """Draw marker error, loss, violation of the dynamics and parameters against iteration.
@@ -39,7 +39,7 @@ def convergence(
     ----------
     history : sequence of Iteration
     names : sequence of str
-        Parameters to draw, in either convention.
+        Parameters to draw; all by default.
     truth : mapping, optional
         Parameters are drawn relative to these; by default to their final values.
     """
@@ -57,7 +57,8 @@ def convergence(
         axes.plot(numbers, _positive(values), "o-", ms=2.5, lw=LINE_PT, color=colour)
         dress(axes, "", "", label)
         log_axis(axes)
-    _draw_parameters(panels[3], history, names, truth)
+    drawn = list(history[0].parameters) if names is None and history else list(names or ())
+    _draw_parameters(panels[3], history, drawn, truth)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
     for axes in panels:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -75,8 +76,8 @@ def _draw_parameters(
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):
-        values = np.array([getattr(iteration.theta, name) for iteration in history], dtype=float)
-        symbol, unit = SYMBOLS[name]
+        values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
+        symbol, unit = mathematical(name), unit_of(name)
         reference = values[-1] if truth is None else truth[name]
         label = f"{symbol} = {values[-1]:.4g} {unit}"
         style = {"ms": 2.5, "lw": LINE_PT, "color": CYCLE[k % len(CYCLE)]}

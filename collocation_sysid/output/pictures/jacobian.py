@@ -13,7 +13,7 @@ from matplotlib.image import AxesImage
 
 from ...arrays import Array
 from ...nlp.collocation import Collocation
-from ..style import PAGE_MM, SMALL_PT, SYMBOLS, dress, framed_figure
+from ..style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
 
 SHOWN_STEPS = 6
 # Picture elements across a panel, and decades of magnitude told apart.
@@ -53,7 +53,9 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     _draw(middle, band, norm)
     image = _draw(right, block, norm)
     dress(left, "", "", "equations of motion")
-    left.set_xticks(np.arange(nq) + 0.5, [SYMBOLS[p.name][0] for p in collocation.parameters.free])
+    left.set_xticks(
+        np.arange(nq) + 0.5, [mathematical(p.name) for p in collocation.parameters.free]
+    )
     left.set_ylim(rows, 0)
     _tick_blocks(left, "y", "c", range(first, steps), height)
     dress(middle, f"{steps} of {segment.grid_rows} timesteps", "node positions")

@@ -13,15 +13,6 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from ...errors import InputError
 
-SYMBOLS = {
-    "lambda_pa": ("λ", "Pa"),
-    "mu_pa": ("μ", "Pa"),
-    "young_pa": ("E", "Pa"),
-    "poisson": ("ν", ""),
-    "gamma_r_s": ("γ_r", "s"),
-    "gamma_m_1_s": ("γ_m", "1/s"),
-}
-
 
 def rendered(template: str, **values: Any) -> str:
     """A page from a template of this folder; text is escaped."""

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from .page import SYMBOLS, millimetres, number, picture, read_json, rendered
+from ...fem.constants import symbol_of, unit_of
+from .page import millimetres, number, picture, read_json, rendered
 
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
 WORST, APART = 8, 5
@@ -89,13 +90,13 @@ def _notes(result: dict[str, Any]) -> list[str]:
 
 def _weakest(result: dict[str, Any]) -> list[str]:
     free = {name: p for name, p in result["parameters"].items() if not p["fixed"]}
-    unknown = [SYMBOLS[name][0] for name, p in free.items() if p["std_error"] is None]
+    unknown = [symbol_of(name) for name, p in free.items() if p["std_error"] is None]
     said = [f"No error bar for {', '.join(unknown)}: see the notes."] if unknown else []
     known = {name: p["std_error"] / p["value"] for name, p in free.items() if p["std_error"]}
     if known:
         name = max(known, key=lambda key: known[key])
         how = "weakly" if known[name] > 0.1 else "least well, but well"
-        said.append(f"{SYMBOLS[name][0]} is {how} identified: ±{number(196 * known[name], 2)} %.")
+        said.append(f"{symbol_of(name)} is {how} identified: ±{number(196 * known[name], 2)} %.")
     return said
 
 
@@ -103,7 +104,7 @@ def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
     rows = []
     for group in ("parameters", "derived"):
         for name, found in result[group].items():
-            symbol, unit = SYMBOLS[name]
+            symbol, unit = symbol_of(name), unit_of(name)
             low, high = found.get("ci95") or (None, None)
             rows.append(
                 {

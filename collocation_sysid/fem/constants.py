@@ -1,0 +1,121 @@
+"""The constants that terms of the model declare: what they are called, and what values make sense.
+
+A term names each constant with its unit, as the problem file does: ``mu_pa``, ``gamma_r_s``. The
+constant of a named region has the region in front, ``core.mu_pa``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+Scale = Literal["log", "linear"]
+
+# Units by the ending of a name, longest first.
+_UNITS = {
+    "_kg_m3": "kg/m³",
+    "_1_s": "1/s",
+    "_pa": "Pa",
+    "_kg": "kg",
+    "_s": "s",
+    "_m": "m",
+}
+
+
+@dataclass(frozen=True)
+class Constant:
+    """One constant of a term.
+
+    Attributes
+    ----------
+    name : str
+        With its unit.
+    symbol : str
+        For tables and pictures; the name without its unit by default.
+    meaning : str
+        In a few words.
+    bounds : (lower, upper)
+        Of an estimate for which the problem gives none: wide enough for foams and rubbers alike.
+    scale : {"log", "linear"}
+        Whether the constant is a positive number whose logarithm is estimated, or any number.
+    typical : float or None
+        What a linear one may change by in a step, where its guess does not tell.
+    below : float
+        Values are less than this.
+    """
+
+    name: str
+    symbol: str = ""
+    meaning: str = ""
+    bounds: tuple[float, float] = (1e-6, 1e9)
+    scale: Scale = "log"
+    typical: float | None = None
+    below: float = float("inf")
+
+    @property
+    def least(self) -> float:
+        """Smallest value that makes sense."""
+        return 0.0 if self.scale == "log" else -float("inf")
+
+
+STIFFNESS = (1.0, 1e9)
+LAMBDA = Constant("lambda_pa", "λ", "first Lamé parameter", STIFFNESS)
+MU = Constant("mu_pa", "μ", "shear modulus", STIFFNESS)
+KAPPA = Constant("kappa_pa", "κ", "bulk modulus", (1.0, 1e10))
+YOUNG = Constant("young_pa", "E", "Young's modulus", STIFFNESS)
+POISSON = Constant("poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, below=0.5)
+GAMMA_R = Constant("gamma_r_s", "γ_r", "stiffness-proportional damping", (1e-7, 10.0))
+GAMMA_M = Constant("gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4))
+C10 = Constant("c10_pa", "C₁₀", "half the shear modulus, or a share of it", STIFFNESS)
+C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", STIFFNESS)
+C20 = Constant("c20_pa", "C₂₀", "factor of (Ī₁ − 3)²", (-1e9, 1e9), "linear")
+C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "linear")
+GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4))
+CHAIN_STRETCH = Constant("chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0))
+
+# The constants that have a symbol, by name: what tables and pictures look up.
+KNOWN: Mapping[str, Constant] = {
+    constant.name: constant
+    for constant in (
+        LAMBDA,
+        MU,
+        KAPPA,
+        YOUNG,
+        POISSON,
+        GAMMA_R,
+        GAMMA_M,
+        C10,
+        C01,
+        C20,
+        C30,
+        GENT_LIMIT,
+        CHAIN_STRETCH,
+    )
+}
+
+
+def bare(name: str) -> str:
+    """The name of a constant without its region."""
+    return name.rpartition(".")[2]
+
+
+def unit_of(name: str) -> str:
+    """The unit that a name ends with, "" if none."""
+    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
+
+
+def symbol_of(name: str) -> str:
+    """How a constant is written: its symbol, and its region behind."""
+    region, _, own = name.rpartition(".")
+    symbol = KNOWN[own].symbol if own in KNOWN else _without_unit(own)
+    return f"{symbol} {region}".strip()
+
+
+def constant_named(name: str) -> Constant:
+    """The known constant of this name, or one of which nothing but the name is known."""
+    return KNOWN.get(bare(name), Constant(bare(name)))
+
+
+def _without_unit(name: str) -> str:
+    return next((name.removesuffix(e) for e in _UNITS if name.endswith(e)), name)
