@@ -64,6 +64,9 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
 OneExperiment = Annotated[
     str | None, typer.Option(metavar="NAME", help="Experiment; by default the first.")
 ]
+AllowCode = Annotated[
+    bool, typer.Option("--allow-code", help="Run Python files that the problem names.")
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list the runs.")]
 
 EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -87,6 +90,7 @@ def solve(
     method: Annotated[str | None, typer.Option(help="Method, instead of the problem's.")] = None,
     out: Out = None,
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     as_json: AsJson = False,
     verbose: Verbose = False,
     quiet: Quiet = False,
@@ -101,7 +105,7 @@ def solve(
     from .terminal import Progress, summary
 
     folder = out or Path("runs") / _run_name(problem)
-    loaded = load_problem(problem, set_ or ())
+    loaded = load_problem(problem, set_ or (), allow_code=allow_code)
     _require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
@@ -128,6 +132,7 @@ def simulate(
     problem: ProblemPath,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to write.")],
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     integrator: Annotated[
         str, typer.Option(help="newmark, or a scheme: midpoint, backward-euler, bdf2.")
     ] = "newmark",
@@ -147,7 +152,7 @@ def simulate(
     from .synthesis import write_data
     from .terminal import Progress
 
-    loaded = load_problem(problem, set_ or (), simulation=True)
+    loaded = load_problem(problem, set_ or (), True, allow_code)
     _require_possible(out)
     with Progress(errors, loaded, quiet=quiet) as progress:
         written = write_data(
@@ -181,6 +186,7 @@ def compare(
     scheduler: Scheduler = None,
     time_limit: TimeLimit = None,
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     out: Out = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -196,10 +202,11 @@ def compare(
     from .study.table import Yardstick
 
     names, limits = parse_methods(methods), Limits(workers, scheduler, time_limit)
-    loaded = load_problem(problem, set_ or ())
+    loaded = load_problem(problem, set_ or (), allow_code=allow_code)
     free = [item.name for item in loaded.parameters.free]
     yardstick = Yardstick(read_truth(truth or (), loaded.parameters.names, free), within)
-    planned = plan_comparison(loaded, names, set_ or (), starts, spread, seed, yardstick.truth)
+    options = starts, spread, seed, yardstick.truth, allow_code
+    planned = plan_comparison(loaded, names, set_ or (), *options)
     study = _Study("compare", problem, planned, yardstick, out)
     _study(study, limits, dry_run, as_json, quiet)
 
@@ -224,6 +231,7 @@ def sweep(
     scheduler: Scheduler = None,
     time_limit: TimeLimit = None,
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     out: Out = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -237,8 +245,10 @@ def sweep(
 
     chosen = parse_methods(method, "--method")[0] if method else None
     limits = Limits(workers, scheduler, time_limit)
-    planned = plan_sweep(problem, parse_over(over), set_ or (), chosen)
-    load_problem(problem, planned[0].overrides)  # a missing file would fail every run
+    planned = plan_sweep(problem, parse_over(over), set_ or (), chosen, allow_code)
+    load_problem(
+        problem, planned[0].overrides, False, allow_code
+    )  # a missing file would fail every run
     _study(_Study("sweep", problem, planned, Yardstick(), out), limits, dry_run, as_json, quiet)
 
 
@@ -308,13 +318,18 @@ def _dry_run(planned: Sequence[PlannedRun], finished: Sequence[str], as_json: bo
         "check problem.toml", "check problem.toml --set transcription.scheme=backward-euler"
     )
 )
-def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False) -> None:
+def check(
+    problem: ProblemPath,
+    set_: Overrides = None,
+    allow_code: AllowCode = False,
+    as_json: AsJson = False,
+) -> None:
     """Tell what is wrong with a problem before solving it."""
     from .check import check_problem
     from .problem import load_problem
     from .terminal import check_table
 
-    findings = check_problem(load_problem(problem, set_ or ()))
+    findings = check_problem(load_problem(problem, set_ or (), allow_code=allow_code))
     if as_json:
         typer.echo(json.dumps(findings.as_dict(), indent=1))
     else:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..checked import Finite, Flag, Positive, Text, Whole
+from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..methods import METHODS
 from ..methods.casadi_nlp import why_not
 from ..nlp.schemes import SCHEMES
-from .recording_schema import ExperimentSection
+from .recording_schema import ExperimentSection, Nodes
 from .section import Section, Unit, given_keys, require_one
 
 
@@ -24,12 +25,45 @@ def _offered(name: Any) -> Any:
 
 
 if TYPE_CHECKING:
-    MaterialName = ElementName = SchemeName = MethodName = str
+    MaterialName = DampingName = ElementName = SchemeName = MethodName = str
 else:
     MaterialName = Literal[tuple(MATERIALS)]
+    DampingName = Literal[tuple(DAMPINGS)]
     ElementName = Literal[tuple(ELEMENTS)]
     SchemeName = Literal[tuple(SCHEMES)]
     MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
+
+
+class CodeSection(Section):
+    """A material of the user's own: a Python function of F and named constants."""
+
+    file: Text = Field(description="Python file; it is run, which needs --allow-code.")
+    function: Text = Field(description="Name of the energy function in it.")
+
+
+def _material_form(value: Any) -> str:
+    return "<code>" if isinstance(value, dict) else "<name>"
+
+
+Material = Annotated[
+    Annotated[CodeSection, Tag("<code>")] | Annotated[MaterialName, Tag("<name>")],
+    Discriminator(_material_form),
+]
+
+
+class RegionSection(Section):
+    """Cells that differ from the rest; its parameters have its name in front."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(
+        description="Letters, digits, - and _."
+    )
+    cells: Nodes = Field(
+        description="Selection of cells, by their centres: a table of box_m, ball_m or indices, or "
+        "the name of a cell array or of a physical group."
+    )
+    material: Material | None = None
+    damping: DampingName | None = None
+    density_kg_m3: Positive | None = None
 
 
 class ObjectSection(Section):
@@ -41,8 +75,14 @@ class ObjectSection(Section):
     length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
     mass_kg: Positive | None = Field(None, description="Weighed mass of the whole object.")
     density_kg_m3: Positive | None = Field(None, description="Uniform density instead of a mass.")
-    material: MaterialName = "neo-hookean"
+    material: Material = Field(
+        "neo-hookean", description="A material's name, or a table of file and function."
+    )
+    damping: DampingName = "rayleigh"
     element: ElementName = "tet4"
+    region: list[RegionSection] = Field(
+        default_factory=list, description="[[object.region]] tables: cells that differ."
+    )
     evaluator: Literal["auto", "simd", "casadi"] = Field(
         "auto", description="How element kernels are evaluated."
     )
