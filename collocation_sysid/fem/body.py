@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
 from ..errors import InputError
-from .batched import Batch, Evaluator, available_threads, choose_evaluator, make_evaluator
+from .batched import Batch, Evaluator, EvaluatorChoice, available_threads
 from .elements import Element, element_named, reference_geometry
-from .expressions import KERNELS
+from .expressions import KERNELS, energy_kernel
 from .materials import Energy, material_named
 from .mesh import TetMesh
 from .nodes import Nodes
@@ -81,7 +81,8 @@ class Body:
         A name in `elements.ELEMENTS`. "tet10" puts a node on every edge of the mesh: some eight
         times the unknowns, and far better in bending or when nearly incompressible.
     evaluator : {"auto", "simd", "casadi"}
-        How element kernels are evaluated, see `batched`.
+        How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
+        for a material that vector code cannot evaluate.
     threads : int, optional
         Threads for evaluations over several timesteps; the available cores by default.
 
@@ -96,7 +97,7 @@ class Body:
     Raises
     ------
     InputError
-        For unknown names or a mass that is not positive.
+        For unknown names, a mass that is not positive, or a material "simd" cannot evaluate.
     """
 
     def __init__(
@@ -117,13 +118,15 @@ class Body:
         self.nodes_m: Array = self.nodes.points_m
         self.cells: NDArray[np.int64] = self.nodes.cells
         self.threads = threads or available_threads()
-        self.evaluator = choose_evaluator(evaluator)
         density = _density(mesh.volume_m3, density_kg_m3, mass_kg)
         shares = density * mesh.volumes_m3[:, None] * self.element.mass_shares
         self.node_mass: Array = np.zeros(len(self.nodes_m))
         np.add.at(self.node_mass, self.cells, shares)
         self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
         self._evaluators: dict[str, Evaluator] = {}
+        self._choice = EvaluatorChoice(evaluator)
+        # Derivatives need no operations but those of the energy and the ones every evaluator has.
+        self._choice.check(energy_kernel(self.element, self.material).pieces)
 
     def select(self, selection: Selection) -> NDArray[np.int64]:
         """Return the nodes of a `selection.Selection`, sorted.
@@ -137,6 +140,20 @@ class Body:
             If there are none.
         """
         return selection.resolve(self.nodes)
+
+    @property
+    def evaluator(self) -> str:
+        """How element kernels are evaluated: "simd" or "casadi"."""
+        return self._choice.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Why it is not "simd", if the material is to blame."""
+        return self._choice.notes
+
+    def make_evaluator(self, batch: Batch) -> Evaluator:
+        """Build the evaluator of a batch of this body's material."""
+        return self._choice.make(batch)
 
     @property
     def mass_kg(self) -> float:
@@ -289,8 +306,7 @@ class Body:
         self, name: str, fields: Sequence[Array], theta: Theta, out: Array | None = None
     ) -> Array:
         if name not in self._evaluators:
-            batch = self._batch(name)
-            self._evaluators[name] = make_evaluator(batch, self.evaluator)
+            self._evaluators[name] = self.make_evaluator(self._batch(name))
         width = self._width(name)
         shape = (len(fields[0]), width)
         if out is None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from ..fem.batched import Batch, Evaluator, make_evaluator
+from ..fem.batched import Batch, Evaluator
 from ..fem.body import Body
 from ..fem.elements import Element
 from ..fem.expressions import THETA, PointKernel
@@ -52,7 +52,7 @@ class ElementFields:
         places = len(NAMES) * np.arange(cells)[:, None] + np.arange(len(NAMES))
         batch = Batch(kernel, body.cells, body.geometry, places, len(NAMES) * cells)
         volumes = body.geometry[:, :, -1].sum(axis=1)
-        return cls(body, lambda_pa, mu_pa, make_evaluator(batch, body.evaluator), volumes)
+        return cls(body, lambda_pa, mu_pa, body.make_evaluator(batch), volumes)
 
     def at(self, positions_m: ArrayLike) -> dict[str, Array]:
         """The fields by `NAMES`, (T, E) each, at positions (T, n, 3).

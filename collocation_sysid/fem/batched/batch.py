@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
+from ...errors import InputError
 from ..expressions import PointKernel
 
 
@@ -43,3 +44,7 @@ class Evaluator(Protocol):
     def __call__(self, fields: Sequence[Array], theta: Array, out: Array, threads: int) -> None:
         """Overwrite `out` (T, width) from `fields`, each (T, 3n) contiguous, and θ (3,)."""
         ...
+
+
+class VectorCodeError(InputError):
+    """A kernel that cannot be compiled to vector code."""
