@@ -1,7 +1,7 @@
 """The inverse error function in elementary operations: the C library has none.
 
 A rational first guess and two Newton steps, which are exact but for the rounding of x. CasADi's
-own leaves the steps out below x = −0.7, where it is right to some six digits only.
+own is up to 3·10⁻⁶ off, most of all around |x| = 0.7.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import casadi as ca
 # Numerators and denominators, the highest power first.
 CENTRE = (
     (-0.140543331, 0.914624893, -1.645349621, 0.886226899),
-    (-0.329097515, 0.012229801, 1.442710462, -2.118377725, 1.0),
+    (0.012229801, -0.329097515, 1.442710462, -2.118377725, 1.0),
 )
 TAIL = (
     (1.641345311, 3.429567803, -1.624906493, -1.970840454),

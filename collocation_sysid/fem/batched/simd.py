@@ -33,7 +33,7 @@ class SimdEvaluator:
         kernel = batch.kernel
         count = len(batch.cells)
         blocks = -(-count // lanes)
-        # Padding lanes repeat the last element with volume zero: they add exactly nothing.
+        # Padding lanes repeat the last element with volume zero, by which they are known.
         lane_element = np.minimum(np.arange(blocks * lanes), count - 1)
         geometry = batch.geometry[lane_element].copy()
         geometry[count:, :, -1] = 0.0
@@ -136,9 +136,15 @@ class _Emitter:
                     here = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
                     self._pieces(gathered, here, parameters, pieces)
                     self._contract(pieces, here, half, outputs)
+                here = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
+                volume = self._load(here, I64(geometry_size - 1))
+                zero = self.vector(None)
+                # Not left to the product with the volume, which makes NaN of what is infinite.
+                is_element = b.fcmp_ordered("!=", volume, zero)
                 targets = b.gep(destinations, [b.mul(block, I64(total * self.lanes))])
                 with counting(b, I64(0), I64(total), "output") as k:
-                    self._scatter(self._load(outputs, k), targets, k, out_row)
+                    value = b.select(is_element, self._load(outputs, k), zero)
+                    self._scatter(value, targets, k, out_row)
         b.ret_void()
         return self.module
 
