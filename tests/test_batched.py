@@ -204,6 +204,16 @@ def test_operations_are_those_of_casadi(name):
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=0)
 
 
+@pytest.mark.parametrize("name", [*FUNCTIONS, "OP_ERFINV"])
+def test_derivatives_need_no_other_operations(name):
+    z = ca.SX.sym("z", 2)
+    function = FUNCTIONS.get(name, lambda x, y: ca.erfinv(x))
+    value = ca.exp(function(z[0], z[1]))
+    for _ in range(3):  # as many as a curvature kernel takes
+        value = ca.sum1(ca.gradient(value, z))
+        instructions.check_operations(ca.Function("derivative", [z], [value]))
+
+
 def test_every_operation_of_vector_code_is_tested():
     known = {instructions.operation_name(operation) for operation in instructions.OPERATIONS}
     assert known - set(FUNCTIONS) == {"OP_ASSIGN", "OP_ERFINV"}

@@ -103,7 +103,7 @@ def _library(name: str) -> Emit:
 
     def emit(b: Builder, *operands: Value) -> Value:
         function = _declared(b.module, name, DOUBLE, len(operands))
-        # Without it a value nobody needs, and one that no loop changes, would be found each time.
+        # Otherwise a call may set errno, and the compiler keeps even those that are repeated.
         function.attributes.add("readnone")
         result: Value = ir.Constant(operands[0].type, ir.Undefined)
         for lane in map(I32, range(operands[0].type.count)):
