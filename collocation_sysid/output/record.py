@@ -187,7 +187,11 @@ def result(finished: Run) -> dict[str, Any]:
             "constraints": collocation.constraints,
             "scheme": collocation.scheme,
         },
-        "notes": list(dict.fromkeys([*problem.notes, *solution.notes, *finished.all_notes])),
+        "notes": list(
+            dict.fromkeys(
+                [*problem.notes, *problem.body.notes, *solution.notes, *finished.all_notes]
+            )
+        ),
         "history": [
             {
                 "iteration": line.number,

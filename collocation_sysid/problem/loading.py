@@ -79,7 +79,7 @@ def load_problem(
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
     body = _located(path, "object", lambda: _load_body(file.object, mesh, folder, allow_code))
     parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))
-    experiments, notes = [], list(mesh.notes)
+    experiments, notes = [], [*mesh.notes, *body.notes]
     for section in file.experiment:
         reader = RecordingReader(section, folder, body, parameters, simulation)
         experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
