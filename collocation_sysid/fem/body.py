@@ -193,6 +193,14 @@ class Body:
         """Build the evaluator of a batch of this body's material."""
         return self._choice.make(batch)
 
+    @cached_property
+    def part_of_cells(self) -> Index:
+        """(E,) number of the part that each cell belongs to."""
+        numbers = np.zeros(len(self.cells), dtype=np.int64)
+        for k, part in enumerate(self.parts):
+            numbers[part.cells] = k
+        return numbers
+
     @property
     def mass_kg(self) -> float:
         """Total mass."""
