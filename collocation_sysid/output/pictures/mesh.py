@@ -85,12 +85,10 @@ def mesh_picture(
     draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
     entries = ["grasped"] if held.any() else []
     entries += ["markers", "behind the body"] if len(names) else []
-    several = list(enumerate(part_names)) if len(part_names) > 1 else []
-    draw_key(
-        axes,
-        [*key(*entries), *(skin_key(k, name or "rest") for k, name in several)],
-        (1.0, total - 1.5),
-    )
+    handles = key(*entries)
+    if len(part_names) > 1:
+        handles += [skin_key(k, name or "rest") for k, name in enumerate(part_names)]
+    draw_key(axes, handles, (1.0, total - 1.5))
     return figure
 
 
