@@ -122,12 +122,11 @@ def study(
     starts: NDArray[np.float64],
     noisy: bool,
     only: list[int] | None = None,
-    method: ReducedSpace = ReducedSpace(),
 ) -> list[Outcome]:
     """Solve from every start."""
     expected = np.array(list(TRUTH.values()))
     if noisy:
-        optimum = method(Collocation([experiment], parameters(expected), scheme))
+        optimum = ReducedSpace()(Collocation([experiment], parameters(expected), scheme))
         if not optimum.status.converged:
             raise SystemExit(f"from the truth: {optimum.message}")
         expected = np.array(optimum.theta)
@@ -137,7 +136,7 @@ def study(
             continue
         collocation = Collocation([experiment], parameters(guess), scheme)
         with counted_factorisations() as count:
-            solution = method(collocation)
+            solution = ReducedSpace()(collocation)
         ratios = np.abs(np.log(np.array(solution.theta) / expected))
         close = 1e-4 if noisy else TOLERANCE
         outcomes.append(

@@ -14,6 +14,7 @@ from problems_small import (
     SMALL_EXPERIMENTS,
     TRUTH,
     bar_in_two_hands,
+    bar_let_go,
     hung_cube,
     measured,
     noisy,
@@ -27,7 +28,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.secant import updated, with_curvature
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.methods.start import carried_rigidly
+from collocation_sysid.methods.start import carried_rigidly, initial_variables
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.nlp.schemes import SCHEMES
@@ -194,10 +195,13 @@ def test_it_starts_from_given_variables():
     assert seen[0].rms_m < 1e-9
 
 
-def test_positions_to_start_from_need_not_satisfy_the_dynamics():
-    q, (x,) = cube().unpack(solved_cube().z)
-    disturbed = x + 1e-4 * np.random.default_rng(1).normal(size=x.shape)
-    solution = ReducedSpace()(cube(), start=cube().pack(q + 0.2, [disturbed]))
+@pytest.mark.parametrize("make", [hung_cube, released_cube, bar_let_go])
+@pytest.mark.parametrize("explicit", [False, True])
+def test_positions_to_start_from_need_satisfy_neither_dynamics_nor_grasps(make, explicit, rng):
+    collocation = Collocation([measured(make())], GUESS, explicit_grasps=explicit)
+    q, (x,) = collocation.unpack(initial_variables(collocation)[0])
+    start = collocation.pack(q + 0.2, [x + 1e-4 * rng.normal(size=x.shape)])
+    solution = ReducedSpace()(collocation, start=start)
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-6
 

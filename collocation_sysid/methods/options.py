@@ -76,11 +76,11 @@ def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
 
 def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
     """The error for a value, or for an entry of the table that it is."""
-    if fault["type"] == "value_error":
-        return InputError(str(fault["ctx"]["error"]), None, name)
     for part in fault["loc"]:
         if isinstance(found, Mapping) and part in found:
             name, found = f"{name}.{part}", found[part]
+    if fault["type"] == "value_error":
+        return InputError(str(fault["ctx"]["error"]), None, name)
     choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
     hint = hint_at(str(found), choices)
     return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)

@@ -55,8 +55,10 @@ class Search:
         self.reach = collocation.reach_p
         self.p, self.x = collocation.guess_p, None
         if start is not None:
-            self.p = np.clip(collocation.parameters_of(start), self.lower, self.upper)
-            self.x = collocation.unpack(start)[1]
+            start = np.clip(start, *collocation.bounds())
+            parts = zip(collocation.segments, collocation.unpack(start)[1], strict=True)
+            self.p = collocation.parameters_of(start)
+            self.x = [segment.grasped(x) for segment, x in parts]
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)

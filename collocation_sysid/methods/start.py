@@ -98,7 +98,4 @@ def carried_rigidly(segment: Segment, theta: Theta) -> Array:
         shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
         carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
         x = carried.reshape(len(t_s), -1)
-    x[:, segment.held_dofs] = segment.held_positions
-    if segment.dynamics.taken is not None:
-        x[segment.dynamics.taken] = segment.taken_positions
-    return x
+    return segment.grasped(x)
