@@ -327,7 +327,7 @@ class _Climb:
 
     def _record(self) -> None:
         nlp, z = self.problem.nlp, self._answer()
-        self.recorder.at(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
+        self.recorder.line(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
 
     def _answer(self) -> Array:
         """The last iterate with held nodes where their grasps are."""

@@ -14,7 +14,7 @@ from .horizon import Horizon, Point
 from .ladder import FEWEST, part_of
 from .recorder import Recorder
 from .secant import updated, with_curvature
-from .solution import Status
+from .solution import Iteration, Status
 
 if TYPE_CHECKING:
     from .reduced_space import ReducedSpace
@@ -306,4 +306,5 @@ class Search:
         distances = np.concatenate(squares)
         rms_m = float(np.sqrt(distances.mean())) if len(distances) else 0.0
         theta = self.collocation.parameters.theta(q)
-        self.recorder.line(self.sweeps, loss, rms_m, violation_n, theta)
+        time_s = self.recorder.elapsed_s
+        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, theta, time_s))
