@@ -59,6 +59,7 @@ class Search:
             parts = zip(collocation.segments, collocation.unpack(start)[1], strict=True)
             self.p = collocation.parameters_of(start)
             self.x = [segment.grasped(x) for segment, x in parts]
+        self.first = self.p
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
@@ -144,8 +145,7 @@ class Search:
         moduli = np.array([name in MODULI for name in names], dtype=bool)
         q, upper = self.p[: len(names)], self.upper[: len(names)]
         stiffer = np.minimum(q + np.log(2) * moduli, upper)
-        started = self.collocation.parameters.guess_q
-        factor = float(np.exp(np.max(stiffer - started, initial=0.0)))
+        factor = float(np.exp(np.max(stiffer - self.first[: len(names)], initial=0.0)))
         if np.allclose(stiffer, q) or factor > 1.01 * 2**STIFFENINGS:
             raise failure
         self.p = np.concatenate([stiffer, self.p[len(names) :]])
