@@ -9,6 +9,7 @@ from typing import Any
 from .errors import InputError, SimulationError, hint_at
 from .methods import METHODS
 from .methods.casadi_nlp import why_not
+from .methods.options import built
 from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .problem import Problem
@@ -97,7 +98,7 @@ def solve(
         unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
         raise InputError(why_not(name) or unknown, None, "--method")
     chosen = METHODS[name]
-    known = {field.name for field in fields(chosen.options)}
+    known = {field.name for field in fields(chosen)}
     in_file = problem.file.solver.model_dump(exclude_unset=True, exclude={"method", "huber"})
     foreign = sorted(set(in_file) - known)
     if foreign and method is None:
@@ -113,7 +114,7 @@ def solve(
     given = {key: value for key, value in in_file.items() if key in known} | options
     try:
         collocation = build_collocation(problem)
-        solution = chosen.solve(collocation, chosen.options(**given), watch)
+        solution = built(chosen, given, "solver")(collocation, watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:

@@ -10,24 +10,12 @@ from typing import Any, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from ..checked import expected as wanted
 from ..errors import InputError
 from .schema import ProblemFile
 
 Part = str | int
 Fault = Mapping[str, Any]
-
-_EXPECTED = {
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "bool_type": "true or false, without quotes",
-    "string_type": "text in quotes",
-    "string_too_short": "a text that is not empty",
-    "finite_number": "a finite number",
-    "greater_than": "a number above {gt:g}",
-    "greater_than_equal": "a number of at least {ge:g}",
-    "dict_type": "a table",
-}
 
 
 def explain(error: ValidationError, content: dict[str, Any], path: Path) -> InputError:
@@ -82,9 +70,7 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
         return f"{found}; expected a table with some of the keys {', '.join(model.model_fields)}"
     if kind == "literal_error":
         return f"{found}; {_meant(fault['input'], fault['ctx']['expected'])}"
-    if kind in _EXPECTED:
-        return f"{found}; expected {_EXPECTED[kind].format(**fault.get('ctx') or {})}"
-    return f"{found}; expected {fault['msg'].removeprefix('Input should be ')}"
+    return f"{found}; expected {wanted(fault)}"
 
 
 def _unknown_key(key: Sequence[Part]) -> str:

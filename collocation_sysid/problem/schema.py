@@ -12,6 +12,7 @@ from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..methods import METHODS
 from ..methods.casadi_nlp import why_not
+from ..methods.interior_point import IpoptValue
 from ..nlp.schemes import SCHEMES
 from .recording_schema import ExperimentSection, Nodes
 from .section import Section, Unit, given_keys, require_one
@@ -189,15 +190,6 @@ class TranscriptionSection(Section):
     )
 
 
-def _ipopt_value(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise ValueError(
-            f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
-            'switches are "yes" and "no"'
-        )
-    return value
-
-
 class SolverSection(Section):
     """The method and its options."""
 
@@ -263,7 +255,7 @@ class SolverSection(Section):
     tolerance: Positive = 1e-8
     max_iterations: Whole = Field(default=200, ge=0)
     max_time_s: Positive = 1e6
-    ipopt: dict[str, Annotated[str | int | float, BeforeValidator(_ipopt_value)]] = Field(
+    ipopt: dict[str, IpoptValue] = Field(
         default_factory=dict, description="Further IPOPT options by name."
     )
 
