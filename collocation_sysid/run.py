@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from .errors import InputError, SimulationError, hint_at
@@ -96,24 +96,9 @@ def solve(
     if name not in METHODS:
         unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
         raise InputError(why_not(name) or unknown, None, "--method")
-    chosen = METHODS[name]
-    known = {field.name for field in fields(chosen.options)}
-    in_file = problem.file.solver.model_dump(exclude_unset=True, exclude={"method", "huber"})
-    foreign = sorted(set(in_file) - known)
-    if foreign and method is None:
-        raise InputError(
-            f"method {name!r} has no such option; it has {', '.join(sorted(known))}. "
-            "Name the method it belongs to in solver.method",
-            problem.path,
-            f"solver.{foreign[0]}",
-        )
-    unknown = sorted(set(options) - known)
-    if unknown:
-        raise InputError(f"no option {unknown[0]!r}; {name} has {', '.join(sorted(known))}")
-    given = {key: value for key, value in in_file.items() if key in known} | options
     try:
-        collocation = build_collocation(problem)
-        solution = chosen.solve(collocation, chosen.options(**given), watch)
+        chosen = problem.file.solver.options(name, **options)
+        solution = METHODS[name].solve(build_collocation(problem), chosen, watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:

@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from ..checked import Flag, NotNegative, Positive, Text, Whole
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
-from ..methods import METHODS
-from ..methods.casadi_nlp import why_not
 from ..nlp.schemes import SCHEMES
 from .recording_schema import ExperimentSection
 from .section import Section, Unit, given_keys, require_one
-
-
-def _offered(name: Any) -> Any:
-    reason = why_not(name) if isinstance(name, str) else None
-    if reason is not None:
-        raise ValueError(reason)
-    return name
-
+from .solver_schema import SolverSection
 
 if TYPE_CHECKING:
-    MaterialName = ElementName = SchemeName = MethodName = str
+    MaterialName = ElementName = SchemeName = str
 else:
     MaterialName = Literal[tuple(MATERIALS)]
     ElementName = Literal[tuple(ELEMENTS)]
     SchemeName = Literal[tuple(SCHEMES)]
-    MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
 
 
 class ObjectSection(Section):
@@ -119,85 +109,6 @@ class TranscriptionSection(Section):
     )
 
 
-def _ipopt_value(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise ValueError(
-            f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
-            'switches are "yes" and "no"'
-        )
-    return value
-
-
-class SolverSection(Section):
-    """The method and its options."""
-
-    method: MethodName = "reduced-space"
-    hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
-    warm_up: float = Field(
-        default=0.1,
-        ge=0,
-        description="Gauss–Newton while a step changes a parameter by more than this.",
-    )
-    proximal: float = Field(
-        default=1e-5, ge=0, description="Added to the Hessian at the positions."
-    )
-    linear_solver: Text = Field(default="mumps", description="IPOPT's linear solver.")
-    huber: Positive | None = Field(
-        default=None,
-        description="Samples farther off than this many sigmas count linearly, not squared.",
-    )
-    factorisation: Literal["auto", "band", "sparse"] = Field(
-        default="auto", description="How reduced-space factorises a timestep's equations."
-    )
-    inner: Literal["cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"] = Field(
-        default="cg-descent",
-        description="What minimises the merit function of penalty and augmented-lagrangian; "
-        "the latter's default is levenberg-marquardt.",
-    )
-    schedule: Literal["geometric", "progress", "constant"] = Field(
-        default="geometric",
-        description="How rho rises: after every stage, where slack is left, or never.",
-    )
-    rho: Positive = Field(
-        default=1e2,
-        description="First weight of the dynamics; augmented-lagrangian's default is 1e5.",
-    )
-    rho_max: Positive = Field(
-        default=1e8, description="Its last; augmented-lagrangian's default is 1e9."
-    )
-    rho_factor: Annotated[float, Field(gt=1)] = Field(
-        default=10.0, description="Factor above 1 between the weights of two stages."
-    )
-    inner_iterations: Annotated[Whole, Field(gt=0)] = Field(
-        default=1000, description="Most iterations of a stage."
-    )
-    violation: Positive = Field(
-        default=1e-3,
-        description="Slack left in the dynamics, over the largest force; "
-        "augmented-lagrangian's default is 1e-7.",
-    )
-    gradient: Literal["forward", "adjoint"] = Field(
-        default="forward", description="How shooting finds the slope of its loss."
-    )
-    shares: list[Positive] = Field(
-        default=[0.25, 0.5, 1.0],
-        description="List of the shares of the samples that continuation solves one after another; "
-        "the last is 1.",
-    )
-    stage: SolverSection | None = Field(
-        default=None, description="A method and its options, for each share of continuation."
-    )
-    casadi: dict[str, Any] = Field(
-        default_factory=dict, description="Further options of a casadi: solver by name."
-    )
-    tolerance: Positive = 1e-8
-    max_iterations: Whole = Field(default=200, ge=0)
-    max_time_s: Positive = 1e6
-    ipopt: dict[str, Annotated[str | int | float, BeforeValidator(_ipopt_value)]] = Field(
-        default_factory=dict, description="Further IPOPT options by name."
-    )
-
-
 class UncertaintySection(Section):
     """How the error bars are found."""
 
@@ -232,7 +143,7 @@ class ProblemFile(Section):
         min_length=1, description="At least one [[experiment]] table, one for each recording."
     )
     transcription: TranscriptionSection = TranscriptionSection()
-    solver: SolverSection = SolverSection()
+    solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()
     uncertainty: UncertaintySection = UncertaintySection()
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, hint_at
 from ..methods import METHODS
 
 RANGE = "such as 50:5000:log:9 or 0:1:5"
@@ -29,8 +28,13 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
         raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
     for name in names:
         if name not in METHODS:
-            raise InputError(f"found {name!r}; {_meant(name, METHODS)}", None, option)
+            raise _unknown(name, METHODS, None, option)
     return names
+
+
+def _unknown(name: str, known: Collection[str], source: Path | None, option: str) -> InputError:
+    expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+    return InputError(f"found {name!r}; {expected}", source, option)
 
 
 # The truth ----------------------------------------------------------------------------------------
@@ -59,7 +63,7 @@ def read_truth(
         source, table = _truth_table(item)
         for name, value in table.items():
             if name not in known:
-                raise InputError(f"found {name!r}; {_meant(name, known)}", source, "--truth")
+                raise _unknown(name, known, source, "--truth")
             truth[name] = _positive(name, value, source)
     if missing := [name for name in needed if given and name not in truth]:
         raise InputError(
@@ -186,11 +190,3 @@ def _items(text: str) -> list[str]:
         else:
             items[-1] += letter
     return [item.strip() for item in items if item.strip()]
-
-
-def _meant(name: str, known: Iterable[str]) -> str:
-    names = list(known)
-    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
-    close = longer or difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]!r}? Expected" if close else "expected"
-    return f"{hint} one of {', '.join(names)}"

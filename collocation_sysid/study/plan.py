@@ -172,7 +172,9 @@ def _planned(
         if (section := getattr(file.parameters, name)) is not None and section.guess is not None
     }
     content = file.model_dump(mode="json", exclude_unset=True)
-    content.setdefault("solver", {})["method"] = method
+    solver = content.get("solver", {})
+    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
+    content["solver"]["method"] = method
     decisive = [content, start, _hashes_of_files(content, path.parent), _version()]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]

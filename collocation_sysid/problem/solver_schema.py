@@ -1,0 +1,112 @@
+"""[solver] of the problem file: the method, the loss, and a table of options for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+    create_model,
+    model_validator,
+)
+
+from ..checked import Positive
+from ..errors import InputError
+from ..methods import METHODS
+from ..methods.casadi_nlp import why_not
+from ..methods.described import options_of, options_schema
+from ..methods.options import built
+from .section import Section
+
+OPTIONS = {method: [field.name for field in fields(options_of(method))] for method in METHODS}
+DEFAULT = "reduced-space"
+
+
+def _offered(name: Any) -> Any:
+    reason = why_not(name) if isinstance(name, str) else None
+    if reason is not None:
+        raise ValueError(reason)
+    return name
+
+
+if TYPE_CHECKING:
+    MethodName = str
+else:
+    MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
+
+
+class MethodSection(Section):
+    """The method, the loss, and a table of options for each method."""
+
+    method: MethodName = DEFAULT
+    huber: Positive | None = Field(
+        default=None,
+        description="Samples farther off than this many sigmas count linearly, not squared.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _options_are_in_tables(cls, given: Any) -> Any:
+        places: dict[str, list[str]] = {}
+        for name in given if isinstance(given, Mapping) else ():
+            if owners := _owners(name, given.get("method", DEFAULT)):
+                places.setdefault(owners[0], []).append(name)
+        moves = [f"{', '.join(names)} to {_heading(method)}" for method, names in places.items()]
+        if moves:
+            remedy = f"move {' and '.join(moves)}"
+            raise ValueError(f"the options of a method have a table of their own: {remedy}")
+        return given
+
+    def options(self, method: str, **changed: Any) -> Any:
+        """A method's options: those of the file, but for some."""
+        in_file = getattr(self, method)
+        if not changed:
+            return in_file
+        return _read(method, {name: getattr(in_file, name) for name in OPTIONS[method]} | changed)
+
+
+def _read(method: str, given: Any) -> Any:
+    """The options that a table gives."""
+    where = f"solver.{method}"
+    if not isinstance(given, Mapping):
+        raise InputError(f"found {given!r}; expected a table of options", None, where)
+    for name in given:
+        owners = _owners(name)
+        if owners and method not in owners:
+            owned = f"{name} is an option of {', '.join(owners)}"
+            has = f"{method} has {', '.join(OPTIONS[method])}"
+            raise InputError(f"{owned}; {has}", None, where)
+    return built(options_of(method), given, where)
+
+
+def _owners(option: str, first: str = DEFAULT) -> list[str]:
+    """Methods that have an option, one of them before the others."""
+    owners = [method for method in METHODS if option in OPTIONS[method]]
+    return sorted(owners, key=lambda method: method != first)
+
+
+def _heading(method: str) -> str:
+    return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
+
+
+def _table(method: str) -> tuple[Any, Any]:
+    """Type and default of a method's key."""
+    checks = PlainValidator(partial(_read, method)), WithJsonSchema(options_schema(method))
+    return Annotated[Any, *checks], Field(default_factory=options_of(method))
+
+
+if TYPE_CHECKING:
+    SolverSection = MethodSection
+else:
+    SolverSection = create_model(
+        "SolverSection",
+        __base__=MethodSection,
+        __doc__=MethodSection.__doc__,
+        **{method: _table(method) for method in METHODS},
+    )
