@@ -97,8 +97,8 @@ def solve(
         unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
         raise InputError(why_not(name) or unknown, None, "--method")
     try:
-        chosen = problem.file.solver.options(name, **options)
-        solution = METHODS[name].solve(build_collocation(problem), chosen, watch)
+        solver = problem.file.solver.method_named(name, **options)
+        solution = solver(build_collocation(problem), watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:

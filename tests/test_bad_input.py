@@ -506,7 +506,7 @@ SOLVING = [
         options=settings("solver.interior-point.ipopt.mu_strategy=foo"),
     ),
     bad(
-        "truth-for-an-ipopt-switch", "solver.interior-point.ipopt.expect_infeasible", "found true", '"yes"',
+        "truth-for-an-ipopt-switch", "ipopt.expect_infeasible", "found true", '"yes"',
         options=settings("solver.interior-point.ipopt.expect_infeasible=true"),
     ),
     bad(

@@ -450,8 +450,8 @@ def test_each_method_has_the_options_of_its_own_table(tiny):
     problem = cs.load_problem("problem.toml", tables)
     solution = cs.solve(problem, "reduced-space")
     assert solution.status.converged
-    assert problem.file.solver.options("interior-point").hessian == "limited-memory"
-    assert problem.file.solver.options("reduced-space").hessian == "gauss-newton"
+    assert problem.file.solver.method_named("interior-point").hessian == "limited-memory"
+    assert problem.file.solver.method_named("reduced-space").hessian == "gauss-newton"
 
 
 def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):

@@ -68,7 +68,7 @@ def test_overrides_are_written_as_in_toml(tiny):
     assert file.experiment[0].gravity_m_s2 == (0, 0, -1.62)
     assert file.experiment[0].start == "undeformed"
     assert file.parameters.mu_pa.fixed == 300
-    assert file.solver.options("reduced-space").ladder == (0.5, 1.0)
+    assert file.solver.method_named("reduced-space").ladder == (0.5, 1.0)
 
 
 def test_the_text_as_run_has_the_overrides_in_it(tiny):

@@ -12,6 +12,7 @@ from problem_files import TRUTH
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import load_problem
 from collocation_sysid.study import (
     Limits,
@@ -301,16 +302,16 @@ def test_a_stopped_study_ends_its_runs(stand_in):
 
 
 def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
-    def broken(*_):
-        raise ZeroDivisionError("nothing to divide by")
+    class Broken(ReducedSpace):
+        def __call__(self, *_):
+            raise ZeroDivisionError("nothing to divide by")
 
-    broken_method = type(METHODS["reduced-space"])(broken, METHODS["reduced-space"].options)
-    monkeypatch.setitem(METHODS, "reduced-space", broken_method)
+    monkeypatch.setitem(METHODS, "reduced-space", Broken)
     planned = plan_comparison(load_problem("problem.toml"), ["reduced-space"])[0].as_dict()
     record = worker.attempt(planned)
     assert record["outcome"] == "error"
     assert record["message"] == "ZeroDivisionError: nothing to divide by"
-    assert "in broken" in record["traceback"]
+    assert "in __call__" in record["traceback"]
     refused = worker.attempt({**planned, "overrides": ["parameters.mu_pa.guess=1e9"]})
     assert refused["outcome"] == "error"
     assert "mu_pa: guess = 1e+09" in refused["message"]

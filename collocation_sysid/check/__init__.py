@@ -120,7 +120,7 @@ def check_problem(problem: Problem) -> Findings:
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
     jacobian, hessian = _nonzeros(problem)
     solver = problem.file.solver
-    factorisation = solver.options("reduced-space").factorisation
+    factorisation = solver.method_named("reduced-space").factorisation
     found_costs = costs(collocation, z, jacobian + hessian, factorisation)
     chosen = next((cost for cost in found_costs if cost.method == solver.method), None)
 

@@ -11,19 +11,14 @@ from . import METHODS
 from .options import documented
 
 
-def options_of(method: str) -> type[Any]:
-    """The dataclass of a method's options."""
-    return METHODS[method].options
-
-
 def summary(method: str) -> str:
     """What a method is, in a line."""
-    return inspect.cleandoc(options_of(method).__doc__ or "").splitlines()[0]
+    return inspect.cleandoc(METHODS[method].__doc__ or "").splitlines()[0]
 
 
 def options_schema(method: str) -> dict[str, Any]:
     """JSON schema of a method's options: types, ranges, defaults and descriptions."""
-    kind = options_of(method)
+    kind = METHODS[method]
     defaults, descriptions = kind(), documented(kind)
     options = TypeAdapter(kind).json_schema()["properties"]
     for name, option in options.items():

@@ -90,12 +90,7 @@ class Unconstrained:
     def grasped(self, z: Array) -> Array:
         """The point with all held nodes exactly where their grasps are."""
         q, positions = self.nlp.unpack(z)
-        moved = [x.copy() for x in positions]
-        for segment, x in zip(self.nlp.segments, moved, strict=True):
-            first = segment.dynamics.first_row
-            x[first:, segment.held_dofs] = segment.held_positions[first:]
-            if segment.dynamics.taken is not None:
-                x[segment.dynamics.taken] = segment.taken_positions
+        moved = [s.grasped(x) for s, x in zip(self.nlp.segments, positions, strict=True)]
         there = self.nlp.pack(q, moved, self.nlp.unpack_own(z))
         there[~self.free] = z[~self.free]
         return there if self.is_upright(there) else z

@@ -10,24 +10,12 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from ..checked import expected as wanted
 from ..errors import InputError, hint_at
 from .schema import ProblemFile
 
 Part = str | int
 Fault = Mapping[str, Any]
-
-_EXPECTED = {
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "bool_type": "true or false, without quotes",
-    "string_type": "text in quotes",
-    "string_too_short": "a text that is not empty",
-    "finite_number": "a finite number",
-    "greater_than": "a number above {gt:g}",
-    "greater_than_equal": "a number of at least {ge:g}",
-    "dict_type": "a table",
-}
 
 
 def explain(error: ValidationError, content: dict[str, Any], path: Path) -> InputError:
@@ -85,9 +73,7 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
         choices = fault["ctx"]["expected"]
         hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
         return f"{found}; expected {choices}{hint}"
-    if kind in _EXPECTED:
-        return f"{found}; expected {_EXPECTED[kind].format(**fault.get('ctx') or {})}"
-    return f"{found}; expected {fault['msg'].removeprefix('Input should be ')}"
+    return f"{found}; expected {wanted(fault)}"
 
 
 def _unknown_key(key: Sequence[Part]) -> str:

@@ -20,11 +20,11 @@ from ..checked import Positive
 from ..errors import InputError
 from ..methods import METHODS
 from ..methods.casadi_nlp import why_not
-from ..methods.described import options_of, options_schema
+from ..methods.described import options_schema
 from ..methods.options import built
 from .section import Section
 
-OPTIONS = {method: [field.name for field in fields(options_of(method))] for method in METHODS}
+OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"
 
 
@@ -63,16 +63,16 @@ class MethodSection(Section):
             raise ValueError(f"the options of a method have a table of their own: {remedy}")
         return given
 
-    def options(self, method: str, **changed: Any) -> Any:
-        """A method's options: those of the file, but for some."""
-        in_file = getattr(self, method)
+    def method_named(self, name: str, **changed: Any) -> Any:
+        """A method with the options of its table, but for some."""
+        in_file = getattr(self, name)
         if not changed:
             return in_file
-        return _read(method, {name: getattr(in_file, name) for name in OPTIONS[method]} | changed)
+        return _read(name, {option: getattr(in_file, option) for option in OPTIONS[name]} | changed)
 
 
 def _read(method: str, given: Any) -> Any:
-    """The options that a table gives."""
+    """The method with the options that its table gives."""
     where = f"solver.{method}"
     if not isinstance(given, Mapping):
         raise InputError(f"found {given!r}; expected a table of options", None, where)
@@ -82,7 +82,7 @@ def _read(method: str, given: Any) -> Any:
             owned = f"{name} is an option of {', '.join(owners)}"
             has = f"{method} has {', '.join(OPTIONS[method])}"
             raise InputError(f"{owned}; {has}", None, where)
-    return built(options_of(method), given, where)
+    return built(METHODS[method], given, where)
 
 
 def _owners(option: str, first: str = DEFAULT) -> list[str]:
@@ -98,7 +98,7 @@ def _heading(method: str) -> str:
 def _table(method: str) -> tuple[Any, Any]:
     """Type and default of a method's key."""
     checks = PlainValidator(partial(_read, method)), WithJsonSchema(options_schema(method))
-    return Annotated[Any, *checks], Field(default_factory=options_of(method))
+    return Annotated[Any, *checks], Field(default_factory=partial(_read, method, {}))
 
 
 if TYPE_CHECKING:
