@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import InputError, SimulationError, hint_at
-from .methods import METHODS
-from .methods.casadi_nlp import why_not
+from .errors import InputError, SimulationError
+from .methods.described import require_method
 from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .problem import Problem
@@ -93,9 +92,7 @@ def solve(
         For an unknown method or option, and when the solver refuses the problem.
     """
     name = method or problem.file.solver.method
-    if name not in METHODS:
-        unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
-        raise InputError(why_not(name) or unknown, None, "--method")
+    require_method(name, "--method")
     try:
         solver = problem.file.solver.method_named(name, **options)
         solution = solver(build_collocation(problem), watch)

@@ -7,8 +7,17 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from ..errors import InputError, hint_at
 from . import METHODS
+from .casadi_nlp import why_not
 from .options import documented
+
+
+def require_method(name: str, option: str) -> None:
+    """Refuse the name of a method that there is not, given as an option of the command line."""
+    if name not in METHODS:
+        unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
+        raise InputError(why_not(name) or unknown, None, option)
 
 
 def summary(method: str) -> str:

@@ -57,7 +57,7 @@ class MethodSection(Section):
         for name in given if isinstance(given, Mapping) else ():
             if owners := _owners(name, given.get("method", DEFAULT)):
                 places.setdefault(owners[0], []).append(name)
-        moves = [f"{', '.join(names)} to {_heading(method)}" for method, names in places.items()]
+        moves = [f"{', '.join(names)} to {heading(method)}" for method, names in places.items()]
         if moves:
             remedy = f"move {' and '.join(moves)}"
             raise ValueError(f"the options of a method have a table of their own: {remedy}")
@@ -91,7 +91,8 @@ def _owners(option: str, first: str = DEFAULT) -> list[str]:
     return sorted(owners, key=lambda method: method != first)
 
 
-def _heading(method: str) -> str:
+def heading(method: str) -> str:
+    """How a method's table begins in the file."""
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
 
 

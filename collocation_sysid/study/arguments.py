@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError, hint_at
 from ..methods import METHODS
+from ..methods.described import require_method
 
 RANGE = "such as 50:5000:log:9 or 0:1:5"
 
@@ -27,14 +28,8 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     if not names:
         raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
     for name in names:
-        if name not in METHODS:
-            raise _unknown(name, METHODS, None, option)
+        require_method(name, option)
     return names
-
-
-def _unknown(name: str, known: Collection[str], source: Path | None, option: str) -> InputError:
-    expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
-    return InputError(f"found {name!r}; {expected}", source, option)
 
 
 # The truth ----------------------------------------------------------------------------------------
@@ -63,7 +58,8 @@ def read_truth(
         source, table = _truth_table(item)
         for name, value in table.items():
             if name not in known:
-                raise _unknown(name, known, source, "--truth")
+                expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+                raise InputError(f"found {name!r}; {expected}", source, "--truth")
             truth[name] = _positive(name, value, source)
     if missing := [name for name in needed if given and name not in truth]:
         raise InputError(
