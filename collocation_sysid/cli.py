@@ -172,7 +172,9 @@ def simulate(
 )
 def compare(
     problem: ProblemPath,
-    methods: Annotated[str, typer.Option(metavar="A,B,…", help="Methods, separated by commas.")],
+    methods: Annotated[
+        str, typer.Option(metavar="A,B,…", help="Methods, each with its options of the file.")
+    ],
     starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
     spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,

@@ -83,7 +83,7 @@ def _unknown_key(key: Sequence[Part]) -> str:
 
 
 def _place(fault: Fault, content: dict[str, Any]) -> str:
-    """Where a fault is, which those that other modules found may know better."""
+    """Where a fault is; an `InputError` knows the place inside what is one value here."""
     error = (fault.get("ctx") or {}).get("error")
     known = error.where if isinstance(error, InputError) else None
     return known or _where(_key(fault), content)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -53,13 +53,9 @@ class MethodSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _options_are_in_tables(cls, given: Any) -> Any:
-        places: dict[str, list[str]] = {}
-        for name in given if isinstance(given, Mapping) else ():
-            if owners := _owners(name, given.get("method", DEFAULT)):
-                places.setdefault(owners[0], []).append(name)
-        moves = [f"{', '.join(names)} to {heading(method)}" for method, names in places.items()]
-        if moves:
-            remedy = f"move {' and '.join(moves)}"
+        outside = [name for name in given if _owners(name)] if isinstance(given, Mapping) else []
+        if outside:
+            remedy = f"move {_moves(outside, given.get('method', DEFAULT))}"
             raise ValueError(f"the options of a method have a table of their own: {remedy}")
         return given
 
@@ -85,10 +81,18 @@ def _read(method: str, given: Any) -> Any:
     return built(METHODS[method], given, where)
 
 
-def _owners(option: str, first: str = DEFAULT) -> list[str]:
-    """Methods that have an option, one of them before the others."""
-    owners = [method for method in METHODS if option in OPTIONS[method]]
-    return sorted(owners, key=lambda method: method != first)
+def _owners(option: str) -> list[str]:
+    """Methods that have an option."""
+    return [method for method in METHODS if option in OPTIONS[method]]
+
+
+def _moves(options: Sequence[str], chosen: Any) -> str:
+    """Which options belong in which tables: in the chosen method's where it has them."""
+    places: dict[str, list[str]] = {}
+    for option in options:
+        owners = _owners(option)
+        places.setdefault(chosen if chosen in owners else owners[0], []).append(option)
+    return " and ".join(f"{', '.join(names)} to {heading(to)}" for to, names in places.items())
 
 
 def heading(method: str) -> str:
