@@ -44,7 +44,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: Path):
     names: dict[str, object] = {"__name__": "docs"}
     for code in blocks(page, "python"):
-        exec(compile(code, name_of(page), "exec"), names)
+        exec(compile(code, name_of(page), "exec", dont_inherit=True), names)
 
 
 # What keeps a command of the pages short here.

@@ -267,4 +267,4 @@ class Monitor(ca.Callback):
         if merit < self._best_merit:
             self._best_merit, self.best = merit, (z, multipliers)
         recorder = self.recorder
-        recorder.at(len(recorder.history), z, float(value[0]) / recorder.collocation.loss_scale)
+        recorder.line(len(recorder.history), z, float(value[0]) / recorder.collocation.loss_scale)

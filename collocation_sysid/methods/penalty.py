@@ -156,9 +156,10 @@ class Stages(Options):
         """Where ρ ends."""
         return self.rho_max
 
-    def first(self, merit: Merit) -> Stage:
-        """What the climb begins with."""
-        raise NotImplementedError
+    @property
+    def first_gradient(self) -> float:
+        """What is wanted of the first stage."""
+        return self.tolerance
 
     def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
         """What follows a stage that ended at z, given the slack of the one before.
@@ -195,10 +196,6 @@ class Penalty(Stages):
         """Where ρ ends."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
-    def first(self, merit: Merit) -> Stage:
-        """What the climb begins with."""
-        return Stage(merit, self.tolerance)
-
     def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
         """The same with a larger ρ."""
         rho = stage.merit.rho
@@ -223,9 +220,10 @@ class AugmentedLagrangian(Stages):
 
     name: ClassVar[str] = "augmented-lagrangian"
 
-    def first(self, merit: Merit) -> Stage:
-        """What the climb begins with."""
-        return Stage(merit, max(FIRST_GRADIENT, self.tolerance))
+    @property
+    def first_gradient(self) -> float:
+        """What is wanted of the first stage."""
+        return max(FIRST_GRADIENT, self.tolerance)
 
     def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
         """The next with the multipliers of the last, and a larger ρ where it left much slack."""
@@ -258,7 +256,8 @@ class _Climb:
         if not self.problem.is_upright(self.z):
             raise InputError("elements are inverted at the start; start from another point")
         no_weights = np.zeros(nlp.constraints)
-        self.stage = options.first(Merit(self.problem, options.rho, no_weights))
+        merit = Merit(self.problem, options.rho, no_weights)
+        self.stage = Stage(merit, options.first_gradient)
         self.iterations, self.gradient = 0, np.inf
         curvature = nlp.hessian(self.z, 1.0, no_weights).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
@@ -327,7 +326,7 @@ class _Climb:
 
     def _record(self) -> None:
         nlp, z = self.problem.nlp, self._answer()
-        self.recorder.at(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
+        self.recorder.line(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
 
     def _answer(self) -> Array:
         """The last iterate with held nodes where their grasps are."""

@@ -10,7 +10,6 @@ import numpy as np
 from ..arrays import Array
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
-from ..nlp.parameters import Theta
 from ..nlp.stopwatch import Stopwatch
 from .method import Watch
 from .multipliers import constraint_multipliers
@@ -88,20 +87,15 @@ class Recorder:
         except KeyboardInterrupt:
             return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 
-    def at(self, number: int, z: Array, loss: float) -> None:
-        """Add the line of the history for variables z."""
-        violations = self.collocation.violations_n(z)
-        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in violations)
-        self.line(number, loss, self.collocation.rms_m(z), violation_n, self.collocation.theta(z))
-
-    def line(
-        self, number: int, loss: float, rms_m: float, violation_n: float, theta: Theta
-    ) -> None:
-        """Add a line to the history, and show it to who watches."""
-        self.add(Iteration(number, loss, rms_m, violation_n, theta, self.elapsed_s))
+    def line(self, number: int, z: Array, loss: float) -> None:
+        """Add the line for variables z to the history."""
+        nlp = self.collocation
+        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in nlp.violations_n(z))
+        line = Iteration(number, loss, nlp.rms_m(z), violation_n, nlp.theta(z), self.elapsed_s)
+        self.add(line)
 
     def add(self, line: Iteration) -> None:
-        """Add a line, and show it."""
+        """Add a line to the history, and show it to who watches."""
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)

@@ -14,7 +14,7 @@ from .horizon import Horizon, Point
 from .ladder import FEWEST, part_of
 from .recorder import Recorder
 from .secant import updated, with_curvature
-from .solution import Status
+from .solution import Iteration, Status
 
 if TYPE_CHECKING:
     from .reduced_space import ReducedSpace
@@ -59,6 +59,7 @@ class Search:
             parts = zip(collocation.segments, collocation.unpack(start)[1], strict=True)
             self.p = collocation.parameters_of(start)
             self.x = [segment.grasped(x) for segment, x in parts]
+        self.first = self.p
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
@@ -144,8 +145,7 @@ class Search:
         moduli = np.array([name in MODULI for name in names], dtype=bool)
         q, upper = self.p[: len(names)], self.upper[: len(names)]
         stiffer = np.minimum(q + np.log(2) * moduli, upper)
-        started = self.collocation.parameters.guess_q
-        factor = float(np.exp(np.max(stiffer - started, initial=0.0)))
+        factor = float(np.exp(np.max(stiffer - self.first[: len(names)], initial=0.0)))
         if np.allclose(stiffer, q) or factor > 1.01 * 2**STIFFENINGS:
             raise failure
         self.p = np.concatenate([stiffer, self.p[len(names) :]])
@@ -306,4 +306,5 @@ class Search:
         distances = np.concatenate(squares)
         rms_m = float(np.sqrt(distances.mean())) if len(distances) else 0.0
         theta = self.collocation.parameters.theta(q)
-        self.recorder.line(self.sweeps, loss, rms_m, violation_n, theta)
+        time_s = self.recorder.elapsed_s
+        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, theta, time_s))

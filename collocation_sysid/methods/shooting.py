@@ -259,5 +259,5 @@ class _Search:
             shot = _Shot(p.copy(), z, collocation.objective(z), np.zeros(0), slope)
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot
-            self.recorder.at(self.shots, z, shot.objective / collocation.loss_scale)
+            self.recorder.line(self.shots, z, shot.objective / collocation.loss_scale)
         return shot

@@ -284,7 +284,7 @@ class Collocation:
         return self.constraints_and_jacobian(z, out)[1]
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """Return g and the values of ∂g/∂z, from one evaluation of the elements."""
+        """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
         values = np.empty(len(self.jacobian_structure[1])) if out is None else out
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
         rows, by_phi = np.empty(self.constraints), []
