@@ -6,7 +6,6 @@ Exit codes: 0 converged, 1 not converged, 2 bad input, 130 interrupted.
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from .errors import InputError, SimulationError
+from .folders import require_possible, run_name
 
 if TYPE_CHECKING:
     from .study import Limits, PlannedRun
@@ -95,7 +95,11 @@ def solve(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Identify the parameters and write a run folder."""
+    """Identify the parameters and write a run folder.
+
+    Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
+    --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
+    """
     from .methods.solution import Status
     from .output.record import as_json as json_text
     from .output.record import result, write_run
@@ -104,9 +108,9 @@ def solve(
     from .run import run
     from .terminal import Progress, summary
 
-    folder = out or Path("runs") / _run_name(problem)
+    folder = out or Path("runs") / run_name(problem)
     loaded = load_problem(problem, set_ or (), allow_code=allow_code)
-    _require_possible(folder)
+    require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
         finished = run(loaded, method, watch=progress.iteration, log=progress.say)
@@ -153,7 +157,7 @@ def simulate(
     from .terminal import Progress
 
     loaded = load_problem(problem, set_ or (), True, allow_code)
-    _require_possible(out)
+    require_possible(out)
     with Progress(errors, loaded, quiet=quiet) as progress:
         written = write_data(
             loaded, out, integrator, timestep_s, noise_m, seed, frames, progress.share
@@ -173,7 +177,9 @@ def simulate(
 )
 def compare(
     problem: ProblemPath,
-    methods: Annotated[str, typer.Option(metavar="A,B,…", help="Methods, separated by commas.")],
+    methods: Annotated[
+        str, typer.Option(metavar="A,B,…", help="Methods, each with its options of the file.")
+    ],
     starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
     spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
@@ -264,7 +270,7 @@ class _Study:
 
     @property
     def folder(self) -> Path:
-        return self.out or Path("runs") / f"{_run_name(self.problem)}-{self.kind}"
+        return self.out or Path("runs") / f"{run_name(self.problem)}-{self.kind}"
 
 
 def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: bool) -> None:
@@ -281,14 +287,14 @@ def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: b
     if dry_run:
         _dry_run(study.planned, finished, as_json)
         return
-    _require_possible(folder)
+    require_possible(folder)
     interrupted = False
     try:
         with StudyProgress(errors, left, len(study.planned), quiet) as progress:
             run_all(left, store, limits, progress.done)
     except KeyboardInterrupt:
         interrupted = True
-    title = f"{study.kind.capitalize()}: {_run_name(study.problem)}"
+    title = f"{study.kind.capitalize()}: {run_name(study.problem)}"
     report = load_report(title, study.kind, study.planned, store, study.yardstick)
     if report.records:
         write_report(report, folder)
@@ -345,7 +351,7 @@ def plot(
     """Draw the pictures of a run again, from its files."""
     from .output.redraw import redraw
 
-    _require_possible(out or run_folder)
+    require_possible(out or run_folder)
     for file in redraw(run_folder, out or run_folder):
         typer.echo(file)
 
@@ -368,7 +374,7 @@ def report(
     file = to or folder / "report.html"
     study = (folder / "summary.json").is_file()
     page = comparison_page(folder) if study else run_page(folder)
-    _require_possible(file.parent)
+    require_possible(file.parent)
     file.write_text(page, encoding="utf-8")
     typer.echo(file)
 
@@ -389,7 +395,7 @@ def animate(
 
     from .output.animation import animate as film
 
-    _require_possible(to.parent if to is not None else run_folder)
+    require_possible(to.parent if to is not None else run_folder)
     with Progress(console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
         task = bar.add_task("filming", total=1.0)
         file = film(
@@ -419,8 +425,27 @@ def view(
     if html is None:
         show(run_folder, field, experiment)
         return
-    _require_possible(html.parent)
+    require_possible(html.parent)
     typer.echo(export_page(run_folder, html, experiment))
+
+
+@app.command(epilog=_examples("methods", "methods interior-point"))
+def methods(
+    name: Annotated[str | None, typer.Argument(help="Tell this method's options.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the methods, or the options of one: defaults, values, and what they do."""
+    from .method_tables import methods_table, options_table
+    from .methods import METHODS
+    from .methods.described import options_schema, require_method, summary
+
+    if name is not None:
+        require_method(name, "NAME")
+    if as_json:
+        listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
+        typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
+    else:
+        Console(highlight=False).print(options_table(name) if name else methods_table())
 
 
 @app.command()
@@ -434,17 +459,9 @@ def schema() -> None:
 @app.command(epilog=_examples("new my_object", "check my_object/problem.toml"))
 def new(name: Annotated[str, typer.Argument(help="Name of the new folder.")]) -> None:
     """Write a commented problem file to start from."""
-    from .problem.template import TEMPLATE
+    from .problem.template import write_template
 
-    folder = Path(name)
-    file = folder / "problem.toml"
-    _require_possible(folder)
-    if file.exists():
-        raise InputError("it is there already; choose another name", file)
-    folder.mkdir(parents=True, exist_ok=True)
-    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
-    file.write_text(TEMPLATE.format(title=title), encoding="utf-8")
-    typer.echo(file)
+    typer.echo(write_template(Path(name)))
 
 
 def _version(wanted: bool) -> None:
@@ -462,21 +479,6 @@ def _root(
     ] = False,
 ) -> None:
     pass
-
-
-def _run_name(problem: Path) -> str:
-    return problem.resolve().parent.name if problem.stem == "problem" else problem.stem
-
-
-def _require_possible(folder: Path) -> None:
-    """Refuse a folder that cannot be made, before any work is done for it."""
-    for place in (folder, *folder.parents):
-        if place.is_dir():
-            if not os.access(place, os.W_OK):
-                raise InputError("this folder cannot be written in; choose another", place)
-            return
-        if place.exists():
-            raise InputError("this is a file; expected a folder to write in", place)
 
 
 def _show(content: RenderableType) -> None:

@@ -230,7 +230,7 @@ def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
 
 def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 4})
-    chosen = ["solver.method=casadi:sqpmethod", "solver.casadi.min_iter=1"]
+    chosen = ["solver.method=casadi:sqpmethod", "solver.casadi:sqpmethod.casadi.min_iter=1"]
     solution = solve_problem(load_problem(file, chosen))
     assert solution.status.converged
     assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)

@@ -188,10 +188,10 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 16})
     chosen = [
         "solver.method=continuation",
-        "solver.shares=[0.5, 1.0]",
-        "solver.stage.method=shooting",
-        "solver.stage.gradient=adjoint",
-        "solver.stage.tolerance=1e-9",
+        "solver.continuation.shares=[0.5, 1.0]",
+        "solver.continuation.stage.method=shooting",
+        "solver.continuation.stage.gradient=adjoint",
+        "solver.continuation.stage.tolerance=1e-9",
     ]
     solution = solve(load_problem(file, chosen))
     assert solution.status.converged
@@ -205,13 +205,13 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
-        ("solver.stage.metod=shooting", "solver.stage.metod: unknown key; did you mean method?"),
-        ("solver.stage.method=shoting", "stage.method: found 'shoting'; did you mean"),
-        ("solver.stage.gradient=forward", "'interior-point' has no option 'gradient'"),
-        ("solver.shares=[1.0, 0.5]", "expected numbers above 0 that ascend to 1"),
+        ("stage.metod=shooting", "'interior-point' has no option 'metod'"),
+        ("stage.method=shoting", "stage.method: found 'shoting'; expected one of"),
+        ("stage.gradient=forward", "'interior-point' has no option 'gradient'"),
+        ("shares=[1.0, 0.5]", "expected numbers above 0 that ascend to 1"),
     ],
 )
 def test_wrong_stages_of_a_problem_file_are_refused(tmp_path, chosen: str, message: str):
     file = write_problem(tmp_path, {"swing": 8})
     with pytest.raises(InputError, match=re.escape(message)):
-        solve(load_problem(file, ["solver.method=continuation", chosen]))
+        solve(load_problem(file, ["solver.method=continuation", f"solver.continuation.{chosen}"]))

@@ -60,7 +60,7 @@ def test_overrides_are_written_as_in_toml(tiny):
         "experiment.swing.start = undeformed",
         'experiment.swing.grasp.nodes.name="top"',
         "parameters.mu_pa={ fixed = 300 }",
-        "solver.max_iterations=7",
+        "solver.reduced-space.ladder=[0.5, 1]",
     ]
     replace_text("density_kg_m3 = 30.0", "")(tiny)
     replace_text(BOX, "{}")(tiny)
@@ -70,7 +70,7 @@ def test_overrides_are_written_as_in_toml(tiny):
     assert file.experiment[0].gravity_m_s2 == (0, 0, -1.62)
     assert file.experiment[0].start == "undeformed"
     assert file.parameters.mu_pa.fixed == 300
-    assert file.solver.max_iterations == 7
+    assert file.solver.method_named("reduced-space").ladder == (0.5, 1.0)
 
 
 def test_the_text_as_run_has_the_overrides_in_it(tiny):

@@ -139,7 +139,7 @@ def test_the_truth_is_a_file_or_values(tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("mu=3", "found 'mu'; did you mean 'mu_pa'"),
+        ("mu=3", "found 'mu'; expected one of .*; did you mean 'mu_pa'"),
         ("mu_pa=x", "found mu_pa = x; expected a positive number"),
         ("mu_pa=-1", "expected a positive number"),
         ("mu_pa=3", "lambda_pa, gamma_r_s, gamma_m_1_s missing"),
@@ -211,7 +211,8 @@ def test_other_data_are_other_runs(tiny):
 
     before = key()
     assert key() == before
-    assert key("solver.tolerance=1e-6") != before
+    assert key("solver.reduced-space.tolerance=1e-6") != before
+    assert key("solver.shooting.tolerance=1e-6") == before  # an option of another method
     assert key("solver.method=reduced-space") == before  # the method it had anyhow
     markers = tiny / "swing_markers.csv"
     markers.write_text(markers.read_text() + "\n")
@@ -238,7 +239,7 @@ def test_a_sweep_can_be_over_methods(tiny):
 @pytest.mark.parametrize(
     ("over", "message"),
     [
-        ("parameters.mu_pa.gues=1,2", "did you mean guess"),
+        ("parameters.mu_pa.gues=1,2", "did you mean 'guess'"),
         ("transcription.substeps=1,x", "transcription.substeps: found 'x'"),
         ("title.text=1", "--over: title.text leads into"),
     ],

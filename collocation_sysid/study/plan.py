@@ -178,7 +178,9 @@ def _planned(
         if isinstance(section, ParameterSection) and section.guess is not None
     }
     content = file.model_dump(mode="json", exclude_unset=True)
-    content.setdefault("solver", {})["method"] = method
+    solver = content.get("solver", {})
+    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
+    content["solver"]["method"] = method
     decisive = [content, start, _hashes_of_files(content, path.parent), _version()]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
