@@ -275,8 +275,7 @@ def clamped_beam(element: str, divisions, length_m: float, poisson: float = 0.3)
     """Body, stiffness and masses of the free degrees of freedom of a beam clamped at x = 0."""
     mesh = box_mesh((length_m, THICKNESS_M, THICKNESS_M), divisions)
     body = Body(mesh, "linear", density_kg_m3=DENSITY_KG_M3, element=element)
-    lambda_pa = YOUNG_PA * poisson / ((1 + poisson) * (1 - 2 * poisson))
-    K = body.stiffness(body.nodes_m, lambda_pa, YOUNG_PA / (2 * (1 + poisson)))
+    K = body.stiffness(body.nodes_m, young_pa=YOUNG_PA, poisson=poisson)
     free = np.flatnonzero(np.repeat(body.nodes_m[:, 0] > 1e-9, 3))
     return body, K[free][:, free].tocsc(), free
 
