@@ -204,7 +204,7 @@ def energies(scheme: str, theta: np.ndarray) -> np.ndarray:
             v[2:] = (3 * x[2:] - 4 * x[1:-1] + x[:-2]) / (2 * step)
     kinetic = 0.5 * (v**2 @ dynamics.body.dof_mass)
     body = experiment.body
-    elastic = [body.energy(state, theta.lambda_pa, theta.mu_pa) for state in x]
+    elastic = [body.energy(state, lambda_pa=theta[0], mu_pa=theta[1]) for state in x]
     return kinetic + np.array(elastic)
 
 
