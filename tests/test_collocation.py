@@ -238,7 +238,7 @@ def test_variables_and_rows_are_in_the_documented_order():
     q, positions = collocation.unpack(z)
     expected_z, expected_g = [q], []
     for segment, x in zip(collocation.segments, positions, strict=True):
-        residual = segment.dynamics.residual(x, collocation.theta(z))
+        residual = segment.dynamics.residual(x, segment.constants.theta(q))
         expected_z.append(x.ravel() / segment.length_m)
         rows = residual[segment.dynamics.first_row :, segment.free_dofs]
         expected_g.append(rows.ravel() / segment.force_n)
