@@ -32,7 +32,6 @@ from collocation_sysid import (
     Markers,
     Parameter,
     Parameters,
-    Theta,
     simulate,
 )
 from collocation_sysid.experiment import place_markers
@@ -41,7 +40,7 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.simulation import with_markers
 
 BOTH = ["interior-point", "reduced-space"]
-TRUTH = Theta(200.0, 300.0, 0.009, 1.0)
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 PARAMETERS = Parameters(
     (
         Parameter("lambda_pa", 400.0, 10.0, 1e5),
@@ -123,7 +122,8 @@ def measure(mesh: str, steps: int, method: str) -> Row:
     began = time.perf_counter()
     collocation = Collocation([experiment], PARAMETERS)
     build_s = time.perf_counter() - began
-    experiment.body.linearise(experiment.body.nodes_m, 0 * experiment.body.nodes_m, TRUTH)
+    body, truth = experiment.body, experiment.body.theta(TRUTH)
+    body.linearise(body.nodes_m, 0 * body.nodes_m, truth)
     began = time.perf_counter()
     solution = METHODS[method]()(collocation)
     total_s = time.perf_counter() - began
@@ -144,7 +144,7 @@ def measure(mesh: str, steps: int, method: str) -> Row:
         total_s=total_s,
         peak_mb=peak_mb,
         kkt_residual=solution.kkt_residual if small else float("nan"),
-        theta_error=float(np.abs(np.array(solution.theta) / np.array(TRUTH) - 1).max()),
+        theta_error=float(np.abs(solution.theta / truth - 1).max()),
     )
 
 

@@ -16,10 +16,9 @@ from synthetic import Swing, exchanged, measure, occluded, unmeasured
 
 from collocation_sysid.experiment import Experiment, place_markers, write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.nlp.parameters import Theta
 
 FOLDER = Path(__file__).parents[1] / "problems" / "noisy_cylinder"
-TRUTH = Theta(lambda_pa=2500.0, mu_pa=1500.0, gamma_r_s=0.005, gamma_m_1_s=1.5)
+TRUTH = {"lambda_pa": 2500.0, "mu_pa": 1500.0, "gamma_r_s": 0.005, "gamma_m_1_s": 1.5}
 NOISE_M = 0.001
 SWING = Swing(
     duration_s=0.8,

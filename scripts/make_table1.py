@@ -12,11 +12,10 @@ from synthetic import Swing, measure, unmeasured
 
 from collocation_sysid.experiment import write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
 
 FOLDER = Path(__file__).parents[1] / "problems" / "table1"
-TRUTH = Theta(lambda_pa=200.0, mu_pa=300.0, gamma_r_s=0.009, gamma_m_1_s=1.0)
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 SWING = Swing(
     duration_s=0.99,
     amplitude_m=(0.05, 0.04, 0.03),

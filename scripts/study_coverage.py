@@ -31,9 +31,9 @@ from study_starts import TRUTH, hanging_cylinder, parameters
 from synthetic import swing
 
 from collocation_sysid.experiment import Experiment, Grasp, Nuisance
+from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import as_theta
 from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import (
@@ -189,8 +189,8 @@ def noise_of(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Ar
 
 
 def truth() -> dict[str, float]:
-    theta = as_theta(TRUTH)
-    return {**TRUTH, "young_pa": theta.young_pa, "poisson": theta.poisson}
+    young_pa, poisson = engineering(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    return {**TRUTH, "young_pa": young_pa, "poisson": poisson}
 
 
 def held(uncertainty: Uncertainty) -> list[float]:

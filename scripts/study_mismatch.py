@@ -102,7 +102,7 @@ def identify(experiment: Experiment, scheme: str, substeps: int) -> Fit:
     )
     began = time.perf_counter()
     solution = ReducedSpace()(Collocation([experiment], parameters, scheme, substeps))
-    found = np.array(solution.theta)
+    found = solution.theta
     walls = np.array([BOUNDS[name] for name in TRUTH])
     return Fit(
         scheme,

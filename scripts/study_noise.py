@@ -101,7 +101,7 @@ def run(case: Case, sigma_m: float, seed: int) -> Outcome:
     solution = method(collocation)
     return Outcome(
         solution.status.converged,
-        np.log(np.array(solution.theta) / list(TRUTH.values())),
+        np.log(solution.theta / list(TRUTH.values())),
         time.perf_counter() - began,
     )
 

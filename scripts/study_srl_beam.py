@@ -182,17 +182,20 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
 def report(label: str, found: Fit) -> None:
     young = found.uncertainty.estimates["young_pa"]
     low, high = young.ci95 or (np.nan, np.nan)
-    theta = found.solution.theta
+    values = found.solution.parameters
     print(
         f"{label:34}{1e-3 * young.value:8.1f}  {1e-3 * low:.1f} to {1e-3 * high:.1f}"
-        f"{1e3 * theta.gamma_r_s:12.2f}{theta.gamma_m_1_s:11.2f}  {rms_line(found.solution)}",
+        f"{1e3 * values['gamma_r_s']:12.2f}{values['gamma_m_1_s']:11.2f}"
+        f"  {rms_line(found.solution)}",
         flush=True,
     )
 
 
 def material(solution: Solution) -> str:
-    theta = solution.theta
-    return f"{1e-3 * theta.young_pa:9.1f}{1e3 * theta.gamma_r_s:10.2f}{theta.gamma_m_1_s:11.2f}"
+    young_pa, gamma_r_s, gamma_m_1_s = (
+        solution.parameters[name] for name in ("young_pa", "gamma_r_s", "gamma_m_1_s")
+    )
+    return f"{1e-3 * young_pa:9.1f}{1e3 * gamma_r_s:10.2f}{gamma_m_1_s:11.2f}"
 
 
 def interval(estimate: Estimate) -> str:

@@ -129,7 +129,7 @@ def study(
         optimum = ReducedSpace()(Collocation([experiment], parameters(expected), scheme))
         if not optimum.status.converged:
             raise SystemExit(f"from the truth: {optimum.message}")
-        expected = np.array(optimum.theta)
+        expected = optimum.theta
     outcomes = []
     for number, guess in enumerate(starts):
         if only and number not in only:
@@ -137,7 +137,7 @@ def study(
         collocation = Collocation([experiment], parameters(guess), scheme)
         with counted_factorisations() as count:
             solution = ReducedSpace()(collocation)
-        ratios = np.abs(np.log(np.array(solution.theta) / expected))
+        ratios = np.abs(np.log(solution.theta / expected))
         close = 1e-4 if noisy else TOLERANCE
         outcomes.append(
             Outcome(
@@ -149,7 +149,7 @@ def study(
                 solution.rms_m,
                 float(np.exp(ratios.max())),
                 tuple(guess.tolist()),
-                tuple(solution.theta),
+                tuple(solution.theta.tolist()),
                 solution.message,
             )
         )

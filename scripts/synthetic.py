@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence, write_poses_csv
-from collocation_sysid.nlp.parameters import Theta
 from collocation_sysid.nlp.simulation import simulate
 from collocation_sysid.problem import load_problem
 
@@ -70,7 +69,11 @@ def unmeasured(problem: Path, poses: str, logged: PoseSequence) -> Experiment:
 
 
 def measure(
-    experiment: Experiment, fine: PoseSequence, truth: Theta, noise_m: float, seed: int
+    experiment: Experiment,
+    fine: PoseSequence,
+    truth: Mapping[str, float],
+    noise_m: float,
+    seed: int,
 ) -> np.ndarray:
     """Marker tracks (T, M, 3) of a Newmark simulation on the fine poses' own step, with noise."""
     grasp = experiment.grasps[0]

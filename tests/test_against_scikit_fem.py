@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import skfem
 from checks import relative_error
+from materials_small import ELASTIC, LAME, elastic
 from skfem.models.elasticity import linear_elasticity
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 
-LAMBDA_PA, MU_PA = 200.0, 300.0
+LAMBDA_PA, MU_PA = LAME
 
 
 class Library:
@@ -115,19 +116,19 @@ def positions(small_mesh, rng) -> np.ndarray:
 
 def test_neo_hookean_energy(make_body, library, positions):
     expected = library.scalar(energy_density, positions)
-    found = make_body("neo-hookean").energy(positions, LAMBDA_PA, MU_PA)
+    found = make_body("neo-hookean").energy(positions, **ELASTIC)
     assert found == pytest.approx(expected, rel=1e-12)
 
 
 def test_neo_hookean_force(make_body, library, positions):
     expected = -library.vector(virtual_work, positions)
-    found = make_body("neo-hookean").elastic_force(positions, LAMBDA_PA, MU_PA)
+    found = make_body("neo-hookean").elastic_force(positions, **ELASTIC)
     assert relative_error(found, expected) < 1e-12
 
 
 def test_neo_hookean_stiffness(make_body, library, positions):
     expected = library.matrix(tangent_work, positions)
-    found = make_body("neo-hookean").stiffness(positions, LAMBDA_PA, MU_PA)
+    found = make_body("neo-hookean").stiffness(positions, **ELASTIC)
     assert relative_error(found.toarray(), expected) < 1e-12
 
 
@@ -145,7 +146,8 @@ def test_neo_hookean_damping(make_body, library, positions, rng):
 @pytest.mark.parametrize("material", MATERIALS)
 def test_stiffness_at_rest_is_linear_elasticity(make_body, library, material):
     expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
-    found = make_body(material).stiffness(library.points_m, LAMBDA_PA, MU_PA)
+    body = make_body(material)
+    found = body.stiffness(library.points_m, **elastic(body))
     assert relative_error(found.toarray(), expected) < 1e-12
 
 
@@ -158,11 +160,11 @@ def test_quadratic_neo_hookean_energy_force_and_stiffness(quadratic, rng):
     np.testing.assert_allclose(body.nodes_m, library.points_m)
     x = body.nodes_m + rng.uniform(-0.002, 0.002, body.nodes_m.shape)
     energy = library.scalar(energy_density, x)
-    assert body.energy(x, LAMBDA_PA, MU_PA) == pytest.approx(energy, rel=1e-10)
+    assert body.energy(x, **ELASTIC) == pytest.approx(energy, rel=1e-10)
     force = -library.vector(virtual_work, x)
-    assert relative_error(body.elastic_force(x, LAMBDA_PA, MU_PA), force) < 1e-10
+    assert relative_error(body.elastic_force(x, **ELASTIC), force) < 1e-10
     stiffness = library.matrix(tangent_work, x)
-    assert relative_error(body.stiffness(x, LAMBDA_PA, MU_PA).toarray(), stiffness) < 1e-10
+    assert relative_error(body.stiffness(x, **ELASTIC).toarray(), stiffness) < 1e-10
 
 
 @pytest.mark.parametrize("intorder", [2, 6])
@@ -170,7 +172,7 @@ def test_quadratic_stiffness_at_rest_is_exact(quadratic, small_mesh, intorder):
     library = Library(small_mesh, skfem.ElementTetP2(), intorder)
     body = quadratic[1]("linear")
     expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
-    found = body.stiffness(library.points_m, LAMBDA_PA, MU_PA)
+    found = body.stiffness(library.points_m, **ELASTIC)
     assert relative_error(found.toarray(), expected) < 1e-10
 
 

@@ -257,7 +257,7 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
     with terminal.Progress(console, cs.load_problem("problem.toml")) as progress:
-        progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, np.array([*TRUTH.values()]), 0.5))
+        progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, TRUTH, 0.5))
         progress.say("checking")
     assert "violation N" in screen.getvalue()
     assert "2.5000" in screen.getvalue()

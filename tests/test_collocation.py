@@ -22,6 +22,7 @@ from problems_small import (
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.fem.batched.combine import combine_with_numpy
+from collocation_sysid.fem.moduli import engineering as engineering_moduli
 from collocation_sysid.nlp import block_band
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
@@ -85,10 +86,8 @@ def seen_with_gaps(experiment: Experiment) -> Experiment:
 
 def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
     q = collocation.parameters.guess_q if q is None else q
-    theta = collocation.parameters.theta(q)
-    return collocation.pack(
-        q, [march(s.experiment, s.dynamics, theta) for s in collocation.segments]
-    )
+    motions = [march(s.experiment, s.dynamics, s.constants.theta(q)) for s in collocation.segments]
+    return collocation.pack(q, motions)
 
 
 def hessian(collocation: Collocation, z: np.ndarray, weight: float, y: np.ndarray) -> sp.csc_array:
@@ -239,7 +238,7 @@ def test_variables_and_rows_are_in_the_documented_order():
     q, positions = collocation.unpack(z)
     expected_z, expected_g = [q], []
     for segment, x in zip(collocation.segments, positions, strict=True):
-        residual = segment.dynamics.residual(x, collocation.theta(z))
+        residual = segment.dynamics.residual(x, segment.constants.theta(q))
         expected_z.append(x.ravel() / segment.length_m)
         rows = residual[segment.dynamics.first_row :, segment.free_dofs]
         expected_g.append(rows.ravel() / segment.force_n)
@@ -430,8 +429,8 @@ def test_fixing_parameters_drops_their_columns():
 def test_both_elastic_pairs_describe_the_same_constraints():
     lame, engineering = Collocation([swung()], GUESS), Collocation([swung()], ENGINEERING)
     z = some_point(lame)
-    theta = lame.theta(z)
-    q = np.log([theta.young_pa, theta.poisson, theta.gamma_r_s, theta.gamma_m_1_s])
+    lambda_pa, mu_pa, *damping = lame.values(z).values()
+    q = np.log([*engineering_moduli(lambda_pa, mu_pa), *damping])
     other = engineering.pack(q, lame.unpack(z)[1])
     newtons = lame.violations_n(z)[0]
     np.testing.assert_allclose(

@@ -24,6 +24,7 @@ from collocation_sysid.nlp.dynamics import Dynamics
 from collocation_sysid.nlp.marching import march
 
 THETA = as_theta(TRUTH)
+ELASTIC = {"lambda_pa": TRUTH["lambda_pa"], "mu_pa": TRUTH["mu_pa"]}
 
 
 # The printed equations of backward Euler
@@ -40,7 +41,7 @@ def backward_euler() -> tuple[Collocation, np.ndarray]:
 
 
 def stiffness(body: Body, x: np.ndarray) -> np.ndarray:
-    return body.stiffness(x.reshape(-1, 3), THETA.lambda_pa, THETA.mu_pa).toarray()
+    return body.stiffness(x.reshape(-1, 3), **ELASTIC).toarray()
 
 
 def test_residual_is_the_printed_equation_of_motion(backward_euler):
@@ -51,9 +52,9 @@ def test_residual_is_the_printed_equation_of_motion(backward_euler):
     for t in range(2, len(x)):
         v = (x[t] - x[t - 1]) / step
         a = (x[t] - 2 * x[t - 1] + x[t - 2]) / step**2
-        elastic = body.elastic_force(x[t].reshape(-1, 3), THETA.lambda_pa, THETA.mu_pa).ravel()
-        damping = -THETA.gamma_r_s * stiffness(body, x[t]) @ v
-        damping -= THETA.gamma_m_1_s * body.dof_mass * v
+        elastic = body.elastic_force(x[t].reshape(-1, 3), **ELASTIC).ravel()
+        damping = -TRUTH["gamma_r_s"] * stiffness(body, x[t]) @ v
+        damping -= TRUTH["gamma_m_1_s"] * body.dof_mass * v
         weight = np.outer(body.node_mass, GRAVITY_M_S2).ravel()
         expected = elastic + damping + weight - body.dof_mass * a
         np.testing.assert_allclose(residual[t], expected, atol=1e-12 * np.abs(expected).max())
@@ -204,7 +205,7 @@ def energies(scheme: str, theta: np.ndarray) -> np.ndarray:
             v[2:] = (3 * x[2:] - 4 * x[1:-1] + x[:-2]) / (2 * step)
     kinetic = 0.5 * (v**2 @ dynamics.body.dof_mass)
     body = experiment.body
-    elastic = [body.energy(state, theta.lambda_pa, theta.mu_pa) for state in x]
+    elastic = [body.energy(state, lambda_pa=theta[0], mu_pa=theta[1]) for state in x]
     return kinetic + np.array(elastic)
 
 

@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from problems_small import box
 
-from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, LAME, Parameter, Parameters
+from collocation_sysid.fem.moduli import ENGINEERING, LAME
+from collocation_sysid.nlp.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.statistics.identifiability import verdicts
-from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
+from collocation_sysid.statistics.linearised import Derived, FitBlock, LinearisedFit
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
+DAMPING = ("gamma_r_s", "gamma_m_1_s")
 VALUES = {"lambda_pa": 2000.0, "mu_pa": 300.0, "young_pa": 800.0, "poisson": 0.4}
 VALUES |= {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
 Z95 = 1.96
@@ -33,7 +36,9 @@ def uncertainty(covariance: np.ndarray, of: Parameters | None = None) -> Uncerta
     seen, residual = np.ones((4, 1), dtype=bool), np.zeros((4, 1, 3))
     block = FitBlock("swing", 0.01 * np.arange(4), ("tip",), seen, residual, slope, np.ones(1))
     names = tuple(item.name for item in of.free)
-    fit = LinearisedFit((block,), names, k, np.zeros(k), np.zeros(k), np.zeros(k, dtype=bool))
+    derived = Derived.of([ThetaMap(of, box())], of.guess_q)
+    nothing, free = np.zeros(k), np.zeros(k, dtype=bool)
+    fit = LinearisedFit((block,), names, k, nothing, nothing, free, derived)
     return uncertainty_of(fit, of, of.guess_q)
 
 

@@ -112,9 +112,9 @@ def test_elastic_parameters_may_be_young_and_poisson(tiny):
             f"poisson = {{ fixed = {poisson} }}",
         ),
     )(tiny)
-    parameters = load(tiny).parameters
-    theta = parameters.theta(parameters.guess_q)
-    assert (theta.lambda_pa, theta.mu_pa) == pytest.approx((200.0, 300.0))
+    problem = load(tiny)
+    parameters = problem.parameters
+    assert problem.body.theta(parameters.guesses)[:2] == pytest.approx([200.0, 300.0])
     assert [item.name for item in parameters.free] == ["young_pa", "gamma_r_s", "gamma_m_1_s"]
 
 

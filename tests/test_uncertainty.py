@@ -17,9 +17,10 @@ from scipy.stats import chi2
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
+from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import DAMPING, ENGINEERING, Parameter, Parameters
+from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.statistics.uncertainty import (
@@ -33,8 +34,7 @@ NAMES = tuple(TRUTH)
 
 
 def positions(collocation: Collocation, q):
-    theta = collocation.parameters.theta(q)
-    return [march(s.experiment, s.dynamics, theta) for s in collocation.segments]
+    return [march(s.experiment, s.dynamics, s.constants.theta(q)) for s in collocation.segments]
 
 
 def simulated(experiments, parameters=AT_TRUTH, **options) -> tuple[Collocation, np.ndarray]:
@@ -63,16 +63,14 @@ def changed(parameters: Parameters, **changes: dict) -> Parameters:
     )
 
 
-def engineering(theta: np.ndarray) -> Parameters:
-    """The same material by (E, ν)."""
-    values = (theta.young_pa, theta.poisson, theta.gamma_r_s, theta.gamma_m_1_s)
-    uppers = (1e6, 0.49, 10.0, 100.0)
-    return Parameters(
-        tuple(
-            Parameter(name, value, 1e-6, upper)
-            for name, value, upper in zip(ENGINEERING + DAMPING, values, uppers, strict=True)
-        )
+def in_engineering_moduli() -> Parameters:
+    """The truth by (E, ν)."""
+    young_pa, poisson = engineering(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    elastic = (
+        Parameter("young_pa", young_pa, 1e-6, 1e6),
+        Parameter("poisson", poisson, 1e-6, 0.49),
     )
+    return Parameters((*elastic, *AT_TRUTH.items[2:]))
 
 
 # Sensitivities
@@ -338,7 +336,7 @@ def test_damping_of_a_body_at_rest_is_reported_as_undetermined():
 def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
     experiment = measured(hung_cube())
     lame = covariance(*simulated([experiment]))
-    young = covariance(*simulated([experiment], engineering(np.array([*TRUTH.values()]))))
+    young = covariance(*simulated([experiment], in_engineering_moduli()))
     for derived, direct in ((lame, young), (young, lame)):
         for name, estimate in derived.derived.items():
             assert estimate.value == pytest.approx(direct.estimates[name].value)

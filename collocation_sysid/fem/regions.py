@@ -175,6 +175,7 @@ def _cells(mesh: TetMesh, given: Selection | ArrayLike) -> Index:
             f"cells are an array {array.shape} of {array.dtype}; expected cell numbers, or a mask "
             f"({count},) that is true somewhere"
         )
-    if array.min() < 0 or array.max() >= count:
-        raise InputError(f"cell {array.max()} does not exist; the mesh has {count}, from 0 on")
+    outside = array[(array < 0) | (array >= count)]
+    if outside.size:
+        raise InputError(f"cell {outside[0]} does not exist; the mesh has {count}, from 0 on")
     return np.unique(array).astype(np.int64)

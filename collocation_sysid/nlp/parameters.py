@@ -365,8 +365,7 @@ class ThetaMap:
     def derivatives(self, q: Array) -> tuple[Array, Array]:
         """∂θ/∂q (k, nq) and ∂²θ/∂q² (k, nq, nq)."""
         _, jacobian, *hessians = self._theta(np.asarray(q))
-        size = len(q)
-        return jacobian.full(), np.array([h.full() for h in hessians]).reshape(-1, size, size)
+        return jacobian.full(), np.array([hessian.full() for hessian in hessians])
 
     def derived(self, q: Array) -> tuple[Array, Array]:
         """Values of `derived_names`, and their derivatives by q."""
