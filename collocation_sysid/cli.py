@@ -6,7 +6,6 @@ Exit codes: 0 converged, 1 not converged, 2 bad input, 130 interrupted.
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from .errors import InputError, SimulationError
+from .folders import require_possible, run_name
 
 if TYPE_CHECKING:
     from .study import Limits, PlannedRun
@@ -64,6 +64,9 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]
 OneExperiment = Annotated[
     str | None, typer.Option(metavar="NAME", help="Experiment; by default the first.")
 ]
+AllowCode = Annotated[
+    bool, typer.Option("--allow-code", help="Run Python files that the problem names.")
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list the runs.")]
 
 EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -87,11 +90,16 @@ def solve(
     method: Annotated[str | None, typer.Option(help="Method, instead of the problem's.")] = None,
     out: Out = None,
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     as_json: AsJson = False,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Identify the parameters and write a run folder."""
+    """Identify the parameters and write a run folder.
+
+    Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
+    --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
+    """
     from .methods.solution import Status
     from .output.record import as_json as json_text
     from .output.record import result, write_run
@@ -100,9 +108,9 @@ def solve(
     from .run import run
     from .terminal import Progress, summary
 
-    folder = out or Path("runs") / _run_name(problem)
-    loaded = load_problem(problem, set_ or ())
-    _require_possible(folder)
+    folder = out or Path("runs") / run_name(problem)
+    loaded = load_problem(problem, set_ or (), allow_code=allow_code)
+    require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
         finished = run(loaded, method, watch=progress.iteration, log=progress.say)
@@ -128,6 +136,7 @@ def simulate(
     problem: ProblemPath,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to write.")],
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     integrator: Annotated[
         str, typer.Option(help="newmark, or a scheme: midpoint, backward-euler, bdf2.")
     ] = "newmark",
@@ -147,8 +156,8 @@ def simulate(
     from .synthesis import write_data
     from .terminal import Progress
 
-    loaded = load_problem(problem, set_ or (), simulation=True)
-    _require_possible(out)
+    loaded = load_problem(problem, set_ or (), True, allow_code)
+    require_possible(out)
     with Progress(errors, loaded, quiet=quiet) as progress:
         written = write_data(
             loaded, out, integrator, timestep_s, noise_m, seed, frames, progress.share
@@ -168,7 +177,9 @@ def simulate(
 )
 def compare(
     problem: ProblemPath,
-    methods: Annotated[str, typer.Option(metavar="A,B,…", help="Methods, separated by commas.")],
+    methods: Annotated[
+        str, typer.Option(metavar="A,B,…", help="Methods, each with its options of the file.")
+    ],
     starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
     spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
@@ -181,6 +192,7 @@ def compare(
     scheduler: Scheduler = None,
     time_limit: TimeLimit = None,
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     out: Out = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -196,10 +208,11 @@ def compare(
     from .study.table import Yardstick
 
     names, limits = parse_methods(methods), Limits(workers, scheduler, time_limit)
-    loaded = load_problem(problem, set_ or ())
+    loaded = load_problem(problem, set_ or (), allow_code=allow_code)
     free = [item.name for item in loaded.parameters.free]
     yardstick = Yardstick(read_truth(truth or (), loaded.parameters.names, free), within)
-    planned = plan_comparison(loaded, names, set_ or (), starts, spread, seed, yardstick.truth)
+    options = starts, spread, seed, yardstick.truth, allow_code
+    planned = plan_comparison(loaded, names, set_ or (), *options)
     study = _Study("compare", problem, planned, yardstick, out)
     _study(study, limits, dry_run, as_json, quiet)
 
@@ -224,6 +237,7 @@ def sweep(
     scheduler: Scheduler = None,
     time_limit: TimeLimit = None,
     set_: Overrides = None,
+    allow_code: AllowCode = False,
     out: Out = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -237,8 +251,10 @@ def sweep(
 
     chosen = parse_methods(method, "--method")[0] if method else None
     limits = Limits(workers, scheduler, time_limit)
-    planned = plan_sweep(problem, parse_over(over), set_ or (), chosen)
-    load_problem(problem, planned[0].overrides)  # a missing file would fail every run
+    planned = plan_sweep(problem, parse_over(over), set_ or (), chosen, allow_code)
+    load_problem(
+        problem, planned[0].overrides, False, allow_code
+    )  # a missing file would fail every run
     _study(_Study("sweep", problem, planned, Yardstick(), out), limits, dry_run, as_json, quiet)
 
 
@@ -254,7 +270,7 @@ class _Study:
 
     @property
     def folder(self) -> Path:
-        return self.out or Path("runs") / f"{_run_name(self.problem)}-{self.kind}"
+        return self.out or Path("runs") / f"{run_name(self.problem)}-{self.kind}"
 
 
 def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: bool) -> None:
@@ -271,14 +287,14 @@ def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: b
     if dry_run:
         _dry_run(study.planned, finished, as_json)
         return
-    _require_possible(folder)
+    require_possible(folder)
     interrupted = False
     try:
         with StudyProgress(errors, left, len(study.planned), quiet) as progress:
             run_all(left, store, limits, progress.done)
     except KeyboardInterrupt:
         interrupted = True
-    title = f"{study.kind.capitalize()}: {_run_name(study.problem)}"
+    title = f"{study.kind.capitalize()}: {run_name(study.problem)}"
     report = load_report(title, study.kind, study.planned, store, study.yardstick)
     if report.records:
         write_report(report, folder)
@@ -308,13 +324,18 @@ def _dry_run(planned: Sequence[PlannedRun], finished: Sequence[str], as_json: bo
         "check problem.toml", "check problem.toml --set transcription.scheme=backward-euler"
     )
 )
-def check(problem: ProblemPath, set_: Overrides = None, as_json: AsJson = False) -> None:
+def check(
+    problem: ProblemPath,
+    set_: Overrides = None,
+    allow_code: AllowCode = False,
+    as_json: AsJson = False,
+) -> None:
     """Tell what is wrong with a problem before solving it."""
     from .check import check_problem
     from .problem import load_problem
     from .terminal import check_table
 
-    findings = check_problem(load_problem(problem, set_ or ()))
+    findings = check_problem(load_problem(problem, set_ or (), allow_code=allow_code))
     if as_json:
         typer.echo(json.dumps(findings.as_dict(), indent=1))
     else:
@@ -330,7 +351,7 @@ def plot(
     """Draw the pictures of a run again, from its files."""
     from .output.redraw import redraw
 
-    _require_possible(out or run_folder)
+    require_possible(out or run_folder)
     for file in redraw(run_folder, out or run_folder):
         typer.echo(file)
 
@@ -353,7 +374,7 @@ def report(
     file = to or folder / "report.html"
     study = (folder / "summary.json").is_file()
     page = comparison_page(folder) if study else run_page(folder)
-    _require_possible(file.parent)
+    require_possible(file.parent)
     file.write_text(page, encoding="utf-8")
     typer.echo(file)
 
@@ -374,7 +395,7 @@ def animate(
 
     from .output.animation import animate as film
 
-    _require_possible(to.parent if to is not None else run_folder)
+    require_possible(to.parent if to is not None else run_folder)
     with Progress(console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
         task = bar.add_task("filming", total=1.0)
         file = film(
@@ -404,8 +425,27 @@ def view(
     if html is None:
         show(run_folder, field, experiment)
         return
-    _require_possible(html.parent)
+    require_possible(html.parent)
     typer.echo(export_page(run_folder, html, experiment))
+
+
+@app.command(epilog=_examples("methods", "methods interior-point"))
+def methods(
+    name: Annotated[str | None, typer.Argument(help="Tell this method's options.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the methods, or the options of one: defaults, values, and what they do."""
+    from .method_tables import methods_table, options_table
+    from .methods import METHODS
+    from .methods.described import options_schema, require_method, summary
+
+    if name is not None:
+        require_method(name, "NAME")
+    if as_json:
+        listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
+        typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
+    else:
+        Console(highlight=False).print(options_table(name) if name else methods_table())
 
 
 @app.command()
@@ -419,17 +459,9 @@ def schema() -> None:
 @app.command(epilog=_examples("new my_object", "check my_object/problem.toml"))
 def new(name: Annotated[str, typer.Argument(help="Name of the new folder.")]) -> None:
     """Write a commented problem file to start from."""
-    from .problem.template import TEMPLATE
+    from .problem.template import write_template
 
-    folder = Path(name)
-    file = folder / "problem.toml"
-    _require_possible(folder)
-    if file.exists():
-        raise InputError("it is there already; choose another name", file)
-    folder.mkdir(parents=True, exist_ok=True)
-    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
-    file.write_text(TEMPLATE.format(title=title), encoding="utf-8")
-    typer.echo(file)
+    typer.echo(write_template(Path(name)))
 
 
 def _version(wanted: bool) -> None:
@@ -447,21 +479,6 @@ def _root(
     ] = False,
 ) -> None:
     pass
-
-
-def _run_name(problem: Path) -> str:
-    return problem.resolve().parent.name if problem.stem == "problem" else problem.stem
-
-
-def _require_possible(folder: Path) -> None:
-    """Refuse a folder that cannot be made, before any work is done for it."""
-    for place in (folder, *folder.parents):
-        if place.is_dir():
-            if not os.access(place, os.W_OK):
-                raise InputError("this folder cannot be written in; choose another", place)
-            return
-        if place.exists():
-            raise InputError("this is a file; expected a folder to write in", place)
 
 
 def _show(content: RenderableType) -> None:

@@ -8,8 +8,10 @@ from pathlib import Path
 
 
 def hint_at(name: str, known: Iterable[str]) -> str:
-    """What to add to a message about a misspelt name: the known one nearest to it, if any is."""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    """What to add to a message about a name cut short or misspelt: the one that was meant."""
+    names = [other for other in known if len(other) > 2]  # each of two letters is near another
+    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
+    close = longer or difflib.get_close_matches(name, names, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from .arrays import Array
 from .errors import SimulationError
 from .experiment import Experiment
-from .methods import METHODS
+from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
@@ -86,5 +86,5 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     (segment,) = alone.segments
     if not alone.own:
         return segment, np.zeros(0)
-    predicted = METHODS["reduced-space"].solve(alone)
+    predicted = ReducedSpace()(alone)
     return segment, alone.unpack_own(predicted.z)[0]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-from .errors import InputError, SimulationError, hint_at
-from .methods import METHODS
-from .methods.casadi_nlp import why_not
+from .errors import InputError, SimulationError
+from .methods.described import require_method
 from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .problem import Problem
@@ -93,27 +92,10 @@ def solve(
         For an unknown method or option, and when the solver refuses the problem.
     """
     name = method or problem.file.solver.method
-    if name not in METHODS:
-        unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
-        raise InputError(why_not(name) or unknown, None, "--method")
-    chosen = METHODS[name]
-    known = {field.name for field in fields(chosen.options)}
-    in_file = problem.file.solver.model_dump(exclude_unset=True, exclude={"method", "huber"})
-    foreign = sorted(set(in_file) - known)
-    if foreign and method is None:
-        raise InputError(
-            f"method {name!r} has no such option; it has {', '.join(sorted(known))}. "
-            "Name the method it belongs to in solver.method",
-            problem.path,
-            f"solver.{foreign[0]}",
-        )
-    unknown = sorted(set(options) - known)
-    if unknown:
-        raise InputError(f"no option {unknown[0]!r}; {name} has {', '.join(sorted(known))}")
-    given = {key: value for key, value in in_file.items() if key in known} | options
+    require_method(name, "--method")
     try:
-        collocation = build_collocation(problem)
-        solution = chosen.solve(collocation, chosen.options(**given), watch)
+        solver = problem.file.solver.method_named(name, **options)
+        solution = solver(build_collocation(problem), watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:

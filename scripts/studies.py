@@ -27,7 +27,7 @@ class Variant:
     ----------
     name : str, in tables
     method : str
-    options : mapping, as in [solver] of a problem file
+    options : mapping, as in the method's table of a problem file
     share : float
         Of the starts that it is run from; the first ones, for a method that takes long.
     """
@@ -40,7 +40,7 @@ class Variant:
     @property
     def overrides(self) -> list[str]:
         """The options for the command line's --set."""
-        return [f"solver.{key}={value}" for key, value in self.options.items()]
+        return [f"solver.{self.method}.{key}={value}" for key, value in self.options.items()]
 
     def limited(self, time_s: float) -> Variant:
         """With a time limit, unless it has one of its own; reduced-space knows none."""

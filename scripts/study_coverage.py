@@ -32,7 +32,7 @@ from synthetic import swing
 
 from collocation_sysid.experiment import Experiment, Grasp, Nuisance
 from collocation_sysid.fem.moduli import engineering
-from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, solve
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -127,7 +127,7 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     experiment, x = reference(sigma_m)
     rng = np.random.default_rng(seed)
     collocation, phi = twin(experiment, x, case, sigma_m, rng)
-    solution = solve(collocation, ReducedSpaceOptions(tolerance=1e-6, ladder=(1.0,)))
+    solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
     q = solution.z[: collocation.nq]
     fit = linearised_fit(collocation, solution.z)
     found = [uncertainty_of(fit, collocation.parameters, q, *kind) for kind in KINDS]

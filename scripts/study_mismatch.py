@@ -23,7 +23,7 @@ from study_starts import BOUNDS, hanging_cylinder
 from synthetic import Swing
 
 from collocation_sysid.experiment import Experiment, Grasp
-from collocation_sysid.methods.reduced_space import solve
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import simulate, with_markers
@@ -101,7 +101,7 @@ def identify(experiment: Experiment, scheme: str, substeps: int) -> Fit:
         )
     )
     began = time.perf_counter()
-    solution = solve(Collocation([experiment], parameters, scheme, substeps))
+    solution = ReducedSpace()(Collocation([experiment], parameters, scheme, substeps))
     found = solution.theta
     walls = np.array([BOUNDS[name] for name in TRUTH])
     return Fit(

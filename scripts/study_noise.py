@@ -96,9 +96,9 @@ def main() -> None:
 def run(case: Case, sigma_m: float, seed: int) -> Outcome:
     """Identify one noisy twin from the guess."""
     collocation = noisy(sigma_m, seed, GUESS)
-    method = METHODS[case.method]
+    method = METHODS[case.method](**case.options)
     began = time.perf_counter()
-    solution = method.solve(collocation, method.options(**case.options))
+    solution = method(collocation)
     return Outcome(
         solution.status.converged,
         np.log(solution.theta / list(TRUTH.values())),

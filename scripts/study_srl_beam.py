@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from collocation_sysid import Collocation, Problem, Solution, load_problem, solve
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.segment import Segment
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.estimates import Estimate
@@ -170,7 +170,7 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
         solution.collocation.scheme,
         solution.collocation.substeps,
     )
-    predicted = METHODS["reduced-space"].solve(collocation)
+    predicted = ReducedSpace()(collocation)
     ((segment, phi),) = unknowns(predicted)
     (x,) = predicted.positions_m
     return rms_of(segment, x, phi), rms_of(segment, x, np.zeros_like(phi))

@@ -23,7 +23,7 @@ from synthetic import swing
 from collocation_sysid.experiment import Experiment, Grasp, Markers, place_markers
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, solve
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.factorisation import Factoriser
 from collocation_sysid.nlp.parameters import Parameter, Parameters
@@ -122,12 +122,11 @@ def study(
     starts: NDArray[np.float64],
     noisy: bool,
     only: list[int] | None = None,
-    options: ReducedSpaceOptions | None = None,
 ) -> list[Outcome]:
     """Solve from every start."""
     expected = np.array(list(TRUTH.values()))
     if noisy:
-        optimum = solve(Collocation([experiment], parameters(expected), scheme), options)
+        optimum = ReducedSpace()(Collocation([experiment], parameters(expected), scheme))
         if not optimum.status.converged:
             raise SystemExit(f"from the truth: {optimum.message}")
         expected = optimum.theta
@@ -137,7 +136,7 @@ def study(
             continue
         collocation = Collocation([experiment], parameters(guess), scheme)
         with counted_factorisations() as count:
-            solution = solve(collocation, options)
+            solution = ReducedSpace()(collocation)
         ratios = np.abs(np.log(solution.theta / expected))
         close = 1e-4 if noisy else TOLERANCE
         outcomes.append(

@@ -108,15 +108,15 @@ PROBLEM_FILE = [
         edit=replace_text("= 30.0", "= 30.0\ndensity_kg_m3 = 31"),
     ),
     bad(
-        "unknown-key", "object.densty_kg_m3", "unknown key", "did you mean density_kg_m3?",
+        "unknown-key", "object.densty_kg_m3", "unknown key", "did you mean 'density_kg_m3'?",
         edit=replace_text("density", "densty"),
     ),
     bad(
-        "unknown-table", "objekt: unknown key", "did you mean object?",
+        "unknown-table", "objekt: unknown key", "did you mean 'object'?",
         edit=replace_text("[object]", "[objekt]"),
     ),
     bad(
-        "unknown-key-in-an-experiment", "experiment 'swing'", "grasp.pose:", "mean poses?",
+        "unknown-key-in-an-experiment", "experiment 'swing'", "grasp.pose:", "mean 'poses'?",
         edit=replace_text('poses = "', 'pose = "'),
     ),
     bad(
@@ -494,28 +494,28 @@ SOLVING = [
         options=["--method", "newton"],
     ),
     bad(
-        "unknown-solver-option", "solver.tol:", "unknown key", "did you mean tolerance?",
-        options=settings("solver.tol=1e-6"),
+        "unknown-option", "solver.interior-point", "no option 'tol'", "did you mean 'tolerance'?",
+        options=settings("solver.interior-point.tol=1e-6"),
     ),
     bad(
         "unknown-ipopt-option", "problem.toml: solver", "mu_strateg",
-        options=settings("solver.ipopt.mu_strateg=adaptive"),
+        options=settings("solver.interior-point.ipopt.mu_strateg=adaptive"),
     ),
     bad(
         "unknown-ipopt-setting", "problem.toml: solver", "mu_strategy", '"foo"',
-        options=settings("solver.ipopt.mu_strategy=foo"),
+        options=settings("solver.interior-point.ipopt.mu_strategy=foo"),
     ),
     bad(
-        "truth-for-an-ipopt-switch", "solver.ipopt.expect_infeasible", "found true", '"yes"',
-        options=settings("solver.ipopt.expect_infeasible=true"),
+        "truth-for-an-ipopt-switch", "ipopt.expect_infeasible", "found true", '"yes"',
+        options=settings("solver.interior-point.ipopt.expect_infeasible=true"),
     ),
     bad(
         "unknown-linear-solver", "problem.toml: solver", "linear_solver", '"fast"',
-        options=settings("solver.linear_solver=fast"),
+        options=settings("solver.interior-point.linear_solver=fast"),
     ),
     bad(
         "linear-solver-not-installed", "problem.toml: solver", "ma57", "not installed", "mumps",
-        options=settings("solver.linear_solver=ma57"),
+        options=settings("solver.interior-point.linear_solver=ma57"),
     ),
 ]  # fmt: skip
 

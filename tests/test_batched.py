@@ -1,22 +1,34 @@
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+import scipy.special
 from checks import relative_error
-from materials_small import ELASTIC, elastic
+from materials_small import ELASTIC
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem import batched
-from collocation_sysid.fem.batched import choose_evaluator, jit, make_combiner, simd
+from collocation_sysid.fem.batched import (
+    Batch,
+    choose_evaluator,
+    instructions,
+    jit,
+    make_combiner,
+    make_evaluator,
+    simd,
+)
 from collocation_sysid.fem.batched.combine import combine_natively, combine_with_numpy
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.materials import neo_hookean
+from collocation_sysid.fem.expressions import PointKernel
+from collocation_sysid.fem.materials import MATERIALS, neo_hookean
 
 VARIABLE = "COLLOCATION_SYSID_EVALUATOR"
 
@@ -32,6 +44,13 @@ def without_llvmlite(monkeypatch):
     monkeypatch.setitem(sys.modules, "llvmlite", None)
     for module in ("jit", "simd"):
         monkeypatch.delitem(sys.modules, f"{batched.__name__}.{module}")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    folder = tmp_path / "kernels"
+    monkeypatch.setenv("COLLOCATION_SYSID_CACHE", str(folder))
+    return folder
 
 
 def new_body(mesh, material: str | Callable = "neo-hookean", evaluator: str = "auto") -> Body:
@@ -74,7 +93,7 @@ def test_everything_works_without_llvmlite(small_mesh, make_body, without_llvmli
     assert body.evaluator == "casadi"
     x = squeezed(small_mesh)
     expected = make_body("neo-hookean", "casadi").elastic_force(x, **ELASTIC)
-    np.testing.assert_array_equal(body.elastic_force(x, **elastic(body)), expected)
+    np.testing.assert_array_equal(body.elastic_force(x, **ELASTIC), expected)
     assert make_combiner(random_plan(np.random.default_rng(0))).__qualname__.startswith(
         combine_with_numpy.__name__
     )
@@ -93,58 +112,240 @@ def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, monkey
     monkeypatch.setattr(simd, "vector_lanes", lambda: lanes)
     x = squeezed(small_mesh)
     body, reference = new_body(small_mesh, evaluator="simd"), make_body("neo-hookean", "casadi")
-    found, expected = (each.elastic_force(x, **elastic(each)) for each in (body, reference))
+    found, expected = (each.elastic_force(x, **ELASTIC) for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
-    found, expected = (each.stiffness(x, **elastic(each)).toarray() for each in (body, reference))
+    found, expected = (each.stiffness(x, **ELASTIC).toarray() for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
 
 
-FUNCTIONS_OF_J = {
-    "sqrt": ca.sqrt,
-    "fabs": lambda j: ca.fabs(j - 2),
-    "exp": ca.exp,
-    "log": ca.log,
-    "power": lambda j: j**2.7,
-    "power of variables": lambda j: j**j,
-    "sin": ca.sin,
-    "cos": ca.cos,
-    "fmin": lambda j: ca.fmin(j, 0.9),
-    "fmax": lambda j: ca.fmax(j, 0.9),
-    "inverse": lambda j: 1 / j,
-    "negative twice": lambda j: -(j + j),
+FUNCTIONS: dict[str, Callable] = {
+    "OP_ADD": lambda x, y: x + y,
+    "OP_SUB": lambda x, y: x - y,
+    "OP_MUL": lambda x, y: x * y,
+    "OP_DIV": lambda x, y: x / y,
+    "OP_NEG": lambda x, y: -x,
+    "OP_INV": lambda x, y: 1 / x + y,
+    "OP_SQ": lambda x, y: x**2,
+    "OP_TWICE": lambda x, y: x + x,
+    "OP_SQRT": lambda x, y: ca.sqrt(x),
+    "OP_EXP": lambda x, y: ca.exp(x),
+    "OP_EXPM1": lambda x, y: ca.expm1(x),
+    "OP_LOG": lambda x, y: ca.log(x),
+    "OP_LOG1P": lambda x, y: ca.log1p(x),
+    "OP_POW": lambda x, y: x**y,
+    "OP_CONSTPOW": lambda x, y: x**2.7,
+    "OP_SIN": lambda x, y: ca.sin(x),
+    "OP_COS": lambda x, y: ca.cos(x),
+    "OP_TAN": lambda x, y: ca.tan(x),
+    "OP_ASIN": lambda x, y: ca.asin(x),
+    "OP_ACOS": lambda x, y: ca.acos(x),
+    "OP_ATAN": lambda x, y: ca.atan(x),
+    "OP_ATAN2": ca.atan2,
+    "OP_SINH": lambda x, y: ca.sinh(x),
+    "OP_COSH": lambda x, y: ca.cosh(x),
+    "OP_TANH": lambda x, y: ca.tanh(x),
+    "OP_ASINH": lambda x, y: ca.asinh(x),
+    "OP_ACOSH": lambda x, y: ca.acosh(x),
+    "OP_ATANH": lambda x, y: ca.atanh(x),
+    "OP_ERF": lambda x, y: ca.erf(x),
+    "OP_HYPOT": ca.hypot,
+    "OP_FABS": lambda x, y: ca.fabs(x),
+    "OP_SIGN": lambda x, y: ca.sign(x),
+    "OP_COPYSIGN": ca.copysign,
+    "OP_FLOOR": lambda x, y: ca.floor(x),
+    "OP_CEIL": lambda x, y: ca.ceil(x),
+    "OP_FMOD": ca.fmod,
+    "OP_REMAINDER": ca.remainder,
+    "OP_FMIN": ca.fmin,
+    "OP_FMAX": ca.fmax,
+    "OP_LT": lambda x, y: x < y,
+    "OP_LE": lambda x, y: x <= y,
+    "OP_EQ": lambda x, y: x == y,
+    "OP_NE": lambda x, y: x != y,
+    "OP_NOT": lambda x, y: ca.logic_not(x),
+    "OP_AND": ca.logic_and,
+    "OP_OR": ca.logic_or,
+    "OP_IF_ELSE_ZERO": lambda x, y: ca.if_else(x, y, 0),
 }
+NUMBERS = [0.0, 1e-9, 0.25, 0.5, 1.0, 1.5, 2.0, 3.7, 40.0, np.inf]
+NUMBERS = [np.nan, *NUMBERS, *(-number for number in NUMBERS)]
 
 
-@pytest.mark.parametrize("name", FUNCTIONS_OF_J)
-def test_functions_an_energy_may_use(small_mesh, name):
-    def energy(F, lambda_pa, mu_pa):
-        return lambda_pa * FUNCTIONS_OF_J[name](ca.det(F))
-
-    values = [
-        new_body(small_mesh, energy, evaluator).energy(squeezed(small_mesh), **ELASTIC)
-        for evaluator in ("simd", "casadi")
-    ]
-    assert values[0] == pytest.approx(values[1], rel=1e-13)
+def kernel_of(function: Callable) -> PointKernel:
+    """A function of two numbers, which are coordinates of one node, as a kernel."""
+    x, geometry, theta = ca.SX.sym("x", 3), ca.SX.sym("geometry", 4), ca.SX.sym("theta", 3)
+    value = geometry[3] * function(x[0], x[1])
+    names = ["x", "geometry", "theta"]
+    pieces = ca.Function("value", [x, geometry, theta], [value], names, ["value"])
+    return PointKernel(pieces, ("x",), {"value": "none"})
 
 
-def test_function_the_vector_code_lacks_is_refused_with_the_remedy(small_mesh):
-    def clipped(F, lambda_pa, mu_pa):
-        return ca.if_else(ca.det(F) < 0.1, 0, neo_hookean(F, lambda_pa, mu_pa))
+def values(kernel: PointKernel, evaluator: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    count = len(x)
+    cells = np.arange(count)[:, None]
+    geometry = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 1, 4))
+    fields = np.stack([x, y, np.zeros(count)], axis=1).reshape(1, -1)
+    found = np.empty((1, count))
+    batch = Batch(kernel, cells, geometry, cells, count)
+    make_evaluator(batch, evaluator)([fields], np.zeros(3), found, 1)
+    return found[0]
 
+
+def both_values(function: Callable, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    return [values(kernel_of(function), evaluator, x, y) for evaluator in ("simd", "casadi")]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_operations_are_those_of_casadi(name):
+    pieces = kernel_of(FUNCTIONS[name]).pieces
+    assert getattr(ca, name) in [pieces.instruction_id(k) for k in range(pieces.n_instructions())]
+    x, y = np.array(list(product(NUMBERS, NUMBERS))).T
+    found, expected = both_values(FUNCTIONS[name], x, y)
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "OP_ERFINV"])
+def test_derivatives_need_no_other_operations(name):
+    z = ca.SX.sym("z", 2)
+    function = FUNCTIONS.get(name, lambda x, y: ca.erfinv(x))
+    value = ca.exp(function(z[0], z[1]))
+    for _ in range(3):  # as many as a curvature kernel takes
+        value = ca.sum1(ca.gradient(value, z))
+        instructions.check_operations(ca.Function("derivative", [z], [value]))
+
+
+def test_every_operation_of_vector_code_is_tested():
+    known = {instructions.operation_name(operation) for operation in instructions.OPERATIONS}
+    assert known - set(FUNCTIONS) == {"OP_ASSIGN", "OP_ERFINV"}
+
+
+def test_functions_called_from_vector_code_are_resolved():
+    assert set(instructions.LIBRARY.values()) <= set(jit.LIBM)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x, y: ca.sin(x) * ca.cos(x),
+        lambda x, y: 2**x,
+        lambda x, y: 2 ** ca.floor(x),
+        lambda x, y: 10**x,
+        lambda x, y: x**0.5 + x ** (1 / 3),
+    ],
+)
+def test_what_the_compiler_makes_other_calls_of_is_resolved(function):
+    x = np.linspace(0, 4, 11)
+    np.testing.assert_allclose(*both_values(function, x, x), rtol=1e-13)
+
+
+def test_branch_that_is_not_taken_is_not_felt():
+    x = np.array([-1.0, 0.0, 1.0, 2.0, -3.0, 4.0, 0.0, 5.0, 6.0])
+    found, expected = both_values(lambda x, y: ca.if_else(x > 0, ca.log(x), -1), x, x)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    assert (found[x <= 0] == -1).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
+def test_what_is_infinite_in_the_last_element_stays_so(count):
+    x = np.zeros(count)
+    found, expected = both_values(lambda x, y: 1 / x, x, x)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_inverse_error_function_is_exact():
+    x = np.array([-1.5, -1.0, -0.95, -0.7, -0.69, -1e-9, 0.0, 0.3, 0.7, 0.95, 1.0, 2.0, np.nan])
+    found = values(kernel_of(lambda x, y: ca.erfinv(x)), "simd", x, x)
+    np.testing.assert_allclose(found, scipy.special.erfinv(x), rtol=1e-13)
+
+
+def branching(F, lambda_pa, mu_pa):
+    """Softer in tension than in compression, with most of the functions there are."""
+    j, stretch, shear = ca.det(F), ca.trace(F.T @ F) - 3, F[0, 1] + F[1, 0]
+    volumetric = ca.if_else(j < 1, j - 1 - ca.log(j), ca.tanh(j - 1) ** 2 / 2)
+    limited = ca.erf(stretch) + ca.atan2(stretch, j) + ca.log1p(stretch**2) + ca.erfinv(shear / 4)
+    clipped = ca.fmax(stretch, 0.1) ** 3 + ca.fmin(shear, 0.0) ** 2 + ca.hypot(shear, j)
+    either = ca.if_else(ca.logic_or(shear > 0.1, stretch < 0), ca.cosh(shear), ca.exp(-stretch))
+    return lambda_pa * volumetric + mu_pa * (limited + clipped + either)
+
+
+@pytest.mark.parametrize("method", ["force", "linearise", "curvature"])
+def test_energy_with_branches_is_the_same_by_both_evaluators(small_mesh, method, rng):
+    # It is for the evaluators only: an undeformed body has stress.
+    material = replace(MATERIALS["neo-hookean"], energy=branching)
+    bodies = [new_body(small_mesh, material, evaluator) for evaluator in ("simd", "casadi")]
+    x = small_mesh.points_m + 0.004 * rng.standard_normal((3, *small_mesh.points_m.shape))
+    ratios = bodies[0].volume_ratios(x)
+    assert ratios.min() < 1 < ratios.max()
+    v, w = rng.standard_normal((2, *x.shape))
+    states, theta = [x, v, w] if method == "curvature" else [x, v], (*ELASTIC.values(), 0.01, 0.1)
+    found, expected = (getattr(body, method)(*states, theta) for body in bodies)
+    for name in getattr(expected, "__dataclass_fields__", [None]):
+        pair = (getattr(each, name) if name else each for each in (found, expected))
+        assert relative_error(*pair) < 1e-12
+
+
+# What vector code lacks -----------------------------------------------------------------------
+
+
+def printing(F, lambda_pa, mu_pa):
+    return ca.SX.printme(neo_hookean(F, lambda_pa, mu_pa), 0)
+
+
+def test_material_that_vector_code_lacks_yields_to_casadi_with_a_note(small_mesh, make_body):
+    body = new_body(small_mesh, printing)
+    assert body.evaluator == "casadi"
+    (note,) = body.notes
+    assert "CasADi's map, which is many times slower" in note
+    assert "no CasADi operation OP_PRINTME" in note
     x = squeezed(small_mesh)
-    with pytest.raises(InputError, match=r"operation OP_\w+; choose evaluator='casadi'"):
-        new_body(small_mesh, clipped, "simd").energy(x, **ELASTIC)
-    assert new_body(small_mesh, clipped, "casadi").energy(x, **ELASTIC) > 0
+    assert body.energy(x, **ELASTIC) == make_body("neo-hookean", "casadi").energy(x, **ELASTIC)
 
 
-# Compiled code on disk ------------------------------------------------------------------------
+def test_forced_vector_code_refuses_what_it_lacks_with_the_remedy(small_mesh, monkeypatch):
+    refusal = r"operation OP_PRINTME; choose evaluator='casadi'"
+    with pytest.raises(InputError, match=refusal):
+        new_body(small_mesh, printing, "simd")
+    monkeypatch.setenv(VARIABLE, "simd")
+    with pytest.raises(InputError, match=refusal):
+        new_body(small_mesh, printing)
+
+
+def test_kernel_refuses_what_vector_code_lacks():
+    x = np.ones(3)
+    with pytest.raises(InputError, match="no CasADi operation OP_PRINTME"):
+        values(kernel_of(ca.SX.printme), "simd", x, x)
+
+
+@pytest.mark.parametrize("evaluator", ["simd", "casadi"])
+def test_there_is_no_note_where_the_evaluator_is_as_asked_for(small_mesh, evaluator):
+    assert new_body(small_mesh, evaluator=evaluator).notes == ()
+    assert new_body(small_mesh).notes == ()
 
 
 @pytest.fixture
-def cache(tmp_path, monkeypatch) -> Path:
-    folder = tmp_path / "kernels"
-    monkeypatch.setenv("COLLOCATION_SYSID_CACHE", str(folder))
-    return folder
+def broken_compiler(cache, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no registers")
+
+    monkeypatch.setattr(jit, "_compile", fail)
+
+
+def test_failing_compiler_yields_to_casadi_with_a_note(small_mesh, make_body, broken_compiler):
+    body = new_body(small_mesh)
+    x = squeezed(small_mesh)
+    assert body.energy(x, **ELASTIC) == make_body("neo-hookean", "casadi").energy(x, **ELASTIC)
+    assert body.evaluator == "casadi"
+    assert "LLVM cannot compile the energy kernel (no registers)" in body.notes[0]
+    combine = make_combiner(random_plan(np.random.default_rng(0)))
+    assert combine.__qualname__.startswith(combine_with_numpy.__name__)
+
+
+def test_failing_compiler_is_an_error_where_vector_code_is_forced(small_mesh, broken_compiler):
+    with pytest.raises(InputError, match=r"\(no registers\); choose evaluator='casadi'"):
+        evaluate(small_mesh)
+
+
+# Compiled code on disk ------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -165,6 +366,20 @@ def test_compiled_code_is_kept_and_used_again(small_mesh, cache, compiled):
     assert [path.suffix for path in cache.iterdir()] == [".o"]
     assert evaluate(small_mesh) == first
     assert len(compiled) == 1
+
+
+def test_changed_sources_are_compiled_anew(small_mesh, cache, tmp_path, monkeypatch):
+    evaluate(small_mesh)
+    sources = shutil.copytree(Path(jit.__file__).parent, tmp_path / "sources")
+    with (sources / "erfinv.py").open("a") as file:
+        file.write("# changed\n")
+    monkeypatch.setattr(jit, "__file__", str(sources / "jit.py"))
+    jit._generation.cache_clear()
+    try:
+        evaluate(small_mesh)
+    finally:
+        jit._generation.cache_clear()
+    assert len(list(cache.iterdir())) == 2
 
 
 def test_another_material_gets_a_file_of_its_own(small_mesh, cache):

@@ -10,37 +10,27 @@ import casadi as ca
 import numpy as np
 import pytest
 from problem_files import write_problem
-from problems_small import GUESS, TRUTH, hung_cube, measured
+from problems_small import GUESS, TRUTH, hung_cube, measured, noisy
 
 from collocation_sysid import solve as solve_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.callbacks import NlpFunctions
-from collocation_sysid.methods.casadi_nlp import (
-    PLUGINS,
-    REFUSED,
-    CasadiOptions,
-    solve,
-    why_not,
-)
-from collocation_sysid.methods.reduced_space import solve as reduced_space
+from collocation_sysid.methods.casadi_nlp import PLUGINS, REFUSED, SqpMethod, why_not
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.problem import load_problem
 
 
 @cache
 def cube(noise_m: float = 0.0) -> Collocation:
-    made = measured(hung_cube(4))
-    tracks = made.markers.positions_m
-    noise = noise_m * np.random.default_rng(5).normal(size=tracks.shape)
-    return Collocation([with_markers(made, tracks + noise)], GUESS)
+    return Collocation([noisy(hung_cube(4), noise_m, seed=5)], GUESS)
 
 
 @cache
 def solved(plugin: str) -> Solution:
-    return METHODS[f"casadi:{plugin}"].solve(cube())
+    return PLUGINS[plugin]()(cube())
 
 
 def functions() -> NlpFunctions:
@@ -53,7 +43,7 @@ def functions() -> NlpFunctions:
 def point() -> tuple[np.ndarray, np.ndarray]:
     """Some variables and multipliers."""
     rng = np.random.default_rng(1)
-    z = cube().pack(GUESS.guess_q, [reduced_space(cube()).positions_m[0].reshape(5, -1)])
+    z = cube().pack(GUESS.guess_q, [ReducedSpace()(cube()).positions_m[0].reshape(5, -1)])
     return z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=cube().constraints)
 
 
@@ -75,8 +65,8 @@ def test_the_true_parameters_are_recovered(plugin: str):
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
     collocation = cube(1e-4)
-    solution = solve(collocation, plugin=plugin)
-    reference = reduced_space(collocation)
+    solution = PLUGINS[plugin]()(collocation)
+    reference = ReducedSpace()(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.q[:3], reference.q[:3], atol=1e-4)
     np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-6)
@@ -86,20 +76,19 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_explicit_grasps_lead_to_the_same_answer(plugin: str):
     collocation = Collocation([measured(hung_cube(4))], GUESS, explicit_grasps=True)
-    solution = METHODS[f"casadi:{plugin}"].solve(collocation)
+    solution = PLUGINS[plugin]()(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
 
 
 def test_the_exact_hessian_leads_sqp_to_the_same_answer_without_noise():
-    solution = solve(cube(), CasadiOptions("exact"), plugin="sqpmethod")
+    solution = SqpMethod("exact")(cube())
     assert solution.status is Status.CONVERGED
     np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
 
 
 def test_options_of_the_plugin_win():
-    options = CasadiOptions(casadi={"qpsol": "qrqp", "max_iter": 1})
-    solution = solve(cube(), options, plugin="sqpmethod")
+    solution = SqpMethod(casadi={"qpsol": "qrqp", "max_iter": 1})(cube())
     assert solution.status is Status.ITERATION_LIMIT
     assert solution.iterations == 1
 
@@ -135,14 +124,14 @@ def test_the_lagrangians_gradient_has_its_forward_derivative(rng):
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_the_iteration_limit_is_a_status(plugin: str):
-    solution = solve(cube(), CasadiOptions(max_iterations=2), plugin=plugin)
+    solution = PLUGINS[plugin](max_iterations=2)(cube())
     assert solution.status is Status.ITERATION_LIMIT
     assert np.isfinite(solution.z).all()
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_the_time_limit_is_a_status(plugin: str):
-    solution = solve(cube(), CasadiOptions(max_time_s=1e-3), plugin=plugin)
+    solution = PLUGINS[plugin](max_time_s=1e-3)(cube())
     assert solution.status is Status.TIME_LIMIT
     assert np.isfinite(solution.z).all()
 
@@ -153,7 +142,7 @@ def test_an_interruption_keeps_the_best_iterate(plugin: str):
         if iteration.number == 2:
             os.kill(os.getpid(), signal.SIGINT)
 
-    solution = solve(cube(), watch=interrupt, plugin=plugin)
+    solution = PLUGINS[plugin]()(cube(), watch=interrupt)
     assert solution.status is Status.INTERRUPTED
     assert solution.parameters in [line.parameters for line in solution.history]
     assert len(solution.history) <= 5
@@ -165,7 +154,7 @@ def test_an_error_in_the_callers_function_reaches_the_caller(plugin: str):
         raise ZeroDivisionError("in watch")
 
     with pytest.raises(ZeroDivisionError, match="in watch"):
-        solve(cube(), watch=broken, plugin=plugin)
+        PLUGINS[plugin]()(cube(), watch=broken)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
@@ -175,13 +164,13 @@ def test_an_error_in_a_function_reaches_the_caller(plugin: str, monkeypatch):
 
     monkeypatch.setattr(Collocation, "constraints_and_jacobian", broken)
     with pytest.raises(ZeroDivisionError, match="in an evaluation"):
-        solve(cube(), plugin=plugin, start=point()[0])
+        PLUGINS[plugin]()(cube(), start=point()[0])
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_the_history_is_what_was_watched(plugin: str):
     seen: list[Iteration] = []
-    solution = solve(cube(), watch=seen.append, plugin=plugin)
+    solution = PLUGINS[plugin]()(cube(), watch=seen.append)
     assert list(solution.history) == seen
     assert len(seen) > 3
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta, rtol=1e-2)
@@ -189,7 +178,7 @@ def test_the_history_is_what_was_watched(plugin: str):
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_nothing_is_printed(plugin: str, capfd):
-    solve(cube(), CasadiOptions(max_iterations=3), plugin=plugin)
+    PLUGINS[plugin](max_iterations=3)(cube())
     assert capfd.readouterr() == ("", "")
 
 
@@ -217,8 +206,6 @@ def test_every_plugin_of_casadi_is_offered_or_refused_with_a_reason():
 )
 def test_other_names_are_refused_with_a_reason(name: str, message: str):
     assert message in (why_not(name) or "")
-    with pytest.raises(InputError, match=f"solver.method: found '{name}'"):
-        solve(cube(), plugin=name.removeprefix("casadi:"))
 
 
 def test_offered_names_are_not_refused():
@@ -226,14 +213,16 @@ def test_offered_names_are_not_refused():
 
 
 def test_an_unknown_hessian_is_refused():
-    with pytest.raises(InputError, match="no hessian 'bfgs'; available: gauss-newton, exact"):
-        solve(cube(), CasadiOptions("bfgs"), plugin="sqpmethod")  # pyright: ignore
+    with pytest.raises(
+        InputError, match="hessian: found 'bfgs'; expected 'gauss-newton' or 'exact'"
+    ):
+        SqpMethod("bfgs")  # pyright: ignore
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
     with pytest.raises(InputError, match=f"{plugin} cannot be set up: .*max_itre"):
-        solve(cube(), CasadiOptions(casadi={"max_itre": 3}), plugin=plugin)
+        PLUGINS[plugin](casadi={"max_itre": 3})(cube())
 
 
 # From a problem file
@@ -241,7 +230,7 @@ def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
 
 def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 4})
-    chosen = ["solver.method=casadi:sqpmethod", "solver.casadi.min_iter=1"]
+    chosen = ["solver.method=casadi:sqpmethod", "solver.casadi:sqpmethod.casadi.min_iter=1"]
     solution = solve_problem(load_problem(file, chosen))
     assert solution.status.converged
     assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)

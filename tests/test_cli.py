@@ -189,7 +189,7 @@ def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlie
     earlier.mkdir()
     (earlier / "result.json").write_text("{}")
     (earlier / "old.png").write_text("old")
-    short = settings("solver.max_iterations=2")
+    short = settings("solver.interior-point.max_iterations=2")
     outcome = run_command("solve", "problem.toml", "--out", "run", "--verbose", *short)
     assert outcome.code == 1
     assert "iteration limit" in outcome.out
@@ -445,12 +445,13 @@ def test_reduced_space_is_the_method_unless_another_is_named(tiny):
     np.testing.assert_allclose(default.theta, named.theta, rtol=1e-5)
 
 
-def test_an_option_of_another_method_is_refused_in_the_file_but_not_beside_a_named_method(tiny):
-    overrides = ["solver.method=reduced-space", "solver.linear_solver=mumps"]
-    problem = cs.load_problem("problem.toml", overrides)
-    with pytest.raises(cs.InputError, match=r"solver\.linear_solver.*'reduced-space' has no such"):
-        cs.solve(problem)
-    assert cs.solve(problem, "reduced-space").status.converged
+def test_each_method_has_the_options_of_its_own_table(tiny):
+    tables = ["solver.interior-point.hessian=limited-memory", "solver.reduced-space.ladder=[1.0]"]
+    problem = cs.load_problem("problem.toml", tables)
+    solution = cs.solve(problem, "reduced-space")
+    assert solution.status.converged
+    assert problem.file.solver.method_named("interior-point").hessian == "limited-memory"
+    assert problem.file.solver.method_named("reduced-space").hessian == "gauss-newton"
 
 
 def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):

@@ -17,12 +17,14 @@ from problems_small import (
     bar_let_go,
     hung_cube,
     measured,
+    relative_errors,
 )
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
-from collocation_sysid.methods import METHODS
-from collocation_sysid.methods.continuation import ContinuationOptions, first_part, first_samples
+from collocation_sysid.methods.continuation import Continuation, first_part, first_samples
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters
@@ -34,12 +36,7 @@ SHARES = (0.5, 1.0)
 
 
 def continued(collocation: Collocation, watch=None, shares=SHARES, **stage) -> Solution:
-    options = ContinuationOptions(shares, stage)
-    return METHODS["continuation"].solve(collocation, options, watch)
-
-
-def relative_errors(solution: Solution) -> np.ndarray:
-    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
+    return Continuation(shares, stage)(collocation, watch)
 
 
 def cube(steps: int = 19) -> Collocation:
@@ -80,7 +77,7 @@ def test_a_part_has_the_layout_of_the_whole():
         explicit_grasps=True,
         huber=3.0,
     )
-    part = first_part(whole, 0.5, GUESS)
+    part = first_part(whole, 0.5)
     assert [segment.grid_rows for segment in part.segments] == [19, 31]
     assert (part.scheme, part.substeps, part.huber) == ("bdf2", 2, 3.0)
     assert all(segment.explicit_grasps for segment in part.segments)
@@ -104,11 +101,11 @@ def test_the_true_parameters_are_recovered(experiment: str, method: str):
 
 def test_interior_point_goes_on_from_the_positions_of_the_stage_before():
     collocation = cube()
-    solution = METHODS["continuation"].solve(collocation)
+    solution = Continuation()(collocation)
     assert solution.status.converged
     assert np.abs(relative_errors(solution)).max() < 1e-4
     assert solution.max_violation_relative < 1e-6
-    cold = METHODS["interior-point"].solve(collocation)
+    cold = InteriorPoint()(collocation)
     assert solution.notes[-1].startswith("100 % of the samples by interior-point: converged")
     last_stage = int(solution.notes[-1].split("after ")[1].split()[0])
     assert last_stage < cold.iterations
@@ -141,9 +138,8 @@ def test_the_history_goes_on_over_the_stages_and_the_notes_tell_of_them():
 
 def test_it_starts_from_given_variables():
     collocation = cube()
-    answer = METHODS["reduced-space"].solve(collocation)
-    options = ContinuationOptions(SHARES, {"method": "shooting"})
-    solution = METHODS["continuation"].solve(collocation, options, None, answer.z)
+    answer = ReducedSpace()(collocation)
+    solution = Continuation(SHARES, {"method": "shooting"})(collocation, start=answer.z)
     assert solution.iterations < 4
 
 
@@ -172,10 +168,10 @@ def test_what_a_stage_does_not_reach_the_last_one_reports():
 @pytest.mark.parametrize(
     ("shares", "stage", "message"),
     [
-        ((0.5, 0.25, 1.0), {}, r"shares are \[0.5, 0.25, 1.0\]; expected numbers above 0 that"),
+        ((0.5, 0.25, 1.0), {}, r"shares: found \[0.5, 0.25, 1.0\]; expected numbers above 0 that"),
         ((0.5,), {}, "ascend to 1"),
         ((), {}, "ascend to 1"),
-        (SHARES, {"method": "shoting"}, "solver.stage.method: found 'shoting'; expected one of"),
+        (SHARES, {"method": "shoting"}, "stage.method: found 'shoting'; expected one of"),
         (SHARES, {"method": "continuation"}, "found 'continuation'; expected one of"),
         (SHARES, {"hessia": "exact"}, "'interior-point' has no option 'hessia'; it has hessian,"),
     ],
@@ -192,10 +188,10 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 16})
     chosen = [
         "solver.method=continuation",
-        "solver.shares=[0.5, 1.0]",
-        "solver.stage.method=shooting",
-        "solver.stage.gradient=adjoint",
-        "solver.stage.tolerance=1e-9",
+        "solver.continuation.shares=[0.5, 1.0]",
+        "solver.continuation.stage.method=shooting",
+        "solver.continuation.stage.gradient=adjoint",
+        "solver.continuation.stage.tolerance=1e-9",
     ]
     solution = solve(load_problem(file, chosen))
     assert solution.status.converged
@@ -209,13 +205,13 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
-        ("solver.stage.metod=shooting", "solver.stage.metod: unknown key; did you mean method?"),
-        ("solver.stage.method=shoting", "solver.stage.method: found 'shoting'; did you mean"),
-        ("solver.stage.gradient=forward", "'interior-point' has no option 'gradient'"),
-        ("solver.shares=[1.0, 0.5]", "expected numbers above 0 that ascend to 1"),
+        ("stage.metod=shooting", "'interior-point' has no option 'metod'"),
+        ("stage.method=shoting", "stage.method: found 'shoting'; expected one of"),
+        ("stage.gradient=forward", "'interior-point' has no option 'gradient'"),
+        ("shares=[1.0, 0.5]", "expected numbers above 0 that ascend to 1"),
     ],
 )
 def test_wrong_stages_of_a_problem_file_are_refused(tmp_path, chosen: str, message: str):
     file = write_problem(tmp_path, {"swing": 8})
     with pytest.raises(InputError, match=re.escape(message)):
-        solve(load_problem(file, ["solver.method=continuation", chosen]))
+        solve(load_problem(file, ["solver.method=continuation", f"solver.continuation.{chosen}"]))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from checks import directional_derivative
-from problems_small import GUESS, TRUTH, bar_let_go, cube_with_unknowns, hung_cube, measured
+from problems_small import GUESS, TRUTH, bar_let_go, cube_with_unknowns, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
-from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.curvature import exact_curvature
 from collocation_sysid.methods.horizon import Horizon, Point
-from collocation_sysid.methods.reduced_space import ReducedSpaceOptions, solve
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.robust import huberised
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
@@ -20,10 +20,7 @@ from collocation_sysid.nlp.simulation import with_markers
 
 
 def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) -> Collocation:
-    experiment = measured(experiment or hung_cube())
-    tracks = experiment.markers.positions_m
-    noise = noise_m * np.random.default_rng(2).normal(size=tracks.shape)
-    return Collocation([with_markers(experiment, tracks + noise)], GUESS, **changes)
+    return Collocation([noisy(experiment or hung_cube(), noise_m, seed=2)], GUESS, **changes)
 
 
 def point_at(collocation: Collocation, p: np.ndarray) -> Point:
@@ -60,8 +57,8 @@ def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rn
 @pytest.mark.parametrize("experiment", [bar_let_go(), cube_with_unknowns()])
 def test_both_methods_find_the_same_optimum_of_all_unknowns(experiment, huber):
     collocation = with_noise(1e-3, experiment, huber=huber)
-    reduced = solve(collocation, ReducedSpaceOptions(tolerance=1e-9))
-    interior = METHODS["interior-point"].solve(collocation)
+    reduced = ReducedSpace(tolerance=1e-9)(collocation)
+    interior = InteriorPoint()(collocation)
     assert reduced.status.converged
     assert interior.status.converged
     assert reduced.kkt_residual < 1e-7
@@ -71,8 +68,8 @@ def test_both_methods_find_the_same_optimum_of_all_unknowns(experiment, huber):
 
 def test_the_exact_hessian_finds_the_same_optimum_of_a_large_residual():
     collocation = with_noise(5e-3)
-    gauss_newton = solve(collocation)
-    exact = solve(collocation, ReducedSpaceOptions(hessian="exact"))
+    gauss_newton = ReducedSpace()(collocation)
+    exact = ReducedSpace(hessian="exact")(collocation)
     assert exact.status.converged
     np.testing.assert_allclose(exact.theta, gauss_newton.theta, rtol=1e-6)
     assert exact.kkt_residual < 1e-8
@@ -99,16 +96,16 @@ def test_hubers_loss_is_not_led_astray_by_swapped_markers():
     tracks[4:7, [0, 1]] = tracks[4:7, [1, 0]]
     mistaken = with_markers(experiment, tracks)
     truth = np.log(list(TRUTH.values()))
-    best = np.abs(solve(collocation).q - truth).max()
-    squared = np.abs(solve(Collocation([mistaken], GUESS)).q - truth).max()
-    huber = solve(Collocation([mistaken], GUESS, huber=2.0))
+    best = np.abs(ReducedSpace()(collocation).q - truth).max()
+    squared = np.abs(ReducedSpace()(Collocation([mistaken], GUESS)).q - truth).max()
+    huber = ReducedSpace()(Collocation([mistaken], GUESS, huber=2.0))
     assert huber.status.converged
     assert np.abs(huber.q - truth).max() < 0.5 * squared
     assert np.abs(huber.q - truth).max() < best + 0.3
 
 
 def test_options_that_mean_nothing_are_refused():
-    with pytest.raises(InputError, match="limited-memory"):
-        solve(with_noise(1e-3), ReducedSpaceOptions(hessian="limited-memory"))  # type: ignore
+    with pytest.raises(InputError, match="hessian: found 'limited-memory'"):
+        ReducedSpace(hessian="limited-memory")  # type: ignore
     with pytest.raises(InputError, match="huber"):
         with_noise(1e-3, huber=0.0)

@@ -7,9 +7,13 @@ import shlex
 import shutil
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
-from problem_files import run_command
+from problem_files import EXPERIMENT, PROBLEM, run_command
+from pydantic import ValidationError
+
+from collocation_sysid.problem import ProblemFile
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
@@ -40,7 +44,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: Path):
     names: dict[str, object] = {"__name__": "docs"}
     for code in blocks(page, "python"):
-        exec(compile(code, name_of(page), "exec"), names)
+        exec(compile(code, name_of(page), "exec", dont_inherit=True), names)
 
 
 # What keeps a command of the pages short here.
@@ -60,10 +64,28 @@ def test_commands_of_a_page_run(page: Path, checkout: Path):
             assert outcome.code == 0, f"{line}: {outcome.err}"
 
 
+def in_a_problem(code: str) -> dict[str, Any]:
+    """A problem that is valid but for the tables of a block, which take the place of its own."""
+    whole, block = tomllib.loads(PROBLEM + EXPERIMENT), tomllib.loads(code)
+    experiment = block.pop("experiment", {})
+    if isinstance(experiment, dict):
+        experiment = [whole["experiment"][0] | experiment]
+    return whole | block | {"experiment": experiment}
+
+
 @pytest.mark.parametrize("page", pages_with("toml"))
-def test_toml_blocks_are_valid(page: Path):
+def test_toml_blocks_are_valid_in_a_problem_file(page: Path):
     for code in blocks(page, "toml"):
-        tomllib.loads(code)
+        ProblemFile.model_validate(in_a_problem(code))
+
+
+@pytest.mark.parametrize(
+    ("table", "key"),
+    [("object", "mes"), ("experiment.estimate", "gravit"), ("solver.penalty", "ro")],
+)
+def test_a_misspelt_key_of_a_block_is_found(table: str, key: str):
+    with pytest.raises(ValidationError, match=rf"\b{key}\b"):
+        ProblemFile.model_validate(in_a_problem(f"[{table}]\n{key} = 1"))
 
 
 def test_links_between_pages_lead_somewhere():

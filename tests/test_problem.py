@@ -6,6 +6,7 @@ import json
 import tomllib
 from pathlib import Path
 
+import casadi as ca
 import meshio
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from problem_files import (
 from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import read_markers, read_poses
+from collocation_sysid.fem.materials import MATERIALS, neo_hookean
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.problem import ProblemFile, load_problem, read_problem_file
@@ -58,7 +60,7 @@ def test_overrides_are_written_as_in_toml(tiny):
         "experiment.swing.start = undeformed",
         'experiment.swing.grasp.nodes.name="top"',
         "parameters.mu_pa={ fixed = 300 }",
-        "solver.max_iterations=7",
+        "solver.reduced-space.ladder=[0.5, 1]",
     ]
     replace_text("density_kg_m3 = 30.0", "")(tiny)
     replace_text(BOX, "{}")(tiny)
@@ -68,7 +70,7 @@ def test_overrides_are_written_as_in_toml(tiny):
     assert file.experiment[0].gravity_m_s2 == (0, 0, -1.62)
     assert file.experiment[0].start == "undeformed"
     assert file.parameters.mu_pa.fixed == 300
-    assert file.solver.max_iterations == 7
+    assert file.solver.method_named("reduced-space").ladder == (0.5, 1.0)
 
 
 def test_the_text_as_run_has_the_overrides_in_it(tiny):
@@ -252,6 +254,15 @@ def test_resampling_puts_everything_on_the_new_rate(tiny):
     problem = load(tiny, "experiment.0.resample_hz=50")
     np.testing.assert_allclose(problem.experiments[0].t_s, [0, 0.02, 0.04, 0.06, 0.08])
     assert problem.notes == ()
+
+
+def test_material_beyond_vector_code_is_noted(tiny, monkeypatch):
+    def printing(F, lambda_pa, mu_pa):
+        return ca.SX.printme(neo_hookean(F, lambda_pa, mu_pa), 0)
+
+    monkeypatch.setitem(MATERIALS, "neo-hookean", printing)
+    (note,) = load(tiny).notes
+    assert "no CasADi operation OP_PRINTME" in note
 
 
 def test_resampling_above_the_measured_rate_is_noted(tiny):

@@ -14,7 +14,7 @@ import pytest
 
 from collocation_sysid import Problem, load_problem, run, solve, write_run
 from collocation_sysid.experiment import Nuisance, place_markers
-from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.run import Run
@@ -136,7 +136,7 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
         transcription.substeps,
         huber=problem.file.solver.huber if huber else None,
     )
-    return METHODS["reduced-space"].solve(collocation)
+    return ReducedSpace()(collocation)
 
 
 @cache

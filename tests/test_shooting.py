@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 from dataclasses import replace
@@ -15,46 +14,32 @@ from problems_small import (
     GUESS,
     SMALL_EXPERIMENTS,
     TRUTH,
-    as_theta,
     bar_in_two_hands,
     bar_let_go,
     cube_with_unknowns,
     hung_cube,
     measured,
+    noisy,
     quadratic_bar,
+    relative_errors,
 )
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.experiment import Experiment
+from collocation_sysid.methods import shooting
 from collocation_sysid.methods.horizon import Horizon
-from collocation_sysid.methods.reduced_space import solve as reduced_space
-from collocation_sysid.methods.shooting import (
-    ShootingOptions,
-    adjoint_gradient,
-    simulated,
-    solve,
-)
-from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
+from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
 from collocation_sysid.statistics.sensitivity import sensitivities
-
-# As an attribute of the package the name is that of the method.
-shooting = importlib.import_module("collocation_sysid.methods.shooting")
 
 GRADIENTS = ("forward", "adjoint")
 
 
-def relative_errors(solution: Solution) -> np.ndarray:
-    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
-
-
-def noisy(experiment: Experiment, noise_m: float = 1e-3, **changes) -> Collocation:
-    made = measured(experiment)
-    tracks = made.markers.positions_m
-    noise = noise_m * np.random.default_rng(7).normal(size=tracks.shape)
-    return Collocation([with_markers(made, tracks + noise)], GUESS, **changes)
+def with_noise(experiment: Experiment, noise_m: float = 1e-3, **changes) -> Collocation:
+    return Collocation([noisy(experiment, noise_m)], GUESS, **changes)
 
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
@@ -80,7 +65,7 @@ def cube() -> Collocation:
 @pytest.mark.parametrize("huber", [None, 2.0])
 @pytest.mark.parametrize("make", [hung_cube, bar_let_go, quadratic_bar, cube_with_unknowns])
 def test_both_gradients_are_those_of_differences(make, huber, rng):
-    collocation = noisy(make(), huber=huber)
+    collocation = with_noise(make(), huber=huber)
     p = some_parameters(collocation)
     z = simulated(collocation, p)
     adjoint = adjoint_gradient(collocation, z)
@@ -97,7 +82,7 @@ def test_both_gradients_are_those_of_differences(make, huber, rng):
 
 
 def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():
-    collocation = noisy(bar_let_go())
+    collocation = with_noise(bar_let_go())
     z = simulated(collocation, some_parameters(collocation))
     (by_p,) = sensitivities(collocation, z)
     _, (by_x,) = collocation.unpack(collocation.gradient(z))
@@ -111,7 +96,7 @@ def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():
 
 @pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
 def test_the_true_parameters_are_recovered(experiment: str):
-    solution = solve(Collocation([measured(SMALL_EXPERIMENTS[experiment]())], GUESS))
+    solution = Shooting()(Collocation([measured(SMALL_EXPERIMENTS[experiment]())], GUESS))
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-8
     assert solution.rms_m < 1e-9
@@ -122,9 +107,9 @@ def test_the_true_parameters_are_recovered(experiment: str):
 @pytest.mark.parametrize("gradient", GRADIENTS)
 @pytest.mark.parametrize("make", [hung_cube, bar_in_two_hands, bar_let_go])
 def test_with_noise_it_is_the_optimum_of_the_reduced_space(make, gradient):
-    collocation = noisy(make())
-    solution = solve(collocation, ShootingOptions(gradient))
-    reference = reduced_space(collocation)
+    collocation = with_noise(make())
+    solution = Shooting(gradient)(collocation)
+    reference = ReducedSpace()(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-6)
     np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-8)
@@ -134,8 +119,8 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(make, gradient):
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_hubers_loss_and_own_unknowns_have_the_same_optimum(gradient):
-    collocation = noisy(bar_let_go(), 2e-3, huber=2.0)
-    solution, reference = solve(collocation, ShootingOptions(gradient)), reduced_space(collocation)
+    collocation = with_noise(bar_let_go(), 2e-3, huber=2.0)
+    solution, reference = Shooting(gradient)(collocation), ReducedSpace()(collocation)
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)
 
 
@@ -144,7 +129,7 @@ def test_experiments_are_fitted_together_up_to_a_bound(gradient):
     items = [replace(item, upper=250.0) if item.name == "mu_pa" else item for item in GUESS.items]
     made = [measured(hung_cube(8)), measured(bar_in_two_hands(10))]
     collocation = Collocation(made, Parameters(tuple(items)))
-    solution, reference = solve(collocation, ShootingOptions(gradient)), reduced_space(collocation)
+    solution, reference = Shooting(gradient)(collocation), ReducedSpace()(collocation)
     assert solution.status.converged
     assert solution.parameters["mu_pa"] == pytest.approx(250.0, rel=1e-12)
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)
@@ -153,7 +138,7 @@ def test_experiments_are_fitted_together_up_to_a_bound(gradient):
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_with_all_parameters_fixed_it_simulates(gradient):
     fixed = Parameters(tuple(Parameter(name, TRUTH[name], fixed=True) for name in TRUTH))
-    solution = solve(Collocation([measured(hung_cube())], fixed), ShootingOptions(gradient))
+    solution = Shooting(gradient)(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
     assert solution.rms_m < 1e-9
     assert solution.iterations == 1
@@ -162,9 +147,9 @@ def test_with_all_parameters_fixed_it_simulates(gradient):
 def test_it_starts_from_given_parameters():
     seen: list[Iteration] = []
     start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((11, 81))])
-    solution = solve(cube(), watch=seen.append, start=start)
+    solution = Shooting()(cube(), watch=seen.append, start=start)
     assert solution.iterations < 4
-    np.testing.assert_allclose([*seen[0].parameters.values()], list(TRUTH.values()))
+    np.testing.assert_allclose(seen[0].theta, list(TRUTH.values()))
 
 
 # Simulations that fail
@@ -173,7 +158,7 @@ def test_it_starts_from_given_parameters():
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_a_guess_that_cannot_be_simulated_is_a_status(gradient):
     collocation = Collocation([measured(hung_cube())], softened(1000))
-    solution = solve(collocation, ShootingOptions(gradient))
+    solution = Shooting(gradient)(collocation)
     assert solution.status is Status.NOT_SIMULABLE
     for part in ("cannot be simulated at the guess", "interior-point", "t = 0 s"):
         assert part in solution.message
@@ -192,7 +177,7 @@ def test_trials_that_cannot_be_simulated_are_stepped_back_from(gradient, monkeyp
 
     short.failed = False
     monkeypatch.setattr(shooting, "simulated", short)
-    solution = solve(cube(), ShootingOptions(gradient))
+    solution = Shooting(gradient)(cube())
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-6
     assert solution.notes[0].startswith("1 of ")
@@ -206,7 +191,7 @@ def test_where_everything_else_fails_it_stalls_at_the_guess(gradient, monkeypatc
         return simulated(collocation, p, stopwatch)
 
     monkeypatch.setattr(shooting, "simulated", only_the_guess)
-    solution = solve(cube(), ShootingOptions(gradient))
+    solution = Shooting(gradient)(cube())
     assert solution.status is Status.STALLED
     np.testing.assert_allclose(solution.theta, as_theta(GUESS))
 
@@ -220,10 +205,10 @@ def test_where_everything_else_fails_it_stalls_at_the_guess(gradient, monkeypatc
     [({"max_iterations": 3}, Status.ITERATION_LIMIT), ({"max_time_s": 1e-9}, Status.TIME_LIMIT)],
 )
 def test_limits_keep_the_best_simulation(gradient, limit: dict, status: Status):
-    solution = solve(cube(), ShootingOptions(gradient, **limit))
+    solution = Shooting(gradient, **limit)(cube())
     assert solution.status is status
     assert solution.iterations <= 3
-    assert solution.parameters == solution.history[-1].parameters
+    assert solution.theta == solution.history[-1].theta
     assert solution.max_violation_relative < 1e-9
 
 
@@ -233,9 +218,9 @@ def test_an_interruption_keeps_the_best_simulation(gradient):
         if iteration.number >= 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    solution = solve(cube(), ShootingOptions(gradient), interrupt)
+    solution = Shooting(gradient)(cube(), interrupt)
     assert solution.status is Status.INTERRUPTED
-    assert solution.parameters == solution.history[-1].parameters
+    assert solution.theta == solution.history[-1].theta
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
@@ -244,13 +229,13 @@ def test_an_error_in_the_callers_function_reaches_the_caller(gradient):
         raise ZeroDivisionError("in watch")
 
     with pytest.raises(ZeroDivisionError, match="in watch"):
-        solve(cube(), ShootingOptions(gradient), broken)
+        Shooting(gradient)(cube(), broken)
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_the_history_is_what_was_watched_and_its_loss_falls(gradient):
     seen: list[Iteration] = []
-    solution = solve(cube(), ShootingOptions(gradient), seen.append)
+    solution = Shooting(gradient)(cube(), seen.append)
     assert list(solution.history) == seen
     losses = [iteration.loss for iteration in seen]
     assert losses == sorted(losses, reverse=True)
@@ -261,5 +246,5 @@ def test_the_history_is_what_was_watched_and_its_loss_falls(gradient):
 
 
 def test_an_unknown_gradient_is_refused():
-    with pytest.raises(InputError, match="no gradient 'finite'; available: forward, adjoint"):
-        solve(cube(), ShootingOptions("finite"))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="gradient: found 'finite'; expected 'forward' or"):
+        Shooting("finite")  # pyright: ignore[reportArgumentType]

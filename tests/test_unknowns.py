@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp, Nuisance, PoseSequence
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.local import Local
 from collocation_sysid.nlp.simulation import simulate, with_markers
@@ -149,7 +150,7 @@ def test_unknowns_are_found_beside_the_material(kind: str, method: str, rng):
     precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-7))
     cube = replace(cube, markers=precise)
     phi = rng.uniform(-1, 1, Local.of(cube).size)
-    solution = METHODS[method].solve(alone(seen_with(cube, phi)))
+    solution = METHODS[method]()(alone(seen_with(cube, phi)))
     assert solution.status.converged
     (found,) = solution.collocation.unpack_own(solution.z)
     np.testing.assert_allclose(found, phi, atol=1e-3)
@@ -163,7 +164,7 @@ def test_a_prior_keeps_what_the_data_do_not_tell():
     unknown = Nuisance(marker_offset_m=0.002, pose_shift_m=0.001)
     tracks = measured(one).markers.positions_m + np.array([0.005, 0.0, 0.0])
     both = replace(with_markers(one, tracks), nuisance=unknown)
-    solution = METHODS["reduced-space"].solve(alone(both))
+    solution = ReducedSpace()(alone(both))
     (phi,) = solution.collocation.unpack_own(solution.z)
     offset, shift = 0.002 * phi[0], 0.001 * phi[3]
     assert offset / shift == pytest.approx(4.0, rel=0.05)  # as their variances
@@ -178,10 +179,8 @@ def test_a_shift_beyond_the_neighbouring_samples_ends_at_its_bound():
 
 def test_unknowns_widen_the_error_bars_of_the_material():
     plain = measured(hung_cube(20))
-    known = METHODS["reduced-space"].solve(alone(plain))
-    unknown = METHODS["reduced-space"].solve(
-        alone(replace(plain, nuisance=cube_with_unknowns().nuisance))
-    )
+    known = ReducedSpace()(alone(plain))
+    unknown = ReducedSpace()(alone(replace(plain, nuisance=cube_with_unknowns().nuisance)))
     narrow, wide = (
         np.sqrt(np.diag(covariance(s.collocation, s.z).covariance)) for s in (known, unknown)
     )
@@ -196,7 +195,7 @@ def test_experiments_keep_their_unknowns_to_themselves(rng):
         replace(e, markers=replace(e.markers, sigma_m=np.full(len(e.markers.names), 1e-7)))
         for e in both
     ]
-    solution = METHODS["reduced-space"].solve(Collocation(exact, GUESS))
+    solution = ReducedSpace()(Collocation(exact, GUESS))
     found = np.concatenate(solution.collocation.unpack_own(solution.z))
     np.testing.assert_allclose(found, [0.7, -0.4], atol=1e-3)
     assert solution.collocation.names[4:] == (

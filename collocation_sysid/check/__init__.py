@@ -122,7 +122,8 @@ def check_problem(problem: Problem) -> Findings:
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
     jacobian, hessian = _nonzeros(problem)
     solver = problem.file.solver
-    found_costs = costs(collocation, z, jacobian + hessian, solver.factorisation)
+    factorisation = solver.method_named("reduced-space").factorisation
+    found_costs = costs(collocation, z, jacobian + hessian, factorisation)
     chosen = next((cost for cost in found_costs if cost.method == solver.method), None)
 
     quality, worst, shape = body.mesh.quality(), worst_elements(body.mesh), slenderness(body.mesh)

@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError, hint_at
-from .batched import Batch, Evaluator, available_threads, choose_evaluator, make_evaluator
+from .batched import Batch, Evaluator, EvaluatorChoice, available_threads
 from .constants import Constant
 from .damping import Damping
 from .elements import Element, element_named, reference_geometry
-from .expressions import KERNELS, Law
+from .expressions import KERNELS, Law, energy_kernel
 from .materials import Energy, Material
 from .mesh import TetMesh
 from .moduli import Source, elastic_names, source_of
@@ -95,7 +95,8 @@ class Body:
     regions : sequence of Region
         Parts that differ.
     evaluator : {"auto", "simd", "casadi"}
-        How element kernels are evaluated, see `batched`.
+        How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
+        for a material that vector code cannot evaluate.
     threads : int, optional
         Threads for evaluations over several timesteps; the available cores by default.
 
@@ -114,7 +115,8 @@ class Body:
     Raises
     ------
     InputError
-        For unknown names, a mass that is not positive, or regions that overlap.
+        For unknown names, a mass that is not positive, regions that overlap, or a material that
+        "simd" cannot evaluate.
     """
 
     def __init__(
@@ -140,11 +142,15 @@ class Body:
         self.nodes_m: Array = self.nodes.points_m
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
-        self.evaluator = choose_evaluator(evaluator)
         self._part_masses = [self._lumped(part) for part in self.parts]
         self.node_mass: Array = np.sum(self._part_masses, axis=0)
         self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
         self._evaluators: dict[str, list[Evaluator]] = {}
+        self._choice = EvaluatorChoice(evaluator)
+        # Derivatives need no operations but those of the energy and the ones every evaluator has.
+        for part in self.parts:
+            law = Law(part.material, part.damping)
+            self._choice.check(energy_kernel(self.element, law).pieces)
 
     def __repr__(self) -> str:
         materials = ", ".join(f"{p.name or 'body'}: {p.material.name}" for p in self.parts)
@@ -172,6 +178,28 @@ class Body:
             If there are none.
         """
         return selection.resolve(self.nodes)
+
+    @property
+    def evaluator(self) -> str:
+        """How element kernels are evaluated: "simd" or "casadi"."""
+        return self._choice.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Why it is not "simd", if the material is to blame."""
+        return self._choice.notes
+
+    def make_evaluator(self, batch: Batch) -> Evaluator:
+        """Build the evaluator of a batch of this body's material."""
+        return self._choice.make(batch)
+
+    @cached_property
+    def part_of_cells(self) -> Index:
+        """(E,) number of the part that each cell belongs to."""
+        numbers = np.zeros(len(self.cells), dtype=np.int64)
+        for k, part in enumerate(self.parts):
+            numbers[part.cells] = k
+        return numbers
 
     @property
     def mass_kg(self) -> float:
@@ -432,7 +460,7 @@ class Body:
             )
         if name not in self._evaluators:
             batches = [self._batch(name, k) for k in range(len(self.parts))]
-            self._evaluators[name] = [make_evaluator(b, self.evaluator) for b in batches]
+            self._evaluators[name] = [self.make_evaluator(batch) for batch in batches]
         width = self._width(name)
         shape = (len(fields[0]), width)
         if out is None:

@@ -206,10 +206,21 @@ class TetMesh:
     def surface(self) -> np.ndarray:
         """Boundary triangles, (F, 3) int64, counter-clockwise when seen from outside."""
         faces = self.tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
+        return _read_only(faces[self._outer_faces])
+
+    @property
+    def surface_cells(self) -> np.ndarray:
+        """(F,) the element that each boundary triangle is a face of."""
+        return self._outer_faces // 4
+
+    @cached_property
+    def _outer_faces(self) -> np.ndarray:
+        """Which of the elements' faces, four of each in turn, no other element has."""
+        faces = self.tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
         _, first, count = np.unique(
             np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
         )
-        return _read_only(faces[np.sort(first[count == 1])])
+        return np.sort(first[count == 1])
 
     @cached_property
     def edges(self) -> np.ndarray:

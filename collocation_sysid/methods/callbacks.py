@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..nlp.collocation import Collocation
-from .solution import Iteration
+from .recorder import Recorder
 
-Watch = Callable[[Iteration], None]
 HessianValues = Callable[[Array, float, Array, Array], None]
 
 
@@ -226,22 +225,10 @@ def _ints(values: NDArray[np.int64]) -> list[int]:
 class Monitor(ca.Callback):
     """Follows the iterates: history, best point, and the wish to stop."""
 
-    def __init__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None,
-        began: float,
-        errors: list[BaseException],
-        max_time_s: float = np.inf,
-    ) -> None:
+    def __init__(self, recorder: Recorder, errors: list[BaseException]) -> None:
         ca.Callback.__init__(self)
-        self.errors = errors
-        self.collocation = collocation
-        self.watch = watch
-        self.began = began
-        self.max_time_s = max_time_s
+        self.recorder, self.errors = recorder, errors
         self.stop = False
-        self.history: list[Iteration] = []
         self.best: tuple[Array, Array] | None = None
         self.seconds = 0.0
         self._best_merit = np.inf
@@ -254,12 +241,13 @@ class Monitor(ca.Callback):
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        collocation = self.recorder.collocation
         sizes = {
-            "x": self.collocation.variables,
+            "x": collocation.variables,
             "f": 1,
-            "g": self.collocation.constraints,
-            "lam_x": self.collocation.variables,
-            "lam_g": self.collocation.constraints,
+            "g": collocation.constraints,
+            "lam_x": collocation.variables,
+            "lam_g": collocation.constraints,
         }
         return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
 
@@ -270,12 +258,7 @@ class Monitor(ca.Callback):
         except BaseException as error:
             self.errors.append(error)
         self.seconds += time.perf_counter() - began
-        return [1 if self.stop or self.late or self.errors else 0]
-
-    @property
-    def late(self) -> bool:
-        """Whether the time is over."""
-        return time.perf_counter() - self.began > self.max_time_s
+        return [1 if self.stop or self.recorder.late or self.errors else 0]
 
     def _follow(self, arguments) -> None:
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
@@ -283,15 +266,5 @@ class Monitor(ca.Callback):
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
         if merit < self._best_merit:
             self._best_merit, self.best = merit, (z, multipliers)
-        violation = max(np.abs(r).max(initial=0.0) for r in self.collocation.violations_n(z))
-        iteration = Iteration(
-            number=len(self.history),
-            loss=float(value[0]) / self.collocation.loss_scale,
-            rms_m=self.collocation.rms_m(z),
-            violation_n=float(violation),
-            parameters=self.collocation.values(z),
-            time_s=time.perf_counter() - self.began,
-        )
-        self.history.append(iteration)
-        if self.watch is not None:
-            self.watch(iteration)
+        recorder = self.recorder
+        recorder.line(len(recorder.history), z, float(value[0]) / recorder.collocation.loss_scale)

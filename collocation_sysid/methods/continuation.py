@@ -2,97 +2,103 @@
 
 A long recording's loss has many local minima, of swings matched with the wrong period, and a wrong
 guess may not survive it as a simulation; a short one's has few. So the first samples are solved
-first, and every answer starts the next part: its parameters as the guess, and its positions too,
-continued by a simulation, where the method takes a start.
+first, and every answer starts the next part: its parameters, and its positions continued by a
+simulation.
 """
 
 from __future__ import annotations
 
-import inspect
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError, SimulationError
+from ..errors import InputError, hint_at
 from ..experiment.experiment import Experiment
 from ..nlp.collocation import Collocation
-from ..nlp.marching import march_on
-from ..nlp.parameters import Parameters
-from .method import Method
-from .multipliers import constraint_multipliers
-from .solution import Iteration, Solution, Status, Timing
-from .start import carried_rigidly
+from .casadi_nlp import Sleqp, SqpMethod
+from .interior_point import InteriorPoint
+from .ladder import SHARES, Shares, part_of
+from .method import Method, Watch
+from .options import Options, built
+from .penalty import AugmentedLagrangian, Penalty
+from .recorder import Recorder
+from .reduced_space import ReducedSpace
+from .shooting import Shooting
+from .solution import Iteration, Solution, Status
+from .start import completed, marched
 
-Watch = Callable[[Iteration], None]
-
-# Fewest samples of a part.
-MIN_SAMPLES = 8
-NAME = "continuation"
+_ONE_HORIZON = (
+    InteriorPoint,
+    ReducedSpace,
+    Penalty,
+    AugmentedLagrangian,
+    Shooting,
+    SqpMethod,
+    Sleqp,
+)
+# Methods that solve a horizon at once, by name.
+STAGES: dict[str, type] = {kind.name: kind for kind in _ONE_HORIZON}
 
 
 @dataclass(frozen=True)
-class ContinuationOptions:
-    """Options of horizon continuation.
+class Continuation(Options):
+    """Another method on growing parts of every recording.
 
     Attributes
     ----------
     shares : tuple of float
         Shares of the samples solved one after another, ending with 1.
-    stage : mapping
+    stage : mapping or Method
         What solves each: its `method`, "interior-point" by default, and options of that method by
-        name, as in [solver] of a problem file.
+        name, as in the problem file; from Python any method.
     """
 
-    shares: tuple[float, ...] = (0.25, 0.5, 1.0)
-    stage: Mapping[str, Any] = field(default_factory=dict)
+    name: ClassVar[str] = "continuation"
 
+    shares: Shares = SHARES
+    stage: Mapping[str, Any] | Callable[..., Any] = field(default_factory=dict)
 
-def solve(
-    collocation: Collocation,
-    options: ContinuationOptions | None = None,
-    watch: Watch | None = None,
-    start: Array | None = None,
-    *,
-    methods: Mapping[str, Method],
-) -> Solution:
-    """Solve growing parts of a problem with another method.
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.method  # noqa: B018 - refuses a stage that makes no sense
 
-    Parameters
-    ----------
-    collocation : Collocation
-    options : ContinuationOptions, optional
-    watch : callable, optional
-        Called with every `Iteration` of every stage; numbers and times go on.
-    start : (variables,) ndarray, optional
-        Variables of the whole problem that the first stage starts from.
-    methods : mapping
-        The methods to choose from, by name.
+    @cached_property
+    def method(self) -> Method:
+        """What solves the stages.
 
-    Returns
-    -------
-    Solution
-        Of the whole problem, also when a stage was interrupted or refused; the notes tell what
-        each stage found.
+        Raises
+        ------
+        InputError
+            For an unknown method, or an option it does not have.
+        """
+        if not isinstance(self.stage, Mapping):
+            return self.stage
+        given = dict(self.stage)
+        name = given.pop("method", InteriorPoint.name)
+        if name not in STAGES:
+            known = f"expected one of {', '.join(STAGES)}{hint_at(str(name), STAGES)}"
+            raise InputError(f"found {name!r}; {known}", None, "stage.method")
+        return built(STAGES[name], given, "stage")
 
-    Raises
-    ------
-    InputError
-        For shares that do not ascend to 1, an unknown method, or an option it does not have.
-    """
-    options = options or ContinuationOptions()
-    _check_shares(options.shares)
-    climb = _Climb(collocation, *_chosen(options.stage, methods), watch)
-    if start is not None:
-        q, positions = collocation.unpack(start)
-        climb.known = (q, positions, collocation.unpack_own(start))
-    for share in options.shares:
-        if not climb.solve(share):
-            break
-    return climb.answer()
+    def __call__(
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+    ) -> Solution:
+        """Solve the NLP, see `Method`; the first part starts from those rows of a start.
+
+        Numbers and times of the history go on from stage to stage. A stage that was interrupted
+        or refused is the last; the notes tell what each found.
+        """
+        climb = _Climb(self.method, Recorder(self.name, collocation, watch))
+        if start is not None:
+            climb.known = collocation.parameters_of(start), collocation.unpack(start)[1]
+        for share in self.shares:
+            if not climb.solve(share):
+                break
+        return climb.answer()
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
@@ -104,13 +110,12 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
     return replace(experiment, t_s=experiment.t_s[:stop], markers=shorter)
 
 
-def first_part(collocation: Collocation, share: float, parameters: Parameters) -> Collocation:
-    """The problem on a share of every experiment's samples, with a guess of its own."""
+def first_part(collocation: Collocation, share: float) -> Collocation:
+    """The problem on a share of every experiment's samples."""
     experiments = [segment.experiment for segment in collocation.segments]
-    counts = [max(MIN_SAMPLES, round(share * len(e.t_s))) for e in experiments]
     return Collocation(
-        [first_samples(e, count) for e, count in zip(experiments, counts, strict=True)],
-        parameters,
+        [first_samples(e, part_of(len(e.t_s), share)) for e in experiments],
+        collocation.parameters,
         collocation.scheme,
         collocation.substeps,
         collocation.segments[0].explicit_grasps,
@@ -121,150 +126,58 @@ def first_part(collocation: Collocation, share: float, parameters: Parameters) -
 class _Climb:
     """The state between stages: what is known, and what is to be reported."""
 
-    def __init__(
-        self,
-        collocation: Collocation,
-        name: str,
-        method: Method,
-        options: Any,
-        watch: Watch | None,
-    ) -> None:
-        self.collocation, self.name, self.method, self.options = collocation, name, method, options
-        self.takes_start = "start" in inspect.signature(method.solve).parameters
-        self.watch = watch
-        self.began = time.perf_counter()
-        # q, positions as far as they were solved, and each experiment's own unknowns.
-        self.known: tuple[Array, list[Array], list[Array]] | None = None
+    def __init__(self, method: Method, recorder: Recorder) -> None:
+        self.method, self.recorder = method, recorder
+        # Parameters p, and positions as far as they were solved.
+        self.known: tuple[Array, list[Array]] | None = None
         self.last: Solution | None = None
         self.iterations = self.evaluations = 0
-        self.history: list[Iteration] = []
-        self.timing = Timing()
-        self.notes: list[str] = []
 
     def solve(self, share: float) -> bool:
         """Solve one part; whether to go on."""
-        whole = share == 1 and self.takes_start
-        part = self.collocation if whole else first_part(self.collocation, share, self._guess())
-        given = {}
-        if self.takes_start and self.known is not None:
-            given = {"start": _continued(part, *self.known)}
-        before, elapsed = self.iterations, self._elapsed()
+        recorder = self.recorder
+        part = recorder.collocation if share == 1 else first_part(recorder.collocation, share)
+        start = None if self.known is None else _continued(part, *self.known)
+        before, elapsed_s = self.iterations, recorder.elapsed_s
 
         def follow(line: Iteration) -> None:
-            moved = replace(line, number=line.number + before, time_s=line.time_s + elapsed)
-            self.history.append(moved)
-            if self.watch is not None:
-                self.watch(moved)
+            number, time_s = line.number + before, line.time_s + elapsed_s
+            recorder.add(replace(line, number=number, time_s=time_s))
 
-        found = self.method.solve(part, self.options, follow, **given)
+        found = self.method(part, follow, start)
         self._learn(found, share)
         return found.status not in (Status.INTERRUPTED, Status.REFUSED)
 
     def answer(self) -> Solution:
         """The last stage's answer as one of the whole problem."""
         assert self.last is not None
-        last, collocation = self.last, self.collocation
+        assert self.known is not None
+        last, recorder = self.last, self.recorder
         z, multipliers = last.z, last.multipliers
-        if last.collocation is not collocation:
-            z, multipliers = self._whole()
-        return Solution(
-            status=last.status,
-            message=last.message,
-            method=NAME,
-            collocation=collocation,
-            z=z,
-            multipliers=multipliers,
-            iterations=self.iterations,
-            history=tuple(self.history),
-            timing=replace(self.timing, total=self._elapsed()),
-            notes=(*self.notes, *last.notes),
-            evaluations=self.evaluations,
-        )
+        if last.collocation is not recorder.collocation:
+            z, multipliers = _continued(recorder.collocation, *self.known), None
+        recorder.notes += last.notes
+        counts = self.iterations, self.evaluations
+        return recorder.solution(last.status, last.message, z, multipliers, *counts)
 
     def _learn(self, found: Solution, share: float) -> None:
-        self.last = found
-        _, positions = found.collocation.unpack(found.z)
-        self.known = (found.q, positions, found.collocation.unpack_own(found.z))
+        self.last, part = found, found.collocation
+        self.known = part.parameters_of(found.z), part.unpack(found.z)[1]
         self.iterations += found.iterations
         self.evaluations += found.evaluations
-        spent, more = self.timing, found.timing
-        self.timing = Timing(
-            spent.build + more.build,
-            spent.evaluations + more.evaluations,
-            spent.linear_algebra + more.linear_algebra,
-        )
+        watch, spent = self.recorder.stopwatch, found.timing
+        watch.build += spent.build
+        watch.evaluations += spent.evaluations
+        watch.linear_algebra += spent.linear_algebra
         values = ", ".join(f"{name} = {value:.4g}" for name, value in found.parameters.items())
-        self.notes.append(
-            f"{100 * share:.3g} % of the samples by {self.name}: {found.status.value} after "
+        self.recorder.notes.append(
+            f"{100 * share:.3g} % of the samples by {found.method}: {found.status.value} after "
             f"{found.iterations} iterations, {values}"
         )
 
-    def _guess(self) -> Parameters:
-        """The problem's parameters with what is known as their guess."""
-        parameters = self.collocation.parameters
-        if self.known is None:
-            return parameters
-        values = parameters.values(self.known[0])
-        return parameters.with_guess(
-            {i.name: float(np.clip(values[i.name], i.lower, i.upper)) for i in parameters.free}
-        )
 
-    def _whole(self) -> tuple[Array, Array]:
-        """Variables and multipliers of the whole problem."""
-        assert self.known is not None
-        collocation = self.collocation
-        z = _continued(collocation, *self.known)
-        try:
-            return z, constraint_multipliers(collocation, z)
-        except SimulationError:
-            return z, np.zeros(collocation.constraints)
-
-    def _elapsed(self) -> float:
-        return time.perf_counter() - self.began
-
-
-def _continued(
-    collocation: Collocation, q: Array, positions: list[Array], own: list[Array]
-) -> Array:
+def _continued(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
     """Variables z from the first rows of positions: simulated on, or carried by the grasp."""
-    settings = collocation.settings(np.concatenate([q, *own]))
-    whole = []
-    for segment, setting, x, phi in zip(
-        collocation.segments, settings, positions, own, strict=True
-    ):
-        known = x[: segment.grid_rows]
-        if len(known) < segment.grid_rows:
-            carried = carried_rigidly(segment, setting.theta)
-            known, _ = march_on(segment.corrected(phi), setting.dynamics, setting.theta, known)
-            known = np.concatenate([known, carried[len(known) :]])
-        whole.append(known)
-    return collocation.pack(q, whole, own)
-
-
-def _check_shares(shares: tuple[float, ...]) -> None:
-    ascending = all(a < b for a, b in zip((0.0, *shares), shares, strict=False))
-    if not shares or not ascending or shares[-1] != 1:
-        raise InputError(
-            f"shares are {list(shares)}; expected numbers above 0 that ascend to 1", None, "solver"
-        )
-
-
-def _chosen(stage: Mapping[str, Any], methods: Mapping[str, Method]) -> tuple[str, Method, Any]:
-    """Name, method and options of the stages."""
-    given = dict(stage)
-    name = given.pop("method", "interior-point")
-    others = [known for known in methods if known != NAME]
-    if name not in others:
-        raise InputError(
-            f"found {name!r}; expected one of {', '.join(others)}", None, "solver.stage.method"
-        )
-    method = methods[name]
-    unknown = sorted(set(given) - method.option_names)
-    if unknown:
-        raise InputError(
-            f"method {name!r} has no option {unknown[0]!r}; it has "
-            f"{', '.join(sorted(method.option_names))}",
-            None,
-            "solver.stage",
-        )
-    return name, method, method.options(**given)
+    parts = zip(positions, collocation.segments, strict=True)
+    known, _ = marched(collocation, p, [x[: segment.grid_rows] for x, segment in parts])
+    return completed(collocation, p, known)

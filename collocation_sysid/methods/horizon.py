@@ -12,11 +12,11 @@ from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
-from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver, Tangent
 from .robust import huberised
+from .start import marched
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
@@ -154,19 +154,4 @@ class Horizon:
         self, p: Array, x: list[Array] | None = None
     ) -> tuple[list[Array], SimulationError | None]:
         """Trajectories at p as far as they go, continuing those given; and why they stopped."""
-        _, own = self.collocation.split(p)
-        extended, first_failure = [], None
-        settings = self.collocation.settings(p)
-        for k, (solver, setting, phi) in enumerate(zip(self.solvers, settings, own, strict=True)):
-            known = x[k] if x is not None and len(x[k]) else None
-            rows, failure = march_on(
-                solver.segment.corrected(phi),
-                setting.dynamics.first_rows(solver.dynamics.rows),
-                setting.theta,
-                known,
-                MARCHED,
-                stopwatch=self.stopwatch,
-            )
-            extended.append(rows)
-            first_failure = first_failure or failure
-        return extended, first_failure
+        return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch)

@@ -9,14 +9,13 @@ z = middle + half · sin(s) keeps within them smoothly.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult
 from scipy.optimize import minimize as scipy_minimise
 
 from ..arrays import Array
-from ..errors import InputError
 from .cg_descent import CgDescentOptions
 from .cg_descent import minimise as cg_descent
 from .levenberg_marquardt import minimise as levenberg_marquardt
@@ -32,18 +31,6 @@ FAR = 50.0
 # SciPy's line searches interpolate values, so that one out of the domain must be a number: this
 # many times the value so far.
 STEEP = 10.0
-
-
-def check_inner(name: str) -> None:
-    """Refuse an unknown inner solver.
-
-    Raises
-    ------
-    InputError
-    """
-    if name not in get_args(Inner):
-        known = ", ".join(get_args(Inner))
-        raise InputError(f"inner = {name!r}; expected one of {known}", None, "solver")
 
 
 def minimise(
@@ -164,24 +151,24 @@ class _Scaled:
         return self.angle + (self.unit * s)[self.mapped] / (self.half * np.cos(self.angle))
 
     def _slopes(self, s: Array) -> Array:
-        """Dz / (unit ds)."""
+        """Slopes dz / (unit ds)."""
         slopes = np.ones(len(s))
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
     def at(self, s: Array) -> tuple[Array, float, Array]:
-        """Z, m and ∇m; the last point is remembered."""
+        """The point z, m and ∇m; the last point is remembered."""
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.z_of(s)
             self._last = (s.copy(), z, *self.merit.value_and_gradient(z))
         return self._last[1:]
 
     def value(self, s: Array) -> float:
-        """M."""
+        """The value m."""
         return self.merit.value(self.z_of(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """M and ∂m/∂s."""
+        """The value m and ∂m/∂s."""
         _, value, gradient = self.at(s)
         return value, gradient[self.free] * self.unit * self._slopes(s)
 

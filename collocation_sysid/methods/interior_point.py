@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
-import casadi as ca
 import numpy as np
+from pydantic import BeforeValidator
 
 from ..arrays import Array
-from ..errors import InputError
+from ..checked import Count, Finite, NotNegative, Positive, Text, Whole
 from ..nlp.collocation import Collocation
-from .callbacks import Monitor, NlpFunctions, Watch
-from .nlpsol import build, interruptible, timing
+from . import nlpsol
+from .callbacks import NlpFunctions
+from .method import Watch
+from .options import Options
+from .recorder import Recorder
 from .solution import Solution, Status
-from .start import initial_variables
 
-Hessian = Literal["exact", "gauss-newton", "limited-memory"]
+
+def _ipopt_value(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise ValueError(
+            f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
+            'switches are "yes" and "no"'
+        )
+    return value
+
+
+IpoptValue = Annotated[Text | Whole | Finite, BeforeValidator(_ipopt_value)]
 
 IPOPT_STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -49,8 +60,8 @@ STEP_LIMIT = np.log(2.0)
 
 
 @dataclass(frozen=True)
-class InteriorPointOptions:
-    """Options of the interior-point method.
+class InteriorPoint(Options):
+    """Interior point, by IPOPT.
 
     Attributes
     ----------
@@ -70,125 +81,76 @@ class InteriorPointOptions:
     tolerance : float
         IPOPT's `tol` on the scaled optimality conditions.
     max_iterations : int
+        Iterations after which it ends.
     max_time_s : float
+        Seconds after which it ends.
     ipopt : mapping
         Further IPOPT options by name; they win over the ones above.
     """
 
-    hessian: Hessian = "exact"
-    warm_up: float = 0.1
-    proximal: float = 1e-5
-    linear_solver: str = "mumps"
-    tolerance: float = 1e-8
-    max_iterations: int = 200
-    max_time_s: float = 1e6
-    ipopt: Mapping[str, str | int | float] = field(default_factory=dict)
+    name: ClassVar[str] = "interior-point"
 
+    hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
+    warm_up: NotNegative = 0.1
+    proximal: NotNegative = 1e-5
+    linear_solver: Text = "mumps"
+    tolerance: Positive = 1e-8
+    max_iterations: Count = 200
+    max_time_s: Positive = 1e6
+    ipopt: Mapping[str, IpoptValue] = field(default_factory=dict)
 
-def solve(
-    collocation: Collocation,
-    options: InteriorPointOptions | None = None,
-    watch: Watch | None = None,
-    start: Array | None = None,
-) -> Solution:
-    """Solve the NLP with IPOPT.
+    def __call__(
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+    ) -> Solution:
+        """Solve the NLP, see `Method`.
 
-    Parameters
-    ----------
-    collocation : Collocation
-    options : InteriorPointOptions, optional
-    watch : callable, optional
-        Called with every `Iteration`.
-    start : (variables,) ndarray, optional
-        Initial variables; a simulation at the guess by default.
-
-    Returns
-    -------
-    Solution
-        Also when it did not converge, or was interrupted (Ctrl-C): then the best iterate.
-
-    Raises
-    ------
-    InputError
-        If IPOPT does not know an option.
-    """
-    options = options or InteriorPointOptions()
-    if options.hessian not in get_args(Hessian):
-        known = ", ".join(get_args(Hessian))
-        raise InputError(f"no hessian {options.hessian!r}; available: {known}", None, "solver")
-    began = time.perf_counter()
-    notes: list[str] = []
-    if start is None:
-        start, notes = initial_variables(collocation)
-    errors: list[BaseException] = []
-    functions = NlpFunctions(collocation, _DampedHessian(collocation, options), errors)
-    monitor = Monitor(collocation, watch, began, errors)
-    solver = _build_solver(functions, monitor, options)
-    lower, upper = collocation.bounds()
-    built = time.perf_counter()
-    with interruptible(monitor):
-        answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
-    if errors:
-        raise errors[0]
-    stats = solver.stats()
-    spent = timing(functions, monitor, began, built)
-    if stats["return_status"] == "Invalid_Option":
-        notes.append(
-            f"linear_solver = '{options.linear_solver}' needs a library that is not installed; "
-            "'mumps' and 'spral' come with CasADi"
+        Raises
+        ------
+        InputError
+            If IPOPT does not know an option.
+        """
+        recorder = Recorder(self.name, collocation, watch)
+        hessian = _DampedHessian(collocation, self)
+        found = nlpsol.solve(recorder, start, "ipopt", hessian, self._settings, IPOPT_STATUS)
+        if found.said == "Invalid_Option":
+            recorder.notes.append(
+                f"linear_solver = '{self.linear_solver}' needs a library that is not installed; "
+                "'mumps' and 'spral' come with CasADi"
+            )
+        return recorder.solution(
+            found.status,
+            f"{found.status.sentence} (IPOPT: {found.said})",
+            found.z,
+            found.multipliers,
+            found.iterations,
+            found.evaluations,
         )
-    status = IPOPT_STATUS.get(stats["return_status"], Status.NUMERICAL_FAILURE)
-    z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
-    if not status.converged and monitor.best is not None:
-        z, multipliers = monitor.best
-    return Solution(
-        status=status,
-        message=f"{status.sentence} (IPOPT: {stats['return_status']})",
-        method="interior-point",
-        collocation=collocation,
-        z=z,
-        multipliers=multipliers,
-        iterations=int(stats.get("iter_count", len(monitor.history))),
-        history=tuple(monitor.history),
-        timing=spent,
-        notes=tuple(notes),
-        evaluations=functions.calls,
-    )
 
-
-def _build_solver(
-    functions: NlpFunctions, monitor: Monitor, options: InteriorPointOptions
-) -> ca.Function:
-    settings: dict[str, Any] = {
-        "ipopt.linear_solver": options.linear_solver,
-        "ipopt.tol": options.tolerance,
-        "ipopt.max_iter": options.max_iterations,
-        "ipopt.max_wall_time": options.max_time_s,
-        "ipopt.print_level": 0,
-        "ipopt.sb": "yes",
-        "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
-        "print_time": False,
-        "error_on_fail": False,
-        "show_eval_warnings": False,  # a trial step that inverts an element is cut back
-        "no_nlp_grad": True,
-        "jac_g": functions.function("jac_g", "g", "jac_g"),
-        "grad_f": functions.function("grad_f", "f", "grad_f"),
-        "iteration_callback": monitor,
-    }
-    if options.linear_solver == "mumps":  # METIS ordering, no scaling: a little faster here
-        settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
-    if options.hessian == "limited-memory":
-        settings["ipopt.hessian_approximation"] = "limited-memory"
-    else:
-        settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
-    settings |= {f"ipopt.{name}": value for name, value in options.ipopt.items()}
-    return build("ipopt", functions, settings, "IPOPT")
+    def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
+        settings: dict[str, Any] = {
+            "ipopt.linear_solver": self.linear_solver,
+            "ipopt.tol": self.tolerance,
+            "ipopt.max_iter": self.max_iterations,
+            "ipopt.max_wall_time": self.max_time_s,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
+            "jac_g": functions.function("jac_g", "g", "jac_g"),
+            "grad_f": functions.function("grad_f", "f", "grad_f"),
+        }
+        if self.linear_solver == "mumps":  # METIS ordering, no scaling: a little faster here
+            settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
+        if self.hessian == "limited-memory":
+            settings["ipopt.hessian_approximation"] = "limited-memory"
+        else:
+            settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
+        return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 
 
 class _DampedHessian:
     """Hessian of the Lagrangian with the warm-up and proximal terms of the options."""
 
-    def __init__(self, collocation: Collocation, options: InteriorPointOptions) -> None:
+    def __init__(self, collocation: Collocation, options: InteriorPoint) -> None:
         self.collocation = collocation
         self.options = options
         self._last_q = np.full(collocation.nq, np.inf)

@@ -188,9 +188,7 @@ class _System:
         except np.linalg.LinAlgError:
             return None
         border, problem = self.problem.bounded, self.problem
-        reach = np.concatenate(
-            [np.ones(problem.nlp.nq), *(segment.local.reach for segment in problem.nlp.segments)]
-        )
+        reach = problem.nlp.reach_p
         places = np.where(border < problem.nlp.nq, border, border - len(self.z) + len(reach))
         reach = REACH * reach[places]
         # Rounding may leave a parameter on its bound by a hair.

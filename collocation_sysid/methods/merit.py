@@ -55,14 +55,14 @@ class Unconstrained:
         self.bounded: Index = np.flatnonzero(of_p & self.free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
-        """G and ∂g/∂z; the matrix is overwritten by the next call."""
+        """Constraints g and ∂g/∂z; the matrix is overwritten by the next call."""
         self.evaluations += 1
         with self.stopwatch.evaluating():
             rows, _ = self.nlp.constraints_and_jacobian(z, self._entries)
         return rows, self._jacobian
 
     def constraint_values(self, z: Array) -> Array:
-        """G, scaled."""
+        """Constraints g, scaled."""
         self.evaluations += 1
         with self.stopwatch.evaluating():
             return self.nlp.constraint_values(z)
@@ -90,12 +90,7 @@ class Unconstrained:
     def grasped(self, z: Array) -> Array:
         """The point with all held nodes exactly where their grasps are."""
         q, positions = self.nlp.unpack(z)
-        moved = [x.copy() for x in positions]
-        for segment, x in zip(self.nlp.segments, moved, strict=True):
-            first = segment.dynamics.first_row
-            x[first:, segment.held_dofs] = segment.held_positions[first:]
-            if segment.dynamics.taken is not None:
-                x[segment.dynamics.taken] = segment.taken_positions
+        moved = [s.grasped(x) for s, x in zip(self.nlp.segments, positions, strict=True)]
         there = self.nlp.pack(q, moved, self.nlp.unpack_own(z))
         there[~self.free] = z[~self.free]
         return there if self.is_upright(there) else z
@@ -162,7 +157,7 @@ class Merit:
         return self.multipliers + self.rho * rows
 
     def value_of(self, z: Array, rows: Array) -> float:
-        """M from g at z."""
+        """The value m from g at z."""
         pull = float(self.multipliers @ rows + self.rho / 2 * (rows @ rows))
         value = self.problem.nlp.objective(z) + pull
         return value if np.isfinite(value) else np.inf

@@ -1,22 +1,36 @@
-"""What a method is: a function that solves a `Collocation`, and its options."""
+"""What a method is: anything that solves a `Collocation`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Protocol
 
-from .solution import Solution
+from ..arrays import Array
+from ..nlp.collocation import Collocation
+from .solution import Iteration, Solution
+
+Watch = Callable[[Iteration], None]
 
 
-@dataclass(frozen=True)
-class Method:
-    """A solver and the dataclass of its options."""
+class Method(Protocol):
+    """A callable that solves a `Collocation`, as those of `METHODS` are with their options."""
 
-    solve: Callable[..., Solution]
-    options: type[Any]
+    def __call__(
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+    ) -> Solution:
+        """Solve the NLP.
 
-    @property
-    def option_names(self) -> frozenset[str]:
-        """Names of the options."""
-        return frozenset(field.name for field in fields(self.options))
+        Parameters
+        ----------
+        collocation : Collocation
+        watch : callable, optional
+            Called with every line of the history, an `Iteration`.
+        start : (variables,) ndarray, optional
+            Initial variables; the method's own choice at the guess by default.
+
+        Returns
+        -------
+        Solution
+            Also when it did not converge or was interrupted (Ctrl-C): then the best iterate.
+        """
+        ...

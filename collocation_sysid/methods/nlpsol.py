@@ -1,4 +1,4 @@
-"""What solvers behind CasADi's `nlpsol` share: set-up, and Ctrl-C."""
+"""A solve by one of the NLP solvers behind CasADi's `nlpsol`."""
 
 from __future__ import annotations
 
@@ -6,51 +6,137 @@ import io
 import re
 import signal
 import threading
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError
-from .callbacks import Monitor, NlpFunctions
-from .solution import Timing
+from .callbacks import HessianValues, Monitor, NlpFunctions
+from .recorder import Recorder
+from .solution import Status
+
+Settings = Callable[[NlpFunctions], Mapping[str, Any]]
+
+_COMMON = {
+    "print_time": False,
+    "error_on_fail": False,
+    "show_eval_warnings": False,  # a trial step that inverts an element is cut back
+    "no_nlp_grad": True,
+}
 
 
-def build(
-    plugin: str, functions: NlpFunctions, settings: Mapping[str, Any], name: str
-) -> ca.Function:
-    """The solver `plugin` for the NLP of the callbacks.
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The last iterate, or where it did not converge the best.
+
+    Attributes
+    ----------
+    status : Status
+    said : str
+        The solver's own word for it.
+    z : (variables,)
+    multipliers : (constraints,)
+    iterations, evaluations : int
+    """
+
+    status: Status
+    said: str
+    z: Array
+    multipliers: Array
+    iterations: int
+    evaluations: int
+
+
+def solve(
+    recorder: Recorder,
+    start: Array | None,
+    plugin: str,
+    hessian: HessianValues,
+    settings: Settings,
+    statuses: Mapping[str, Status],
+) -> Outcome:
+    """Solve the recorder's collocation; Ctrl-C ends it after the iteration.
+
+    Parameters
+    ----------
+    recorder : Recorder
+    start : (variables,) ndarray, optional
+    plugin : str
+    hessian : callable
+        Writes second derivatives, see `NlpFunctions`.
+    settings : callable
+        The plugin's settings, given the functions.
+    statuses : mapping
+        Its words for how it ended in ours; a failure where one is not among them.
 
     Raises
     ------
     InputError
         If it does not know a setting, with its own words.
     """
+    collocation, watch = recorder.collocation, recorder.stopwatch
+    errors: list[BaseException] = []
+    with watch.building():
+        start = recorder.start(start)
+        functions = NlpFunctions(collocation, hessian, errors)
+        monitor = Monitor(recorder, errors)
+        given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
+        solver = _nlpsol(plugin, functions, given)
+    z, multipliers, said, count = _run(solver, collocation.bounds(), start, monitor)
+    if errors:
+        raise errors[0]
+    watch.evaluations = functions.seconds
+    # What is neither set-up nor callback.
+    others = watch.build + functions.seconds + monitor.seconds
+    watch.linear_algebra = max(0.0, recorder.elapsed_s - others)
+    status = statuses.get(said, Status.NUMERICAL_FAILURE)
+    if monitor.stop or (recorder.late and not status.converged):
+        status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
+    if not (status.converged and np.isfinite(z).all()):
+        z, multipliers = monitor.best or (start, np.zeros(collocation.constraints))
+    iterations = count or max(0, len(recorder.history) - 1)
+    return Outcome(status, said, z, multipliers, iterations, functions.calls)
+
+
+def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
     z = ca.MX.sym("z", functions.collocation.variables)
     value, rows = functions.nlp(z, ca.MX(0, 1))
     said = io.StringIO()
     try:
         with redirect_stdout(said):  # where IPOPT says which setting it refuses
-            return ca.nlpsol("solver", plugin, {"x": z, "f": value, "g": rows}, dict(settings))
+            return ca.nlpsol("solver", plugin, {"x": z, "f": value, "g": rows}, settings)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).strip().splitlines()]
         unknown = [line for line in lines if "Unknown option" in line]
         reason = (said.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
         reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
+        name = "IPOPT" if plugin == "ipopt" else plugin
         raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
 
 
-def timing(functions: NlpFunctions, monitor: Monitor, began: float, built: float) -> Timing:
-    """Where the time went since `began`; what is neither set-up nor callback is linear algebra."""
-    total = time.perf_counter() - began
-    spent = (built - began) + functions.seconds + monitor.seconds
-    return Timing(built - began, functions.seconds, max(0.0, total - spent), total)
+def _run(
+    solver: ca.Function, bounds: tuple[Array, Array], start: Array, monitor: Monitor
+) -> tuple[Array, Array, str, int]:
+    """Variables, multipliers, what the solver said, and its iterations."""
+    lower, upper = bounds
+    try:
+        with _interruptible(monitor):
+            answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
+        stats = solver.stats()
+    except RuntimeError as error:  # of its own, or what a callback's failure makes of it
+        said = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
+        return np.full(len(start), np.nan), np.zeros(0), said, 0
+    z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
+    return z, multipliers, str(stats["return_status"]), int(stats.get("iter_count") or 0)
 
 
 @contextmanager
-def interruptible(monitor: Monitor) -> Iterator[None]:
+def _interruptible(monitor: Monitor) -> Iterator[None]:
     """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program."""
     if threading.current_thread() is not threading.main_thread():
         yield

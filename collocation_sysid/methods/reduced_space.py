@@ -18,66 +18,84 @@ even a rung cannot be simulated as a whole, the rows that can be are solved firs
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
 import numpy as np
 
 from ..arrays import Array
-from ..errors import SimulationError
+from ..checked import Count, Positive
 from ..nlp.collocation import Collocation
+from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
-from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
-from .multipliers import constraint_multipliers
-from .search import ReducedSpaceOptions, Search, Watch
-from .solution import Solution, Status, Timing
+from .ladder import SHARES, Shares
+from .method import Watch
+from .options import Options
+from .recorder import Recorder
+from .search import Search
+from .solution import Solution, Status
+from .start import completed
 
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
 
 
-@one_blas_thread()
-def solve(
-    collocation: Collocation,
-    options: ReducedSpaceOptions | None = None,
-    watch: Watch | None = None,
-) -> Solution:
-    """Solve the NLP in the reduced space.
+@dataclass(frozen=True)
+class ReducedSpace(Options):
+    """Gauss–Newton steps of the parameters, with the trajectories that the dynamics give them.
 
-    Parameters
+    Attributes
     ----------
-    collocation : Collocation
-    options : ReducedSpaceOptions, optional
-    watch : callable, optional
-        Called with every accepted `Iteration`; its number counts sweeps, rejected ones included.
-        The first iterations are those of short horizons.
-
-    Returns
-    -------
-    Solution
-        With the multipliers of the whole NLP. Also when it did not converge or was interrupted.
+    tolerance : float
+        Largest last step of a parameter's logarithm.
+    max_iterations : int
+        Sweeps over all rungs of the ladder; a rejected trial counts.
+    trust : float
+        First trust region: longest step of a parameter's logarithm.
+    ladder : tuple of float
+        Shares of the recording solved one after another, ending with 1; a start needs none.
+    rung_decrease : float
+        All rungs but the last end when a step promises to lower the loss by less than this share.
+    rung_prior : float
+        On them a prior of this standard deviation of the logarithm holds each parameter near its
+        guess: a short horizon says nothing about some, and would let them run to their bounds.
+    hessian : {"gauss-newton", "exact"}
+        Near the answer, what Gauss–Newton leaves out is learned from the steps, or computed
+        exactly from the Lagrangian: a second sweep an iteration, for large residuals.
+    factorisation : {"auto", "band", "sparse"}
+        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
     """
-    search = Search(collocation, options or ReducedSpaceOptions(), watch)
-    why = ""
-    try:
-        status = search.climb()
-    except SimulationError as error:
-        status, why = Status.NOT_SIMULABLE, f" {error}."
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
-    z, multipliers = _whole(collocation, search)
-    search.notes += _notes(collocation, search, z, status)
-    return Solution(
-        status=status,
-        message=f"{status.sentence}{why}",
-        method="reduced-space",
-        collocation=collocation,
-        z=z,
-        multipliers=multipliers,
-        iterations=search.sweeps,
-        history=tuple(search.history),
-        timing=Timing.of(search.stopwatch, search.began),
-        notes=tuple(search.notes),
-        evaluations=search.sweeps,
-    )
+
+    name: ClassVar[str] = "reduced-space"
+
+    tolerance: Positive = 1e-8
+    max_iterations: Count = 200
+    trust: Positive = 1.0
+    ladder: Shares = SHARES
+    rung_decrease: Positive = 0.05
+    rung_prior: Positive = 2.3
+    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
+    factorisation: Choice = "auto"
+
+    @one_blas_thread()
+    def __call__(
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+    ) -> Solution:
+        """Solve the NLP, see `Method`.
+
+        Lines of the history count sweeps, rejected ones included; the first are those of short
+        horizons.
+        """
+        recorder = Recorder(self.name, collocation, watch)
+        search = Search(self, recorder, start)
+        status, message = recorder.search(search.run)
+        z = completed(collocation, search.p, search.x)
+        rows = [segment.grid_rows for segment in collocation.segments]
+        reached = search.x is not None and [len(x) for x in search.x] == rows
+        recorder.notes += _notes(collocation, search.indefinite, z, status)
+        multipliers = None if reached else np.zeros(collocation.constraints)
+        return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)
 
 
 def memory_mb(collocation: Collocation) -> float:
@@ -89,34 +107,12 @@ def memory_mb(collocation: Collocation) -> float:
     return (8 * numbers + max(chunks)) / 1e6
 
 
-def _whole(collocation: Collocation, search: Search) -> tuple[Array, Array]:
-    """Variables and multipliers of the whole NLP."""
-    x = search.x
-    whole = [_filled(s, x[k] if x else None) for k, s in enumerate(collocation.segments)]
-    q, own = collocation.split(search.p)
-    z = collocation.pack(q, whole, own)
-    if x and all(len(a) == s.grid_rows for a, s in zip(x, collocation.segments, strict=True)):
-        try:
-            return z, constraint_multipliers(collocation, z, search.stopwatch)
-        except SimulationError:
-            pass
-    return z, np.zeros(collocation.constraints)
-
-
-def _filled(segment: Segment, x: Array | None) -> Array:
-    """All rows of a trajectory; those not reached are carried rigidly by the grasp."""
-    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(segment.grid_rows, -1)
-    if x is not None:
-        rigid[: len(x)] = x
-    return rigid
-
-
-def _notes(collocation: Collocation, search: Search, z: Array, status: Status) -> list[str]:
+def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) -> list[str]:
     notes = []
-    if search.indefinite:
+    if indefinite:
         steps = sum(segment.constraint_times for segment in collocation.segments)
         notes.append(
-            f"the equations of {search.indefinite} of {steps} timesteps are not positive definite "
+            f"the equations of {indefinite} of {steps} timesteps are not positive definite "
             "at the answer: the body is near buckling, or damped more than its motion allows"
         )
     if status in (Status.CONVERGED, Status.STALLED):

@@ -2,69 +2,24 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from ..arrays import Array
-from ..errors import InputError, SimulationError
+from ..errors import SimulationError
 from ..fem.constants import unit_of
-from ..nlp.collocation import Collocation
-from ..nlp.factorisation import Choice
-from ..nlp.stopwatch import Stopwatch
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
+from .ladder import FEWEST, part_of
+from .recorder import Recorder
 from .secant import updated, with_curvature
 from .solution import Iteration, Status
 
-Watch = Callable[[Iteration], None]
+if TYPE_CHECKING:
+    from .reduced_space import ReducedSpace
 
-
-Hessian = Literal["gauss-newton", "exact"]
-
-
-@dataclass(frozen=True)
-class ReducedSpaceOptions:
-    """Options of the reduced-space method.
-
-    Attributes
-    ----------
-    tolerance : float
-        Largest last step of a parameter's logarithm.
-    max_iterations : int
-        Sweeps over all rungs of the ladder; a rejected trial counts.
-    trust : float
-        First trust region: longest step of a parameter's logarithm.
-    ladder : tuple of float
-        Shares of the recording solved one after another, ending with 1.
-    rung_decrease : float
-        All rungs but the last end when a step promises to lower the loss by less than this share.
-    rung_prior : float
-        On them a prior of this standard deviation of the logarithm holds each parameter near its
-        guess: a short horizon says nothing about some, and would let them run to their bounds.
-    hessian : {"gauss-newton", "exact"}
-        Near the answer, what Gauss–Newton leaves out is learned from the steps, or computed
-        exactly from the Lagrangian: a second sweep an iteration, for large residuals.
-    factorisation : {"auto", "band", "sparse"}
-        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
-    """
-
-    tolerance: float = 1e-8
-    max_iterations: int = 200
-    trust: float = 1.0
-    ladder: tuple[float, ...] = (0.25, 0.5, 1.0)
-    rung_decrease: float = 0.05
-    rung_prior: float = 2.3
-    hessian: Hessian = "gauss-newton"
-    factorisation: Choice = "auto"
-
-
-# Fewest grid rows of a rung.
-MIN_ROWS = 8
 # A trial's infeasibility may be this share of its step's length, or this share of an edge of
 # the mesh: the strain it causes is then small enough for Newton's next step to remove it.
 CONTRACTION, SMALL_STRAIN = 0.5, 0.1
@@ -88,31 +43,23 @@ STIFFENINGS = 10
 
 
 class Search:
-    """The state of a solve: the best point, the trust region, budget, history and notes."""
+    """The state of a solve: the best point, the trust region, and the budget."""
 
-    def __init__(
-        self, collocation: Collocation, options: ReducedSpaceOptions, watch: Watch | None
-    ) -> None:
-        if options.hessian not in get_args(Hessian):
-            known = ", ".join(get_args(Hessian))
-            raise InputError(f"no hessian {options.hessian!r}; available: {known}", None, "solver")
-        self.collocation = collocation
-        self.options = options
-        self.watch = watch
-        self.began = time.perf_counter()
-        self.stopwatch = Stopwatch()
+    def __init__(self, options: ReducedSpace, recorder: Recorder, start: Array | None) -> None:
+        self.options, self.recorder = options, recorder
+        self.collocation = collocation = recorder.collocation
         self.sweeps = 0
         self.trust = options.trust
-        self.history: list[Iteration] = []
-        self.notes: list[str] = []
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
-        self.p = np.concatenate([collocation.parameters.guess_q, np.zeros(collocation.own)])
-        # What a trust region of one allows each parameter.
-        self.reach = np.concatenate(
-            [np.ones(collocation.nq), *(s.local.reach for s in collocation.segments)]
-        )
-        self.x: list[Array] | None = None
+        self.reach = collocation.reach_p
+        self.p, self.x = collocation.guess_p, None
+        if start is not None:
+            start = np.clip(start, *collocation.bounds())
+            parts = zip(collocation.segments, collocation.unpack(start)[1], strict=True)
+            self.p = collocation.parameters_of(start)
+            self.x = [segment.grasped(x) for segment, x in parts]
+        self.first = self.p
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
@@ -120,33 +67,44 @@ class Search:
 
     # The ladder -------------------------------------------------------------------------------
 
-    def climb(self) -> Status:
-        """Solve rung after rung.
+    def run(self) -> tuple[Status, str]:
+        """Solve the whole from the positions given, or rung after rung.
 
         Raises
         ------
         SimulationError
             Where not even the rows that were reached help to reach more.
         """
+        status = self._whole() or self._climb()
+        return status, status.sentence
+
+    def _whole(self) -> Status | None:
+        """Solve the whole where positions are given, unless they lead nowhere."""
+        if self.x is None:
+            return None
+        try:
+            return self._descend(self._horizon([len(x) for x in self.x], last=True), last=True)
+        except SimulationError:
+            self.x = self.point = None
+            return None
+
+    def _climb(self) -> Status:
+        """Solve rung after rung."""
         status = Status.CONVERGED
         for share in self.options.ladder:
             last = share == self.options.ladder[-1]
-            rung = self._horizon(self._rows(share), last)
+            rows = [part_of(segment.grid_rows, share) for segment in self.collocation.segments]
+            rung = self._horizon(rows, last)
             self._reach(rung)
             status = self._descend(rung, last)
             if status is Status.ITERATION_LIMIT:
                 break
         return status
 
-    def _rows(self, share: float) -> list[int]:
-        return [
-            min(segment.grid_rows, max(MIN_ROWS, round(share * segment.grid_rows)))
-            for segment in self.collocation.segments
-        ]
-
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         prior = None if last else self.options.rung_prior
-        return Horizon(self.collocation, rows, prior, self.stopwatch, self.options.factorisation)
+        watch, choice = self.recorder.stopwatch, self.options.factorisation
+        return Horizon(self.collocation, rows, prior, watch, choice)
 
     def _reach(self, rung: Horizon) -> None:
         """Extend the trajectories to a rung's length; where that fails, first solve what is."""
@@ -165,7 +123,7 @@ class Search:
                 self.x = reached
                 return
             rows = [len(x) for x in reached]
-            fewest = min(MIN_ROWS, *rung.rows)
+            fewest = min(FEWEST, *rung.rows)
             if known is None and min(rows) < fewest:
                 self._stiffen(failure)
                 continue
@@ -189,8 +147,7 @@ class Search:
         )
         q, upper = self.p[: len(names)], self.upper[: len(names)]
         stiffer = np.minimum(q + np.log(2) * moduli, upper)
-        started = self.collocation.parameters.guess_q
-        factor = float(np.exp(np.max(stiffer - started, initial=0.0)))
+        factor = float(np.exp(np.max(stiffer - self.first[: len(names)], initial=0.0)))
         if np.allclose(stiffer, q) or factor > 1.01 * 2**STIFFENINGS:
             raise failure
         self.p = np.concatenate([stiffer, self.p[len(names) :]])
@@ -198,7 +155,7 @@ class Search:
             f"the body cannot be simulated at the guess ({failure}); "
             f"started from moduli {factor:.3g} times as stiff"
         )
-        self.notes[:] = [note]
+        self.recorder.notes[:] = [note]
 
     # One rung ---------------------------------------------------------------------------------
 
@@ -247,7 +204,7 @@ class Search:
     def _curvature(self, curvature: Array, before: Point, after: Point) -> Array:
         """What Gauss–Newton leaves out at `after`, the secant's or the exact."""
         if self.options.hessian == "exact":
-            return exact_curvature(self.collocation, after, self.stopwatch)
+            return exact_curvature(self.collocation, after, self.recorder.stopwatch)
         return updated(curvature, before, after)
 
     def _length(self, step: Array) -> float:
@@ -349,14 +306,7 @@ class Search:
             squares.append(segment.observation.squared_distances_m2(projected, own[k]))
             violation_n = max(violation_n, here)
         distances = np.concatenate(squares)
-        line = Iteration(
-            number=self.sweeps,
-            loss=loss,
-            rms_m=float(np.sqrt(distances.mean())) if len(distances) else 0.0,
-            violation_n=violation_n,
-            parameters=self.collocation.parameters.values(q),
-            time_s=time.perf_counter() - self.began,
-        )
-        self.history.append(line)
-        if self.watch is not None:
-            self.watch(line)
+        rms_m = float(np.sqrt(distances.mean())) if len(distances) else 0.0
+        values = self.collocation.parameters.values(q)
+        time_s = self.recorder.elapsed_s
+        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s))

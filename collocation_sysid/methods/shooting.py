@@ -16,26 +16,24 @@ the step, and the line search goes back to a quarter. At the guess there is noth
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from ..arrays import Array
-from ..errors import InputError, SimulationError
+from ..checked import Count, Positive
+from ..errors import SimulationError
 from ..nlp.collocation import Collocation
-from ..nlp.marching import march_on
 from ..nlp.stopwatch import Stopwatch
 from .horizon import Horizon
+from .method import Watch
 from .multipliers import constraint_multipliers
-from .solution import Iteration, Solution, Status, Timing
-from .start import carried_rigidly
-
-Watch = Callable[[Iteration], None]
-Gradient = Literal["forward", "adjoint"]
+from .options import Options
+from .recorder import Ended, Recorder
+from .solution import Solution, Status
+from .start import completed, marched
 
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14
@@ -46,8 +44,8 @@ MEMORY = 20
 
 
 @dataclass(frozen=True)
-class ShootingOptions:
-    """Options of single shooting.
+class Shooting(Options):
+    """Single shooting.
 
     Attributes
     ----------
@@ -63,69 +61,33 @@ class ShootingOptions:
         No simulation is begun after this time.
     """
 
-    gradient: Gradient = "forward"
-    tolerance: float = 1e-8
-    max_iterations: int = 200
-    max_time_s: float = 1e6
+    name: ClassVar[str] = "shooting"
 
+    gradient: Literal["forward", "adjoint"] = "forward"
+    tolerance: Positive = 1e-8
+    max_iterations: Count = 200
+    max_time_s: Positive = 1e6
 
-def solve(
-    collocation: Collocation,
-    options: ShootingOptions | None = None,
-    watch: Watch | None = None,
-    start: Array | None = None,
-) -> Solution:
-    """Solve by single shooting.
+    def __call__(
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+    ) -> Solution:
+        """Solve the NLP, see `Method`; lines of the history are simulations better than all before.
 
-    Parameters
-    ----------
-    collocation : Collocation
-    options : ShootingOptions, optional
-    watch : callable, optional
-        Called with every `Iteration`, which is a simulation better than all before.
-    start : (variables,) ndarray, optional
-        Variables whose parameters are the first; their positions do not matter. The guess by
-        default.
-
-    Returns
-    -------
-    Solution
-        With a simulated trajectory and the multipliers of the whole NLP. Also when it did not
-        converge or was interrupted: then the best simulation. Where that of the guess fails, the
-        status says so and the positions are carried rigidly by the grasp.
-
-    Raises
-    ------
-    InputError
-        For an unknown gradient.
-    """
-    options = options or ShootingOptions()
-    if options.gradient not in get_args(Gradient):
-        known = ", ".join(get_args(Gradient))
-        raise InputError(f"no gradient {options.gradient!r}; available: {known}", None, "solver")
-    search = _Search(collocation, options, watch, start)
-    try:
-        status, why = search.run()
-    except SimulationError as error:
-        status, why = Status.NOT_SIMULABLE, f" {error}."
-    except _Stop as stop:
-        status, why = stop.status, ""
-    except KeyboardInterrupt:
-        status, why = Status.INTERRUPTED, ""
-    z, multipliers = search.answer()
-    return Solution(
-        status=status,
-        message=f"{status.sentence}{why}",
-        method="shooting",
-        collocation=collocation,
-        z=z,
-        multipliers=multipliers,
-        iterations=search.shots,
-        history=tuple(search.history),
-        timing=Timing.of(search.stopwatch, search.began),
-        notes=search.notes,
-        evaluations=search.shots,
-    )
+        Of a start only the parameters matter. Where their simulation fails, the status says so
+        and the positions are carried rigidly by the grasp.
+        """
+        recorder = Recorder(self.name, collocation, watch, self.max_time_s)
+        search = _Search(self, recorder, start)
+        status, message = recorder.search(search.run)
+        best, shots = search.best, search.shots
+        if best is None:
+            z, multipliers = completed(collocation, search.first), np.zeros(collocation.constraints)
+        else:
+            z, multipliers = best.z, None
+        if best is not None and search.failed:
+            failed = f"{search.failed} of {shots} simulations failed"
+            recorder.notes.append(f"{failed}; the search went back each time")
+        return recorder.solution(status, message, z, multipliers, shots, shots)
 
 
 def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = None) -> Array:
@@ -136,17 +98,10 @@ def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = 
     SimulationError
         Naming the step that failed.
     """
+    positions, failure = marched(collocation, p, stopwatch=stopwatch)
+    if failure is not None:
+        raise failure
     q, own = collocation.split(p)
-    positions = []
-    for segment, setting, phi in zip(
-        collocation.segments, collocation.settings(p), own, strict=True
-    ):
-        x, failure = march_on(
-            segment.corrected(phi), setting.dynamics, setting.theta, stopwatch=stopwatch
-        )
-        if failure is not None:
-            raise failure
-        positions.append(x)
     return collocation.pack(q, positions, own)
 
 
@@ -165,13 +120,6 @@ def adjoint_gradient(
     return collocation.parameters_of(slope)
 
 
-class _Stop(Exception):
-    """Ends the search from within an evaluation."""
-
-    def __init__(self, status: Status) -> None:
-        self.status = status
-
-
 @dataclass(frozen=True, eq=False)
 class _Shot:
     """A simulation: its objective, and residuals with slopes or the gradient of the objective."""
@@ -186,31 +134,22 @@ class _Shot:
 class _Search:
     """Counts, remembers and reports simulations for SciPy's optimisers."""
 
-    def __init__(
-        self,
-        collocation: Collocation,
-        options: ShootingOptions,
-        watch: Watch | None,
-        start: Array | None,
-    ) -> None:
-        self.collocation, self.options, self.watch = collocation, options, watch
-        self.began = time.perf_counter()
-        self.stopwatch = Stopwatch()
+    def __init__(self, options: Shooting, recorder: Recorder, start: Array | None) -> None:
+        self.options, self.recorder = options, recorder
+        self.collocation = collocation = recorder.collocation
         self.lower, self.upper = collocation.bounds_p
-        guess = np.concatenate([collocation.parameters.guess_q, np.zeros(collocation.own)])
-        first = guess if start is None else collocation.parameters_of(start)
+        first = collocation.guess_p if start is None else collocation.parameters_of(start)
         self.first = np.clip(first, self.lower, self.upper)
         self.shots = self.failed = 0
         self.last: _Shot | None = None
         self.best: _Shot | None = None
-        self.history: list[Iteration] = []
         self.horizon = None
         if options.gradient == "forward":
             rows = [segment.grid_rows for segment in collocation.segments]
-            self.horizon = Horizon(collocation, rows, stopwatch=self.stopwatch)
+            self.horizon = Horizon(collocation, rows, stopwatch=recorder.stopwatch)
 
     def run(self) -> tuple[Status, str]:
-        """Search; the status, and what SciPy said.
+        """Search; the status, and a sentence with what SciPy said.
 
         Raises
         ------
@@ -219,47 +158,25 @@ class _Search:
         """
         self.last = self._shoot(self.first)
         if not len(self.first):
-            return Status.CONVERGED, ""
+            return Status.CONVERGED, Status.CONVERGED.sentence
         return self._gauss_newton() if self.horizon else self._quasi_newton()
-
-    def answer(self) -> tuple[Array, Array]:
-        """Variables and multipliers of the best simulation."""
-        collocation = self.collocation
-        if self.best is None:
-            q, own = collocation.split(self.first)
-            x = [carried_rigidly(s, s.constants.theta(q)) for s in collocation.segments]
-            return collocation.pack(q, x, own), np.zeros(collocation.constraints)
-        try:
-            return self.best.z, constraint_multipliers(collocation, self.best.z, self.stopwatch)
-        except SimulationError:
-            return self.best.z, np.zeros(collocation.constraints)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """How many simulations failed."""
-        if not self.failed or self.best is None:
-            return ()
-        return (
-            f"{self.failed} of {self.shots} simulations failed; the search went back each time",
-        )
 
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        reach = [np.ones(self.collocation.nq), *(s.local.reach for s in self.collocation.segments)]
         found = least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
             self._slope,  # pyright: ignore[reportArgumentType]
             (self.lower - self.first, self.upper - self.first),
             method="dogbox",
-            x_scale=np.concatenate(reach),
+            x_scale=self.collocation.reach_p,
             xtol=self.options.tolerance,
             ftol=ROUNDING,
             gtol=self.options.tolerance,
         )
         status = Status.ITERATION_LIMIT if found.status == 0 else Status.CONVERGED
-        return status, f" (SciPy: {found.message})"
+        return status, f"{status.sentence} (SciPy: {found.message})"
 
     def _residual(self, step: Array) -> Array:
         shot = self._try(self.first + step)
@@ -286,13 +203,14 @@ class _Search:
                 "maxfun": 10 * self.options.max_iterations + 10,
             },
         )
-        if found.success:
-            return Status.CONVERGED, f" (SciPy: {found.message})"
         assert self.best is not None
         p, slope = self.best.p, self.best.slope
         projected = np.clip(p - slope, self.lower, self.upper) - p
         flat = np.abs(projected).max() <= max(FLAT, self.options.tolerance)
-        return Status.ACCEPTABLE if flat else Status.STALLED, f" (SciPy: {found.message})"
+        status = Status.ACCEPTABLE if flat else Status.STALLED
+        if found.success:
+            status = Status.CONVERGED
+        return status, f"{status.sentence} (SciPy: {found.message})"
 
     def _objective(self, p: Array) -> tuple[float, Array]:
         shot = self._try(p)
@@ -319,41 +237,27 @@ class _Search:
             self.failed += 1
             assert self.best is not None
             if np.abs(p - self.best.p).max() <= self.options.tolerance:
-                raise _Stop(Status.STALLED)
+                raise Ended(Status.STALLED)
             return None
         self.last = shot
         return shot
 
     def _shoot(self, p: Array) -> _Shot:
         if self.shots and self.shots >= self.options.max_iterations:
-            raise _Stop(Status.ITERATION_LIMIT)
-        if self.shots and time.perf_counter() - self.began > self.options.max_time_s:
-            raise _Stop(Status.TIME_LIMIT)
+            raise Ended(Status.ITERATION_LIMIT)
+        if self.shots and self.recorder.late:
+            raise Ended(Status.TIME_LIMIT)
         self.shots += 1
         collocation = self.collocation
-        z = simulated(collocation, p, self.stopwatch)
+        z = simulated(collocation, p, self.recorder.stopwatch)
         if self.horizon is not None:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
             shot = _Shot(p.copy(), z, value, point.residual, point.slope)
         else:
-            slope = adjoint_gradient(collocation, z, self.stopwatch)
+            slope = adjoint_gradient(collocation, z, self.recorder.stopwatch)
             shot = _Shot(p.copy(), z, collocation.objective(z), np.zeros(0), slope)
         if self.best is None or shot.objective < self.best.objective:
-            self._record(shot)
+            self.best = shot
+            self.recorder.line(self.shots, z, shot.objective / collocation.loss_scale)
         return shot
-
-    def _record(self, shot: _Shot) -> None:
-        self.best = shot
-        violations = self.collocation.violations_n(shot.z)
-        line = Iteration(
-            number=self.shots,
-            loss=shot.objective / self.collocation.loss_scale,
-            rms_m=self.collocation.rms_m(shot.z),
-            violation_n=max(float(np.abs(r).max(initial=0.0)) for r in violations),
-            parameters=self.collocation.values(shot.z),
-            time_s=time.perf_counter() - self.began,
-        )
-        self.history.append(line)
-        if self.watch is not None:
-            self.watch(line)

@@ -197,6 +197,16 @@ class Collocation:
         limits = np.concatenate([np.zeros(0), *(s.local.limits for s in self.segments)])
         return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
 
+    @property
+    def guess_p(self) -> Array:
+        """The guess of p; own unknowns are zero."""
+        return np.concatenate([self.parameters.guess_q, np.zeros(self.own)])
+
+    @property
+    def reach_p(self) -> Array:
+        """What a trust region of one allows each entry of p."""
+        return np.concatenate([np.ones(self.nq), *(s.local.reach for s in self.segments)])
+
     def _phi_spans(self) -> list[tuple[int, int]]:
         return list(zip(self._phi_starts[:-1], self._phi_starts[1:], strict=True))
 
@@ -271,7 +281,7 @@ class Collocation:
         return self.constraints_and_jacobian(z, out)[1]
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """G and the values of ∂g/∂z, from one evaluation of the elements."""
+        """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
         values = np.empty(len(self.jacobian_structure[1])) if out is None else out
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
         rows, by_phi = np.empty(self.constraints), []

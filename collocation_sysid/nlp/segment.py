@@ -160,6 +160,14 @@ class Segment:
             return self.experiment
         return replace(self.experiment, gravity_m_s2=self.local.gravity(phi)[0])
 
+    def grasped(self, x: Array) -> Array:
+        """Positions (N, 3n) with the held nodes where their grasps are."""
+        x = x.copy()
+        x[:, self.held_dofs] = self.held_positions
+        if self.dynamics.taken is not None:
+            x[self.dynamics.taken] = self.taken_positions
+        return x
+
     # Values ---------------------------------------------------------------------------------
 
     def constraint_values(self, x: Array, setting: Setting) -> Array:

@@ -129,7 +129,7 @@ class BlockSolver:
 
     @one_blas_thread()
     def forward(self, x: Array, setting: Setting, known: Tangent | None = None) -> Tangent:
-        """P and Z at x (N, 3n).
+        """The step p and the sensitivities Z at x (N, 3n).
 
         Parameters
         ----------

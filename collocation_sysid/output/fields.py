@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from ..fem.batched import Batch, Evaluator, make_evaluator
+from ..fem.batched import Batch, Evaluator
 from ..fem.body import Body
 from ..fem.elements import Element
 from ..fem.expressions import PointKernel
@@ -52,7 +52,7 @@ class ElementFields:
             places = len(NAMES) * part.cells[:, None] + np.arange(len(NAMES))
             width = len(NAMES) * len(body.cells)
             batch = Batch(kernel, body.cells[part.cells], body.geometry[part.cells], places, width)
-            evaluators.append(make_evaluator(batch, body.evaluator))
+            evaluators.append(body.make_evaluator(batch))
         volumes = body.geometry[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)
 

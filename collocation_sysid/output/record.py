@@ -84,6 +84,7 @@ def _write_all_frames(solution: Solution, place: Path) -> None:
             body.nodes_m,
             {"residual_force_n": residual.reshape(positions.shape)},
             fields=ElementFields.of(body, body.theta(solution.parameters)),
+            cell_data={"region": body.part_of_cells} if len(body.parts) > 1 else None,
         )
 
 
@@ -187,7 +188,11 @@ def result(finished: Run) -> dict[str, Any]:
             "constraints": collocation.constraints,
             "scheme": collocation.scheme,
         },
-        "notes": list(dict.fromkeys([*problem.notes, *solution.notes, *finished.all_notes])),
+        "notes": list(
+            dict.fromkeys(
+                [*problem.notes, *problem.body.notes, *solution.notes, *finished.all_notes]
+            )
+        ),
         "history": [
             {
                 "iteration": line.number,

@@ -23,7 +23,7 @@ from ..experiment.experiment import Experiment
 RESULT_FILE = "result.json"
 ARRAYS_FILE = "trajectory.npz"
 # Of the body, and so the same for all experiments of a run.
-SHARED = ("undeformed_m", "tetrahedra", "surface")
+SHARED = ("undeformed_m", "tetrahedra", "surface", "surface_parts")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +37,8 @@ class Replay:
     undeformed_m : (n, 3)
     tetrahedra : (E, 4) corners of the elements
     surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
+    surface_parts : (F,) number of the part of the body that each belongs to
+    part_names : (P,) str, "" for what no region claims
     held : (T, n) bool, which nodes are grasped
     up : (3,) unit vector against gravity; z where there is none
     marker_names : (M,) str
@@ -52,6 +54,8 @@ class Replay:
     undeformed_m: Array
     tetrahedra: NDArray[np.integer]
     surface: NDArray[np.integer]
+    surface_parts: NDArray[np.integer]
+    part_names: Sequence[str]
     held: NDArray[np.bool_]
     up: Array
     marker_names: Sequence[str]
@@ -81,6 +85,8 @@ class Replay:
             body.nodes_m,
             body.mesh.tetrahedra,
             body.mesh.surface,
+            body.part_of_cells[body.mesh.surface_cells],
+            [part.name for part in body.parts],
             experiment.grasped(experiment.t_s)[0],
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
@@ -116,6 +122,8 @@ class Replay:
             "undeformed_m": self.undeformed_m,
             "tetrahedra": self.tetrahedra.astype(np.int32),
             "surface": self.surface.astype(np.int32),
+            "surface_parts": self.surface_parts.astype(np.int32),
+            "part_names": np.array(self.part_names),
         }
         return shared | {prefix + key: value for key, value in own.items() if value is not None}
 
@@ -141,7 +149,8 @@ class Replay:
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
-        return cls(name=name, marker_names=names, **found)
+        parts = [str(part) for part in arrays["part_names"]]
+        return cls(name=name, marker_names=names, part_names=parts, **found)
 
 
 def _single(array: Array | None) -> NDArray[np.float32] | None:

@@ -138,6 +138,7 @@ def write_frames(
     point_series: Mapping[str, ArrayLike] | None = None,
     max_frames: int = MAX_FRAMES,
     fields: ElementFields | None = None,
+    cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> Path:
     """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
 
@@ -155,6 +156,7 @@ def write_frames(
     undeformed_m : (n, 3)
     point_series : mapping of name to (T, n) or (T, n, k) numbers
     fields : ElementFields, optional
+    cell_data : mapping of name to (E,), the same in every frame
     """
     times, positions = np.asarray(t_s, dtype=float), np.asarray(positions_m, dtype=float)
     velocities = np.gradient(positions, times, axis=0, edge_order=1)
@@ -169,7 +171,9 @@ def write_frames(
             "velocity_m_s": velocities[k],
             **{name: values[k] for name, values in series.items()},
         }
-        in_cells = {n: v[0] for n, v in fields.at(positions[k]).items()} if fields else {}
+        in_cells = dict(cell_data or {})
+        if fields is not None:
+            in_cells |= {name: values[0] for name, values in fields.at(positions[k]).items()}
         write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
         written.append((float(times[k]), file))
     listing = Path(folder) / "trajectory.pvd"

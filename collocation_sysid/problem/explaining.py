@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_origin
@@ -10,24 +10,12 @@ from typing import Any, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from ..errors import InputError
+from ..checked import expected as wanted
+from ..errors import InputError, hint_at
 from .schema import ProblemFile
 
 Part = str | int
 Fault = Mapping[str, Any]
-
-_EXPECTED = {
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "bool_type": "true or false, without quotes",
-    "string_type": "text in quotes",
-    "string_too_short": "a text that is not empty",
-    "finite_number": "a finite number",
-    "greater_than": "a number above {gt:g}",
-    "greater_than_equal": "a number of at least {ge:g}",
-    "dict_type": "a table",
-}
 
 
 def explain(error: ValidationError, content: dict[str, Any], path: Path) -> InputError:
@@ -45,8 +33,8 @@ def explain(error: ValidationError, content: dict[str, Any], path: Path) -> Inpu
     # An unknown key explains the others around it.
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     message = _message(fault, content)
-    where = _where(_key(fault), content)
-    others = {_where(_key(other), content) for other in faults} - {where}
+    where = _place(fault, content)
+    others = {_place(other, content) for other in faults} - {where}
     if others:
         message += f" (and {len(others)} more to mend)"
     return InputError(message, path, where or None)
@@ -71,7 +59,8 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
     if kind == "extra_forbidden":
         return _unknown_key(key)
     if kind == "value_error":
-        return str(fault["ctx"]["error"])
+        error = fault["ctx"]["error"]
+        return error.message if isinstance(error, InputError) else str(error)
     in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
     if kind == "missing" and not in_array:
         return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
@@ -81,30 +70,23 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
     if kind in ("model_type", "model_attributes_type") and model is not None:
         return f"{found}; expected a table with some of the keys {', '.join(model.model_fields)}"
     if kind == "literal_error":
-        return f"{found}; {_meant(fault['input'], fault['ctx']['expected'])}"
-    if kind in _EXPECTED:
-        return f"{found}; expected {_EXPECTED[kind].format(**fault.get('ctx') or {})}"
-    return f"{found}; expected {fault['msg'].removeprefix('Input should be ')}"
+        choices = fault["ctx"]["expected"]
+        hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
+        return f"{found}; expected {choices}{hint}"
+    return f"{found}; expected {wanted(fault)}"
 
 
 def _unknown_key(key: Sequence[Part]) -> str:
     known = list(_model_at(key[:-1]).model_fields)
-    close = _nearest(key[-1], known)
-    hint = f"did you mean {close}?" if close else f"expected one of {', '.join(known)}"
-    return f"unknown key; {hint}"
+    hint = hint_at(str(key[-1]), known)
+    return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
 
 
-def _meant(found: Any, expected: str) -> str:
-    close = _nearest(found, expected.replace(" or ", ", ").replace("'", "").split(", "))
-    return f"did you mean {close!r}? Expected {expected}" if close else f"expected {expected}"
-
-
-def _nearest(found: Any, names: Sequence[str]) -> str | None:
-    """The name that was meant, where it was cut short or misspelt."""
-    text = str(found)
-    longer = [name for name in names if len(text) > 2 and name.startswith(text)]
-    close = longer or difflib.get_close_matches(text, [n for n in names if len(n) > 2], n=1)
-    return close[0] if close else None
+def _place(fault: Fault, content: dict[str, Any]) -> str:
+    """Where a fault is; an `InputError` knows the place inside what is one value here."""
+    error = (fault.get("ctx") or {}).get("error")
+    known = error.where if isinstance(error, InputError) else None
+    return known or _where(_key(fault), content)
 
 
 def _where(key: Sequence[Part], content: dict[str, Any]) -> str:

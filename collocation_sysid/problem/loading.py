@@ -10,11 +10,14 @@ from typing import TypeVar
 from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
+from ..fem.materials import Material
 from ..fem.mesh import TetMesh
+from ..fem.regions import Region
 from ..nlp.parameters import Parameters, Tied, Unknown
+from .code import load_material
 from .reading import read_problem_file
-from .recording import RecordingReader, existing_file
-from .schema import ObjectSection, ParameterSection, ProblemFile
+from .recording import RecordingReader, existing_file, selection
+from .schema import CodeSection, ObjectSection, ParameterSection, ProblemFile
 
 T = TypeVar("T")
 
@@ -44,7 +47,10 @@ class Problem:
 
 
 def load_problem(
-    path: str | Path, overrides: Sequence[str] = (), simulation: bool = False
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    simulation: bool = False,
+    allow_code: bool = False,
 ) -> Problem:
     """Load a problem file and the files it names.
 
@@ -55,6 +61,8 @@ def load_problem(
     simulation : bool
         Markers need no file then: those with a `reference_m` are sampled at the poses' times.
         And every experiment may be for validation.
+    allow_code : bool
+        Run the Python files that materials name.
 
     Raises
     ------
@@ -69,9 +77,9 @@ def load_problem(
         )
     folder = path.parent
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
-    body = _located(path, "object", lambda: _load_body(file.object, mesh))
+    body = _located(path, "object", lambda: _load_body(file.object, mesh, folder, allow_code))
     parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))
-    experiments, notes = [], list(mesh.notes)
+    experiments, notes = [], [*mesh.notes, *body.notes]
     for section in file.experiment:
         reader = RecordingReader(section, folder, body, parameters, simulation)
         experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
@@ -103,13 +111,30 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     return TetMesh.from_surface(surface, section.edge_length_m, section.length_unit, cache)
 
 
-def _load_body(section: ObjectSection, mesh: TetMesh) -> Body:
+def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: bool) -> Body:
+    def material(given: str | CodeSection, key: str) -> str | Material:
+        if isinstance(given, CodeSection):
+            return load_material(given, folder, key, allow_code)
+        return given
+
+    regions = [
+        Region(
+            region.name,
+            selection(region.cells),
+            None if region.material is None else material(region.material, f"region.{k}.material"),
+            region.density_kg_m3,
+            region.damping,
+        )
+        for k, region in enumerate(section.region)
+    ]
     return Body(
         mesh,
-        material=section.material,
+        material=material(section.material, "material"),
         density_kg_m3=section.density_kg_m3,
         mass_kg=section.mass_kg,
         element=section.element,
+        damping=section.damping,
+        regions=regions,
         evaluator=section.evaluator,
     )
 

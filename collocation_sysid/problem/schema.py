@@ -7,29 +7,53 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..checked import Finite, Flag, Positive, Text, Whole
+from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
-from ..methods import METHODS
-from ..methods.casadi_nlp import why_not
 from ..nlp.schemes import SCHEMES
-from .recording_schema import ExperimentSection
+from .recording_schema import ExperimentSection, Nodes
 from .section import Section, Unit, given_keys, require_one
-
-
-def _offered(name: Any) -> Any:
-    reason = why_not(name) if isinstance(name, str) else None
-    if reason is not None:
-        raise ValueError(reason)
-    return name
-
+from .solver_schema import SolverSection
 
 if TYPE_CHECKING:
-    MaterialName = ElementName = SchemeName = MethodName = str
+    MaterialName = DampingName = ElementName = SchemeName = str
 else:
     MaterialName = Literal[tuple(MATERIALS)]
+    DampingName = Literal[tuple(DAMPINGS)]
     ElementName = Literal[tuple(ELEMENTS)]
     SchemeName = Literal[tuple(SCHEMES)]
-    MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
+
+
+class CodeSection(Section):
+    """A material of the user's own: a Python function of F and named constants."""
+
+    file: Text = Field(description="Python file; it is run, which needs --allow-code.")
+    function: Text = Field(description="Name of the energy function in it.")
+
+
+def _material_form(value: Any) -> str:
+    return "<code>" if isinstance(value, dict) else "<name>"
+
+
+Material = Annotated[
+    Annotated[CodeSection, Tag("<code>")] | Annotated[MaterialName, Tag("<name>")],
+    Discriminator(_material_form),
+]
+
+
+class RegionSection(Section):
+    """Cells that differ from the rest; its parameters have its name in front."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(
+        description="Letters, digits, - and _."
+    )
+    cells: Nodes = Field(
+        description="Selection of cells, by their centres: a table of box_m, ball_m or indices, or "
+        "the name of a cell array or of a physical group."
+    )
+    material: Material | None = None
+    damping: DampingName | None = None
+    density_kg_m3: Positive | None = None
 
 
 class ObjectSection(Section):
@@ -41,8 +65,14 @@ class ObjectSection(Section):
     length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
     mass_kg: Positive | None = Field(None, description="Weighed mass of the whole object.")
     density_kg_m3: Positive | None = Field(None, description="Uniform density instead of a mass.")
-    material: MaterialName = "neo-hookean"
+    material: Material = Field(
+        "neo-hookean", description="A material's name, or a table of file and function."
+    )
+    damping: DampingName = "rayleigh"
     element: ElementName = "tet4"
+    region: list[RegionSection] = Field(
+        default_factory=list, description="[[object.region]] tables: cells that differ."
+    )
     evaluator: Literal["auto", "simd", "casadi"] = Field(
         "auto", description="How element kernels are evaluated."
     )
@@ -149,85 +179,6 @@ class TranscriptionSection(Section):
     )
 
 
-def _ipopt_value(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise ValueError(
-            f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
-            'switches are "yes" and "no"'
-        )
-    return value
-
-
-class SolverSection(Section):
-    """The method and its options."""
-
-    method: MethodName = "reduced-space"
-    hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
-    warm_up: float = Field(
-        default=0.1,
-        ge=0,
-        description="Gauss–Newton while a step changes a parameter by more than this.",
-    )
-    proximal: float = Field(
-        default=1e-5, ge=0, description="Added to the Hessian at the positions."
-    )
-    linear_solver: Text = Field(default="mumps", description="IPOPT's linear solver.")
-    huber: Positive | None = Field(
-        default=None,
-        description="Samples farther off than this many sigmas count linearly, not squared.",
-    )
-    factorisation: Literal["auto", "band", "sparse"] = Field(
-        default="auto", description="How reduced-space factorises a timestep's equations."
-    )
-    inner: Literal["cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"] = Field(
-        default="cg-descent",
-        description="What minimises the merit function of penalty and augmented-lagrangian; "
-        "the latter's default is levenberg-marquardt.",
-    )
-    schedule: Literal["geometric", "progress", "constant"] = Field(
-        default="geometric",
-        description="How rho rises: after every stage, where slack is left, or never.",
-    )
-    rho: Positive = Field(
-        default=1e2,
-        description="First weight of the dynamics; augmented-lagrangian's default is 1e5.",
-    )
-    rho_max: Positive = Field(
-        default=1e8, description="Its last; augmented-lagrangian's default is 1e9."
-    )
-    rho_factor: Annotated[float, Field(gt=1)] = Field(
-        default=10.0, description="Factor above 1 between the weights of two stages."
-    )
-    inner_iterations: Annotated[Whole, Field(gt=0)] = Field(
-        default=1000, description="Most iterations of a stage."
-    )
-    violation: Positive = Field(
-        default=1e-3,
-        description="Slack left in the dynamics, over the largest force; "
-        "augmented-lagrangian's default is 1e-7.",
-    )
-    gradient: Literal["forward", "adjoint"] = Field(
-        default="forward", description="How shooting finds the slope of its loss."
-    )
-    shares: list[Positive] = Field(
-        default=[0.25, 0.5, 1.0],
-        description="List of the shares of the samples that continuation solves one after another; "
-        "the last is 1.",
-    )
-    stage: SolverSection | None = Field(
-        default=None, description="A method and its options, for each share of continuation."
-    )
-    casadi: dict[str, Any] = Field(
-        default_factory=dict, description="Further options of a casadi: solver by name."
-    )
-    tolerance: Positive = 1e-8
-    max_iterations: Whole = Field(default=200, ge=0)
-    max_time_s: Positive = 1e6
-    ipopt: dict[str, Annotated[str | int | float, BeforeValidator(_ipopt_value)]] = Field(
-        default_factory=dict, description="Further IPOPT options by name."
-    )
-
-
 class UncertaintySection(Section):
     """How the error bars are found."""
 
@@ -264,7 +215,7 @@ class ProblemFile(Section):
         min_length=1, description="At least one [[experiment]] table, one for each recording."
     )
     transcription: TranscriptionSection = TranscriptionSection()
-    solver: SolverSection = SolverSection()
+    solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()
     uncertainty: UncertaintySection = UncertaintySection()
 

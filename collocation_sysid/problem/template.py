@@ -1,5 +1,13 @@
 """The commented problem file that `collocation-sysid new` writes."""
 
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from ..errors import InputError
+from ..folders import require_possible
+
 TEMPLATE = """\
 title = {title}
 
@@ -64,6 +72,9 @@ substeps = 1                   # grid steps between samples
 method = "reduced-space"       # or "interior-point", which needs no simulable guess
 # huber = 3.0                  # samples farther off than this many sigmas count linearly
 
+# [solver.reduced-space]       # options of a method: see `collocation-sysid methods reduced-space`
+# tolerance = 1e-6
+
 # [uncertainty]
 # noise = "estimated"          # sigma_m tells only the markers' relative precision
 # profile = ["poisson"]        # profile likelihood of these parameters
@@ -71,3 +82,21 @@ method = "reduced-space"       # or "interior-point", which needs no simulable g
 # [rollout]                    # the forward simulation that checks the answer
 # timestep_s = 0.002
 """
+
+
+def write_template(folder: Path) -> Path:
+    """Write problem.toml into a folder, which is made; its name is the title.
+
+    Raises
+    ------
+    InputError
+        Where there is one already, or the folder cannot be made.
+    """
+    file = folder / "problem.toml"
+    require_possible(folder)
+    if file.exists():
+        raise InputError("it is there already; choose another name", file)
+    folder.mkdir(parents=True, exist_ok=True)
+    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
+    file.write_text(TEMPLATE.format(title=title), encoding="utf-8")
+    return file

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import InputError
-from ..methods import METHODS
+from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameter
@@ -65,7 +65,7 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
         before.substeps,
         huber=before.huber,
     )
-    found = METHODS["reduced-space"].solve(collocation)
+    found = ReducedSpace()(collocation)
     if not found.status.converged:
         return float("inf")
     prior = 0.0

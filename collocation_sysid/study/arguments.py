@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, hint_at
 from ..methods import METHODS
+from ..methods.described import require_method
 
 RANGE = "such as 50:5000:log:9 or 0:1:5"
 
@@ -28,8 +28,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     if not names:
         raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
     for name in names:
-        if name not in METHODS:
-            raise InputError(f"found {name!r}; {_meant(name, METHODS)}", None, option)
+        require_method(name, option)
     return names
 
 
@@ -59,7 +58,8 @@ def read_truth(
         source, table = _truth_table(item)
         for name, value in table.items():
             if name not in known:
-                raise InputError(f"found {name!r}; {_meant(name, known)}", source, "--truth")
+                expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+                raise InputError(f"found {name!r}; {expected}", source, "--truth")
             truth[name] = _positive(name, value, source)
     if missing := [name for name in needed if given and name not in truth]:
         raise InputError(
@@ -186,11 +186,3 @@ def _items(text: str) -> list[str]:
         else:
             items[-1] += letter
     return [item.strip() for item in items if item.strip()]
-
-
-def _meant(name: str, known: Iterable[str]) -> str:
-    names = list(known)
-    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
-    close = longer or difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]!r}? Expected" if close else "expected"
-    return f"{hint} one of {', '.join(names)}"

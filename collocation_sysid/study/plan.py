@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ class PlannedRun:
     overrides : tuple of "key=value"
     guess : mapping of the estimated parameters to their guesses
     swept : mapping of swept keys to their values as text
+    allow_code : bool, run the Python files that the problem names
     """
 
     key: str
@@ -46,6 +47,7 @@ class PlannedRun:
     overrides: tuple[str, ...] = ()
     guess: Mapping[str, float] = field(default_factory=dict)
     swept: Mapping[str, str] = field(default_factory=dict)
+    allow_code: bool = False
 
     @property
     def label(self) -> str:
@@ -77,6 +79,7 @@ def plan_comparison(
     spread: float = 10.0,
     seed: int = 0,
     truth: Mapping[str, float] | None = None,
+    allow_code: bool = False,
 ) -> list[PlannedRun]:
     """Every method from every start; all methods get the same starts.
 
@@ -93,6 +96,7 @@ def plan_comparison(
     spread : float
     seed : int
     truth : mapping of name to value, optional
+    allow_code : bool
 
     Raises
     ------
@@ -105,7 +109,7 @@ def plan_comparison(
         moved = list(overrides) + _start_overrides(problem, truth or {}, start, spread, seed)
         file, _ = read_problem_file(problem.path, moved)
         planned += [_planned(problem.path, file, method, moved, start) for method in methods]
-    return planned
+    return [replace(run, allow_code=allow_code) for run in planned]
 
 
 def plan_sweep(
@@ -113,6 +117,7 @@ def plan_sweep(
     over: Mapping[str, Sequence[str]],
     overrides: Sequence[str] = (),
     method: str | None = None,
+    allow_code: bool = False,
 ) -> list[PlannedRun]:
     """Every combination of the swept values; the last key changes fastest.
 
@@ -132,7 +137,7 @@ def plan_sweep(
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, error.where) from error
         planned.append(_planned(path, file, method or file.solver.method, moved, swept=swept))
-    return planned
+    return [replace(run, allow_code=allow_code) for run in planned]
 
 
 def _refuse_options(starts: int, spread: float, seed: int) -> None:
@@ -173,7 +178,9 @@ def _planned(
         if isinstance(section, ParameterSection) and section.guess is not None
     }
     content = file.model_dump(mode="json", exclude_unset=True)
-    content.setdefault("solver", {})["method"] = method
+    solver = content.get("solver", {})
+    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
+    content["solver"]["method"] = method
     decisive = [content, start, _hashes_of_files(content, path.parent), _version()]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]

@@ -35,7 +35,9 @@ def main() -> None:
 def attempt(planned: dict[str, Any]) -> dict[str, Any]:
     """Do a planned run; what goes wrong becomes part of its record."""
     try:
-        problem = load_problem(planned["problem"], planned["overrides"])
+        problem = load_problem(
+            planned["problem"], planned["overrides"], allow_code=planned["allow_code"]
+        )
         finished = run(problem, planned["method"])
         return {
             "outcome": FINISHED,

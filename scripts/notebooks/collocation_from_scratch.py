@@ -52,7 +52,7 @@ import collocation_sysid as cs
 from collocation_sysid.check import check_problem
 from collocation_sysid.experiment.nuisance import Nuisance
 from collocation_sysid.fem.moduli import engineering as engineering_moduli
-from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.output.style import (
     BLACK,
@@ -898,7 +898,7 @@ display(figure)
 def fit(experiment, parameters=problem.parameters, scheme="midpoint", substeps=2):
     """The solution by reduced space, and the linear problem near it."""
     program = cs.Collocation([experiment], parameters, scheme, substeps)
-    found = METHODS["reduced-space"].solve(program)
+    found = ReducedSpace()(program)
     assert found.status.converged, found.message
     return found, linearised_fit(program, found.z)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
+from ...errors import InputError
 from ..expressions import PointKernel
 
 
@@ -45,3 +46,7 @@ class Evaluator(Protocol):
     ) -> None:
         """Overwrite `out` (T, width), or add to it, from `fields`, each (T, 3n), and θ (k,)."""
         ...
+
+
+class VectorCodeError(InputError):
+    """A kernel that cannot be compiled to vector code."""

@@ -1,17 +1,179 @@
-"""CasADi's SX operations as LLVM instructions on vectors."""
+"""CasADi's SX operations as LLVM instructions on vectors.
+
+Comparisons and logic are numbers, 1 or 0, and any number but 0 is true. What LLVM has no vector
+instruction for calls the C library lane by lane, as CasADi's own virtual machine does.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
 
 import casadi as ca
 from llvmlite import ir
 
-from ...errors import InputError
-from .loops import Builder, Value
+from .batch import VectorCodeError
+from .erfinv import ERFINV
+from .loops import DOUBLE, I32, Builder, Value
 
 FUSE = ("contract",)  # a product and a sum may become one instruction
+Emit = Callable[..., Value]  # of the builder and one or two operands
+
+
+def function_values(
+    builder: Builder,
+    function: ca.Function,
+    vector: ir.VectorType,
+    read: Callable[[int, int], Value],
+) -> Iterator[tuple[int, int, Value]]:
+    """Emit an SX function, one operation after the other.
+
+    Parameters
+    ----------
+    builder : llvmlite IRBuilder
+    function : casadi.Function
+    vector : type of all values
+    read : callable
+        The value of (input, entry).
+
+    Yields
+    ------
+    output, entry : int
+    value : vector value
+
+    Raises
+    ------
+    VectorCodeError
+        For an operation that has no counterpart here.
+    """
+    check_operations(function)
+    work: dict[int, Value] = {}
+    for k in range(function.n_instructions()):
+        operation, source = function.instruction_id(k), function.instruction_input(k)
+        target = function.instruction_output(k)
+        if operation == ca.OP_INPUT:
+            work[target[0]] = read(*source)
+        elif operation == ca.OP_CONST:
+            work[target[0]] = _constant(vector, function.instruction_constant(k))
+        elif operation == ca.OP_OUTPUT:
+            yield target[0], target[1], work[source[0]]
+        else:
+            work[target[0]] = OPERATIONS[operation](builder, *(work[i] for i in source))
+
+
+def check_operations(function: ca.Function) -> None:
+    """Refuse a function that holds an operation without counterpart here.
+
+    Raises
+    ------
+    VectorCodeError
+        It names the operations.
+    """
+    known = {ca.OP_INPUT, ca.OP_CONST, ca.OP_OUTPUT, *OPERATIONS}
+    held = {function.instruction_id(k) for k in range(function.n_instructions())}
+    if missing := sorted(held - known):
+        raise VectorCodeError(
+            f"vector code has no CasADi operation {', '.join(map(operation_name, missing))}"
+        )
+
+
+def operation_name(operation: int) -> str:
+    """CasADi's own name, such as "OP_ADD"."""
+    names = (name for name, number in vars(ca).items() if number == operation)
+    return next((name for name in names if name.startswith("OP_")), str(operation))
+
+
+# Ways to emit one operation --------------------------------------------------------------------
+
+
+def _constant(vector: ir.VectorType, value: float) -> Value:
+    return ir.Constant(vector, [float(value)] * vector.count)
+
+
+def _intrinsic(name: str) -> Emit:
+    def emit(b: Builder, *operands: Value) -> Value:
+        vector = operands[0].type
+        full_name = f"llvm.{name}.v{vector.count}f64"
+        return b.call(_declared(b.module, full_name, vector, len(operands)), operands)
+
+    return emit
+
+
+def _library(name: str) -> Emit:
+    """Lane by lane: the C library knows no vectors."""
+
+    def emit(b: Builder, *operands: Value) -> Value:
+        function = _declared(b.module, name, DOUBLE, len(operands))
+        # Otherwise a call may set errno, and the compiler keeps even those that are repeated.
+        function.attributes.add("readnone")
+        result: Value = ir.Constant(operands[0].type, ir.Undefined)
+        for lane in map(I32, range(operands[0].type.count)):
+            scalars = [b.extract_element(operand, lane) for operand in operands]
+            result = b.insert_element(result, b.call(function, scalars), lane)
+        return result
+
+    return emit
+
+
+def _declared(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.Function:
+    known = module.globals.get(name)
+    return known or ir.Function(module, ir.FunctionType(kind, [kind] * operands), name)
+
+
+def _compared(sign: str) -> Emit:
+    def emit(b: Builder, x: Value, y: Value) -> Value:
+        return _number(b, _comparison(b, sign, x, y), x.type)
+
+    return emit
+
+
+def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
+    # As in C: NaN differs from everything, itself included.
+    return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
+
+
+def _number(b: Builder, truth: Value, vector: ir.VectorType) -> Value:
+    return b.uitofp(truth, vector)
+
+
+def _is_true(b: Builder, x: Value) -> Value:
+    return _comparison(b, "!=", x, _constant(x.type, 0.0))
+
+
+def _not(b: Builder, x: Value) -> Value:
+    return _number(b, b.not_(_is_true(b, x)), x.type)
+
+
+def _and(b: Builder, x: Value, y: Value) -> Value:
+    return _number(b, b.and_(_is_true(b, x), _is_true(b, y)), x.type)
+
+
+def _or(b: Builder, x: Value, y: Value) -> Value:
+    return _number(b, b.or_(_is_true(b, x), _is_true(b, y)), x.type)
+
+
+def _if_else_zero(b: Builder, condition: Value, x: Value) -> Value:
+    # Not a product: the branch that is not taken may be infinite or NaN.
+    return b.select(_is_true(b, condition), x, _constant(x.type, 0.0))
+
+
+def _sign(b: Builder, x: Value) -> Value:
+    zero, one, minus_one = (_constant(x.type, value) for value in (0.0, 1.0, -1.0))
+    # Zeros of either sign and NaN are their own sign.
+    positive = b.select(_comparison(b, ">", x, zero), one, x)
+    return b.select(_comparison(b, "<", x, zero), minus_one, positive)
+
+
+def _erfinv(b: Builder, x: Value) -> Value:
+    ((_, _, value),) = function_values(b, ERFINV, x.type, lambda *_: x)
+    return value
+
+
 INTRINSICS = {
     ca.OP_SQRT: "sqrt",
     ca.OP_FABS: "fabs",
+    ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceil",
+    ca.OP_COPYSIGN: "copysign",
     ca.OP_LOG: "log",
     ca.OP_EXP: "exp",
     ca.OP_POW: "pow",
@@ -21,46 +183,43 @@ INTRINSICS = {
     ca.OP_FMIN: "minnum",
     ca.OP_FMAX: "maxnum",
 }
-
-
-def operation_value(builder: Builder, operation: int, operands: list) -> Value:
-    """Emit one SX operation.
-
-    Parameters
-    ----------
-    builder : llvmlite IRBuilder
-    operation : int
-        As of `casadi.Function.instruction_id`.
-    operands : list of vector values, one or two
-
-    Raises
-    ------
-    InputError
-        For an operation that has no counterpart here.
-    """
-    b, x = builder, operands[0]
-    vector = x.type
-    binary = {ca.OP_ADD: b.fadd, ca.OP_SUB: b.fsub, ca.OP_MUL: b.fmul, ca.OP_DIV: b.fdiv}
-    if operation in binary:
-        return binary[operation](x, operands[1], flags=FUSE)
-    if operation == ca.OP_SQ:
-        return b.fmul(x, x, flags=FUSE)
-    if operation == ca.OP_TWICE:
-        return b.fadd(x, x, flags=FUSE)
-    if operation == ca.OP_NEG:
-        return b.fneg(x)
-    if operation == ca.OP_ASSIGN:
-        return x
-    if operation == ca.OP_INV:
-        return b.fdiv(ir.Constant(vector, [1.0] * vector.count), x, flags=FUSE)
-    if operation in INTRINSICS:
-        kind = ir.FunctionType(vector, [vector] * len(operands))
-        name = f"llvm.{INTRINSICS[operation]}.v{vector.count}f64"
-        intrinsic = b.module.globals.get(name) or ir.Function(b.module, kind, name)
-        return b.call(intrinsic, operands)
-    names = (name for name, number in vars(ca).items() if number == operation)
-    name = next((name for name in names if name.startswith("OP_")), operation)
-    raise InputError(
-        f"the vector evaluator has no CasADi operation {name}; "
-        "choose evaluator='casadi' for this material"
-    )
+LIBRARY = {
+    ca.OP_TAN: "tan",
+    ca.OP_ASIN: "asin",
+    ca.OP_ACOS: "acos",
+    ca.OP_ATAN: "atan",
+    ca.OP_ATAN2: "atan2",
+    ca.OP_SINH: "sinh",
+    ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh",
+    ca.OP_ASINH: "asinh",
+    ca.OP_ACOSH: "acosh",
+    ca.OP_ATANH: "atanh",
+    ca.OP_LOG1P: "log1p",
+    ca.OP_EXPM1: "expm1",
+    ca.OP_ERF: "erf",
+    ca.OP_HYPOT: "hypot",
+    ca.OP_FMOD: "fmod",
+    ca.OP_REMAINDER: "remainder",
+}
+COMPARISONS = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
+OPERATIONS: dict[int, Emit] = {
+    ca.OP_ASSIGN: lambda b, x: x,
+    ca.OP_ADD: lambda b, x, y: b.fadd(x, y, flags=FUSE),
+    ca.OP_SUB: lambda b, x, y: b.fsub(x, y, flags=FUSE),
+    ca.OP_MUL: lambda b, x, y: b.fmul(x, y, flags=FUSE),
+    ca.OP_DIV: lambda b, x, y: b.fdiv(x, y, flags=FUSE),
+    ca.OP_NEG: lambda b, x: b.fneg(x),
+    ca.OP_SQ: lambda b, x: b.fmul(x, x, flags=FUSE),
+    ca.OP_TWICE: lambda b, x: b.fadd(x, x, flags=FUSE),
+    ca.OP_INV: lambda b, x: b.fdiv(_constant(x.type, 1.0), x, flags=FUSE),
+    ca.OP_NOT: _not,
+    ca.OP_AND: _and,
+    ca.OP_OR: _or,
+    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+    ca.OP_SIGN: _sign,
+    ca.OP_ERFINV: _erfinv,
+    **{operation: _compared(sign) for operation, sign in COMPARISONS.items()},
+    **{operation: _intrinsic(name) for operation, name in INTRINSICS.items()},
+    **{operation: _library(name) for operation, name in LIBRARY.items()},
+}

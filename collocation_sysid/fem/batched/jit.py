@@ -21,8 +21,11 @@ from llvmlite import binding as llvm
 from llvmlite import ir
 from platformdirs import user_cache_path
 
-# Scalar functions that vector intrinsics fall back to; resolved from the C library by name.
-LIBM = ("log", "exp", "pow", "sin", "cos", "tan", "atan", "tanh", "sinh", "cosh")
+# Scalar functions that compiled code calls, or that vector intrinsics fall back to; resolved from
+# the C library by name.
+LIBM = ("exp", "exp2", "expm1", "log", "log1p", "pow", "ldexp", "hypot", "fmod", "remainder", "erf")
+LIBM += ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
+LIBM += ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
 CHECKSUM_BYTES = hashlib.sha256().digest_size
 
 
@@ -112,8 +115,8 @@ def _cached_object(build: Callable[[], ir.Module], key: str, machine: llvm.Targe
 def _generation() -> str:
     """Identify the code that emits and compiles: once it changes, old kernels must not be used."""
     digest = hashlib.sha256()
-    for file in ("jit.py", "simd.py", "instructions.py", "loops.py", "combine.py"):
-        digest.update(Path(__file__).with_name(file).read_bytes())
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(file.read_bytes())
     return digest.hexdigest()
 
 

@@ -13,14 +13,13 @@ import ctypes
 import hashlib
 from collections.abc import Iterator, Sequence
 
-import casadi as ca
 import numpy as np
 from llvmlite import ir
 from numpy.typing import NDArray
 
 from ..expressions import Contraction, PointKernel
 from .batch import Array, Batch
-from .instructions import FUSE, operation_value
+from .instructions import FUSE, function_values
 from .jit import CompiledFunction, vector_lanes
 from .loops import DOUBLE, DOUBLES, I32, I32S, I64, Builder, Value, counting
 from .threads import in_slices
@@ -34,7 +33,7 @@ class SimdEvaluator:
         kernel = batch.kernel
         count = len(batch.cells)
         blocks = -(-count // lanes)
-        # Padding lanes repeat the last element with volume zero: they add exactly nothing.
+        # Padding lanes repeat the last element with volume zero, by which they are known.
         lane_element = np.minimum(np.arange(blocks * lanes), count - 1)
         geometry = batch.geometry[lane_element].copy()
         geometry[count:, :, -1] = 0.0
@@ -141,9 +140,15 @@ class _Emitter:
                     here = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
                     self._pieces(gathered, here, parameters, pieces)
                     self._contract(pieces, here, half, outputs)
+                here = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
+                volume = self._load(here, I64(geometry_size - 1))
+                zero = self.vector(None)
+                # Not left to the product with the volume, which makes NaN of what is infinite.
+                is_element = b.fcmp_ordered("!=", volume, zero)
                 targets = b.gep(destinations, [b.mul(block, I64(total * self.lanes))])
                 with counting(b, I64(0), I64(total), "output") as k:
-                    self._scatter(self._load(outputs, k), targets, k, out_row)
+                    value = b.select(is_element, self._load(outputs, k), zero)
+                    self._scatter(value, targets, k, out_row)
         b.ret_void()
         return self.module
 
@@ -203,29 +208,15 @@ class _Emitter:
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
     def _pieces(self, gathered: list, geometry: Value, parameters: list, pieces: Value) -> None:
-        """Walk the SX instructions of one quadrature point."""
-        work: dict[int, Value] = {}
-        sx = self.sx
-        for k in range(sx.n_instructions()):
-            operation, source = sx.instruction_id(k), sx.instruction_input(k)
-            target = sx.instruction_output(k)
-            if operation == ca.OP_INPUT:
-                slot, entry = source
-                if slot < self.fields:
-                    work[target[0]] = self._load(gathered[slot], I64(entry))
-                elif slot == self.fields:
-                    work[target[0]] = self._load(geometry, I64(entry))
-                else:
-                    work[target[0]] = parameters[entry]
-            elif operation == ca.OP_CONST:
-                constant = float(sx.instruction_constant(k))
-                work[target[0]] = ir.Constant(self.vector, [constant] * self.lanes)
-            elif operation == ca.OP_OUTPUT:
-                entry = I64(self.piece_offsets[target[0]] + target[1])
-                self._store(work[source[0]], pieces, entry)
-            else:
-                operands = [work[i] for i in source]
-                work[target[0]] = operation_value(self.builder, operation, operands)
+        """Find the pieces of one quadrature point."""
+
+        def read(slot: int, entry: int) -> Value:
+            if slot > self.fields:
+                return parameters[entry]
+            return self._load(geometry if slot == self.fields else gathered[slot], I64(entry))
+
+        for piece, entry, value in function_values(self.builder, self.sx, self.vector, read):
+            self._store(value, pieces, I64(self.piece_offsets[piece] + entry))
 
     def _contract(self, pieces: Value, geometry: Value, half: Value, outputs: Value) -> None:
         """Add the pieces of one quadrature point to the outputs, as `expressions._contracted`."""

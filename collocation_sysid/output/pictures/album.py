@@ -63,6 +63,8 @@ def _of_body(replay: Replay) -> dict[str, Figure]:
             replay.marker_places_m,
             replay.marker_names,
             replay.up,
+            replay.surface_parts,
+            replay.part_names,
         ),
         "elements": elements_picture(replay.undeformed_m, replay.tetrahedra),
     }

@@ -21,6 +21,7 @@ from .scene import (
     draw_scale,
     key,
     sheet,
+    skin_key,
     width_over_height,
 )
 
@@ -37,6 +38,8 @@ def mesh_picture(
     places_m: Array,
     names: Sequence[str],
     up: ArrayLike = (0.0, 0.0, 1.0),
+    parts: NDArray[np.integer] | None = None,
+    part_names: Sequence[str] = (),
 ) -> Figure:
     """Draw the undeformed body from the front and from behind, with its markers' names.
 
@@ -48,6 +51,8 @@ def mesh_picture(
     places_m : (M, 3) of the markers
     names : (M,) str
     up : (3,)
+    parts : (F,) the part of the body that each triangle belongs to
+    part_names : (P,) str
     """
     front = Camera.facing(nodes_m[None], up)
     behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
@@ -69,7 +74,7 @@ def mesh_picture(
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
         everything = np.vstack([nodes_m, places_m])
         view = View.fitting(camera, everything, (width, height), corner)
-        Drawn(axes, view, surface).show(nodes_m, held, places_m)
+        Drawn(axes, view, surface, parts).show(nodes_m, held, places_m)
         if named:
             dots = view.places(places_m[mine])
             own = [name for name, here in zip(names, mine, strict=True) if here]
@@ -80,7 +85,10 @@ def mesh_picture(
     draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
     entries = ["grasped"] if held.any() else []
     entries += ["markers", "behind the body"] if len(names) else []
-    draw_key(axes, key(*entries), (1.0, total - 1.5))
+    handles = key(*entries)
+    if len(part_names) > 1:
+        handles += [skin_key(k, name or "rest") for k, name in enumerate(part_names)]
+    draw_key(axes, handles, (1.0, total - 1.5))
     return figure
 
 

@@ -18,7 +18,9 @@ from ...arrays import Array
 from ..style import BLACK, SMALL_PT, VERMILION
 from .camera import Camera, Triangles
 
-SKIN, EDGE = "#B4D0EA", "#5A6B7B"
+EDGE = "#5A6B7B"
+# Of the parts of a body in turn.
+SKINS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
 # Of more triangles than this one would see nothing but edges.
 EDGED = 6000
 _DOT = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
@@ -87,10 +89,19 @@ class Drawn:
     axes : Axes of a `sheet`
     view : View
     surface : (F, 3)
+    parts : (F,) the part of the body that each triangle belongs to; one part by default
     """
 
-    def __init__(self, axes: Axes, view: View, surface: Triangles) -> None:
+    def __init__(
+        self,
+        axes: Axes,
+        view: View,
+        surface: Triangles,
+        parts: NDArray[np.integer] | None = None,
+    ) -> None:
         self.view, self.surface = view, surface
+        numbers = np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(SKINS)
+        self.skins = np.array([to_rgb(skin) for skin in SKINS])[numbers]
         self.edged = len(surface) <= EDGED
         self.skin = PolyCollection([], linewidths=0.3 if self.edged else 0.1, edgecolors=EDGE)
         self.skin.set_joinstyle("round")
@@ -106,7 +117,7 @@ class Drawn:
         """
         camera = self.view.camera
         polygons, brightness, faces = camera.faces(positions_m, self.surface)
-        colours: Any = brightness[:, None] * np.array(to_rgb(SKIN))
+        colours: Any = brightness[:, None] * self.skins[faces]
         self.skin.set_verts(list(self.view.origin_mm + self.view.mm_per_m * polygons))
         self.skin.set_facecolor(colours)
         if not self.edged:
@@ -150,7 +161,7 @@ def draw_directions(
 
 
 def key(*entries: str) -> list[Line2D]:
-    """Legend handles of "grasped", "markers", "measured" and "behind the body"."""
+    """Legend handles of "grasped", "markers", "measured" and "behind the body", or of parts."""
     styles = {
         "grasped": {**_SQUARE, "ms": 3.0},
         "behind the body": {**_DOT, "mfc": "none"},
@@ -159,6 +170,12 @@ def key(*entries: str) -> list[Line2D]:
         Line2D([], [], label=name, **styles.get(name, {**_DOT, "mfc": VERMILION}))
         for name in entries
     ]
+
+
+def skin_key(part: int, name: str) -> Line2D:
+    """Legend handle of a part of the body."""
+    look: Any = {**_SQUARE, "ms": 4.0, "mec": EDGE, "mew": 0.3, "mfc": SKINS[part % len(SKINS)]}
+    return Line2D([], [], label=name, **look)
 
 
 def draw_key(axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike) -> None:

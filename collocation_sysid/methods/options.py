@@ -1,0 +1,86 @@
+"""A method is a dataclass of its options, checked against the types of its fields."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any, ClassVar, TypeVar, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from ..checked import expected
+from ..errors import InputError, hint_at
+
+T = TypeVar("T", bound="Options")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Base of the methods: a value that is not of its field's type is an `InputError`."""
+
+    name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        for name, adapter in _adapters(type(self)).items():
+            found = getattr(self, name)
+            try:
+                object.__setattr__(self, name, adapter.validate_python(found))
+            except ValidationError as error:
+                raise _refusal(name, found, error.errors(include_url=False)[0]) from error
+
+
+def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
+    """A method from its options by name.
+
+    Parameters
+    ----------
+    kind : type
+    given : mapping
+    where : str
+        The key under which the options were given, for messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown option, with the nearest that there is, or a value that it cannot have.
+    """
+    known = [field.name for field in fields(kind)]
+    for name in given:
+        if name not in known:
+            has = f"it has {', '.join(known)}{hint_at(name, known)}"
+            raise InputError(f"{kind.name!r} has no option {name!r}; {has}", None, where)
+    try:
+        return kind(**given)
+    except InputError as error:
+        raise InputError(error.message, None, f"{where}.{error.where}") from error
+
+
+def documented(kind: type) -> dict[str, str]:
+    """Descriptions of the options by name, from "Attributes" in the docstrings of a method."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        _, _, section = inspect.cleandoc(base.__doc__ or "").partition("Attributes\n----------\n")
+        for names, text in re.findall(r"^(\w[\w, ]*) : .*\n((?: +.*(?:\n|$))+)", section, re.M):
+            found |= dict.fromkeys(names.split(", "), " ".join(text.split()))
+    return {field.name: found[field.name] for field in fields(kind)}
+
+
+@cache
+def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
+    types = get_type_hints(kind, include_extras=True)
+    return {field.name: TypeAdapter(types[field.name]) for field in fields(kind)}
+
+
+def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
+    """The error for a value, or for an entry of the table that it is."""
+    for part in fault["loc"]:
+        if isinstance(found, Mapping) and part in found:
+            name, found = f"{name}.{part}", found[part]
+    if fault["type"] == "value_error":
+        return InputError(str(fault["ctx"]["error"]), None, name)
+    choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
+    hint = hint_at(str(found), choices)
+    return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)

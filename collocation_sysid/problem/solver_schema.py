@@ -1,0 +1,117 @@
+"""[solver] of the problem file: the method, the loss, and a table of options for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+    create_model,
+    model_validator,
+)
+
+from ..checked import Positive
+from ..errors import InputError
+from ..methods import METHODS
+from ..methods.casadi_nlp import why_not
+from ..methods.described import options_schema
+from ..methods.options import built
+from .section import Section
+
+OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
+DEFAULT = "reduced-space"
+
+
+def _offered(name: Any) -> Any:
+    reason = why_not(name) if isinstance(name, str) else None
+    if reason is not None:
+        raise ValueError(reason)
+    return name
+
+
+if TYPE_CHECKING:
+    MethodName = str
+else:
+    MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
+
+
+class MethodSection(Section):
+    """The method, the loss, and a table of options for each method."""
+
+    method: MethodName = DEFAULT
+    huber: Positive | None = Field(
+        default=None,
+        description="Samples farther off than this many sigmas count linearly, not squared.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _options_are_in_tables(cls, given: Any) -> Any:
+        outside = [name for name in given if _owners(name)] if isinstance(given, Mapping) else []
+        if outside:
+            remedy = f"move {_moves(outside, given.get('method', DEFAULT))}"
+            raise ValueError(f"the options of a method have a table of their own: {remedy}")
+        return given
+
+    def method_named(self, name: str, **changed: Any) -> Any:
+        """A method with the options of its table, but for some."""
+        in_file = getattr(self, name)
+        if not changed:
+            return in_file
+        return _read(name, {option: getattr(in_file, option) for option in OPTIONS[name]} | changed)
+
+
+def _read(method: str, given: Any) -> Any:
+    """The method with the options that its table gives."""
+    where = f"solver.{method}"
+    if not isinstance(given, Mapping):
+        raise InputError(f"found {given!r}; expected a table of options", None, where)
+    for name in given:
+        owners = _owners(name)
+        if owners and method not in owners:
+            owned = f"{name} is an option of {', '.join(owners)}"
+            has = f"{method} has {', '.join(OPTIONS[method])}"
+            raise InputError(f"{owned}; {has}", None, where)
+    return built(METHODS[method], given, where)
+
+
+def _owners(option: str) -> list[str]:
+    """Methods that have an option."""
+    return [method for method in METHODS if option in OPTIONS[method]]
+
+
+def _moves(options: Sequence[str], chosen: Any) -> str:
+    """Which options belong in which tables: in the chosen method's where it has them."""
+    places: dict[str, list[str]] = {}
+    for option in options:
+        owners = _owners(option)
+        places.setdefault(chosen if chosen in owners else owners[0], []).append(option)
+    return " and ".join(f"{', '.join(names)} to {heading(to)}" for to, names in places.items())
+
+
+def heading(method: str) -> str:
+    """How a method's table begins in the file."""
+    return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
+
+
+def _table(method: str) -> tuple[Any, Any]:
+    """Type and default of a method's key."""
+    checks = PlainValidator(partial(_read, method)), WithJsonSchema(options_schema(method))
+    return Annotated[Any, *checks], Field(default_factory=partial(_read, method, {}))
+
+
+if TYPE_CHECKING:
+    SolverSection = MethodSection
+else:
+    SolverSection = create_model(
+        "SolverSection",
+        __base__=MethodSection,
+        __doc__=MethodSection.__doc__,
+        **{method: _table(method) for method in METHODS},
+    )
