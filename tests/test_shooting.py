@@ -14,6 +14,7 @@ from problems_small import (
     GUESS,
     SMALL_EXPERIMENTS,
     TRUTH,
+    as_theta,
     bar_in_two_hands,
     bar_let_go,
     cube_with_unknowns,
@@ -32,7 +33,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters, as_theta
+from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.statistics.sensitivity import sensitivities
 
 GRADIENTS = ("forward", "adjoint")
@@ -149,7 +150,7 @@ def test_it_starts_from_given_parameters():
     start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((11, 81))])
     solution = Shooting()(cube(), watch=seen.append, start=start)
     assert solution.iterations < 4
-    np.testing.assert_allclose(seen[0].theta, list(TRUTH.values()))
+    np.testing.assert_allclose([*seen[0].parameters.values()], list(TRUTH.values()))
 
 
 # Simulations that fail
@@ -208,7 +209,7 @@ def test_limits_keep_the_best_simulation(gradient, limit: dict, status: Status):
     solution = Shooting(gradient, **limit)(cube())
     assert solution.status is status
     assert solution.iterations <= 3
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
     assert solution.max_violation_relative < 1e-9
 
 
@@ -220,7 +221,7 @@ def test_an_interruption_keeps_the_best_simulation(gradient):
 
     solution = Shooting(gradient)(cube(), interrupt)
     assert solution.status is Status.INTERRUPTED
-    assert solution.theta == solution.history[-1].theta
+    assert solution.parameters == solution.history[-1].parameters
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
