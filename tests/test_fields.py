@@ -25,7 +25,7 @@ def bar(element: str = "tet4", material: str = "neo-hookean", evaluator: str = "
 
 @cache
 def fields_of(body: Body) -> ElementFields:
-    return ElementFields.of(body, LAMBDA_PA, MU_PA)
+    return ElementFields.of(body, np.array([LAMBDA_PA, MU_PA, 0.0, 0.0]))
 
 
 def deformed(body: Body, gradient) -> dict[str, np.ndarray]:

@@ -60,7 +60,7 @@ def history(count=5):
             loss=10.0 ** (3 - k),
             rms_m=10.0 ** (-2 - k),
             violation_n=0.0 if k == 0 else 10.0**-k,
-            theta=np.array([200.0 * 2 ** (count - 1 - k), 300.0, 0.009, 1.0]),
+            parameters={**TRUTH, "lambda_pa": 200.0 * 2 ** (count - 1 - k)},
             time_s=float(k),
         )
         for k in range(count)

@@ -104,7 +104,7 @@ def test_long_trajectories_are_thinned_evenly(tmp_path):
 
 def test_frames_hold_what_the_material_feels(tmp_path):
     body = Body(MESH, density_kg_m3=30.0)
-    fields = ElementFields.of(body, 200.0, 300.0)
+    fields = ElementFields.of(body, np.array([200.0, 300.0, 0.0, 0.0]))
     stretch = np.linspace(1.0, 1.2, 3)[:, None, None]
     listing = write_frames(
         tmp_path, [0, 1, 2], stretch * MESH.points_m, body.cells, TET4, MESH.points_m, fields=fields
