@@ -129,7 +129,7 @@ def swung_bar(steps: int, start: str) -> Experiment:
     grasp = Grasp(nodes_where(body, 2, 0.0), smooth_poses(fine_s, angular_frequency_rad_s=30.0))
     markers = vertex_markers(body, nodes_where(body, 2, 0.12), t_s)
     gravity = np.array([0.0, 0.0, 9.81])
-    return Experiment("bar", body, t_s, (grasp,), markers, gravity, start=start)  # type: ignore[arg-type]
+    return Experiment(body, t_s, [grasp], markers, gravity, start=start)  # type: ignore[arg-type]
 
 
 def measured_order(start: str, solve: Callable[[Experiment], np.ndarray]) -> float:
