@@ -29,7 +29,7 @@ from problem_files import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.problem import read_problem_file
+from collocation_sysid.problem.reading import read_problem_file
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
