@@ -139,7 +139,7 @@ class ParameterSection(Section):
 
 
 def _parameter_form(value: Any) -> str:
-    return "<table>" if isinstance(value, dict) else "<value>"
+    return "<table>" if isinstance(value, (dict, ParameterSection)) else "<value>"
 
 
 def _flat(given: Any, front: str = "") -> Any:
