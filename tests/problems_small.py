@@ -22,6 +22,7 @@ from collocation_sysid.experiment import (
 )
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import simulate, with_markers
 
@@ -188,6 +189,21 @@ def measured_with(
     tracks = simulate(experiment, truth, scheme, substeps=substeps).markers_m
     present = experiment.markers.present[:, :, None]
     return with_markers(experiment, np.where(present, tracks, np.nan))
+
+
+def noisy(
+    experiment: Experiment, noise_m: float = 1e-3, scheme: str = "midpoint", seed: int = 7
+) -> Experiment:
+    """The experiment with the tracks that `TRUTH` gives it, and white noise."""
+    made = measured(experiment, scheme)
+    tracks = made.markers.positions_m
+    noise = noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
+    return with_markers(made, tracks + noise)
+
+
+def relative_errors(solution: Solution) -> np.ndarray:
+    """Errors of the four parameters over `TRUTH`."""
+    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
 
 
 def _experiment(name, body, t_s, grasps, markers, **changes) -> Experiment:

@@ -316,7 +316,8 @@ class Parameters:
         Raises
         ------
         InputError
-            For a name that none of them knows, a constant that is missing or given twice.
+            For a name that none of them knows, a constant that is missing or given twice, or a
+            stiffness of zero.
         """
         bodies = list(bodies)
         known = [name for body in bodies for name in body.parameter_names]
@@ -335,6 +336,9 @@ class Parameters:
                 raise InputError(
                     "no part of the model uses it: every region has a value of its own", None, name
                 )
+        for item in self.items:
+            if item.fixed and item.guess == 0 and bare(item.name) in ("mu_pa", "young_pa"):
+                raise InputError("fixed = 0, expected a stiffness above 0", None, item.name)
 
 
 class ThetaMap:
