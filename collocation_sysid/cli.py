@@ -100,6 +100,7 @@ def solve(
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
     """
+    from .methods.described import require_method
     from .methods.solution import Status
     from .output.record import as_json as json_text
     from .output.record import result
@@ -108,6 +109,8 @@ def solve(
     from .run import run
     from .terminal import Progress, summary
 
+    if method is not None:
+        require_method(method, "--method")
     folder = out or Path("runs") / run_name(problem)
     loaded = Problem.read(problem, set_ or (), allow_code)
     require_possible(folder)

@@ -175,7 +175,17 @@ SMALL_EXPERIMENTS = {
 
 def measured(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Experiment:
     """The experiment with the tracks that `TRUTH` gives it; missing samples stay missing."""
-    tracks = simulate(experiment, TRUTH, scheme, substeps=substeps).markers_m
+    return measured_with(experiment, TRUTH, scheme, substeps)
+
+
+def measured_with(
+    experiment: Experiment,
+    truth: Mapping[str, float],
+    scheme: str = "midpoint",
+    substeps: int = 1,
+) -> Experiment:
+    """The same with the tracks of any parameters."""
+    tracks = simulate(experiment, truth, scheme, substeps=substeps).markers_m
     present = experiment.markers.present[:, :, None]
     return with_markers(experiment, np.where(present, tracks, np.nan))
 

@@ -29,7 +29,7 @@ from problem_files import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem import Problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
@@ -120,7 +120,7 @@ PROBLEM_FILE = [
         edit=replace_text('poses = "', 'pose = "'),
     ),
     bad(
-        "missing-key", "parameters.gamma_m_1_s", "missing", "damping",
+        "missing-key", "parameters: gamma_m_1_s is missing", "damping",
         edit=replace_text("gamma_m_1_s = { guess = 0.5, lower = 1e-3, upper = 100.0 }", ""),
     ),
     bad(
@@ -140,8 +140,20 @@ PROBLEM_FILE = [
         edit=replace_text('name = "swing"', 'name = "swing"\nvalidation = 1'),
     ),
     bad(
-        "number-for-a-table", "parameters.mu_pa", "found 200.0", "table", "guess, lower",
-        edit=replace_text(MU, "mu_pa = 200.0"),
+        "number-for-a-table", "parameters.mu_pa.prior", "found 0.2", "table", "mean, relative",
+        options=settings("parameters.mu_pa.prior=0.2"),
+    ),
+    bad(
+        "text-for-a-parameter", "parameters.mu_pa", "found 'soft'", "expected a number",
+        edit=replace_text(MU, 'mu_pa = "soft"'),
+    ),
+    bad(
+        "unknown-parameter", "parameters.mu_p: no such parameter", "did you mean 'mu_pa'?",
+        edit=replace_text("mu_pa  ", "mu_p"),
+    ),
+    bad(
+        "unknown-key-of-a-parameter", "parameters.mu_pa.gues", "unknown key", "mean 'guess'?",
+        edit=replace_text(MU, "mu_pa = { gues = 200.0, lower = 10.0 }"),
     ),
     bad(
         "table-for-a-list", "experiment: found", "[[experiment]]",
@@ -260,7 +272,7 @@ PARAMETERS = [
         options=settings("parameters.mu_pa.lower=1e5"),
     ),
     bad(
-        "guess-not-positive", "parameters.gamma_m_1_s.guess", "found 0", "above 0",
+        "guess-not-positive", "parameters.gamma_m_1_s", "guess = 0", "[0.001, 100]",
         options=settings("parameters.gamma_m_1_s.guess=0"),
     ),
     bad(
@@ -271,7 +283,7 @@ PARAMETERS = [
         ),
     ),
     bad(
-        "mixed-elastic-pair", "mu_pa, young_pa", "expected lambda_pa and mu_pa, or young_pa",
+        "mixed-elastic-pair", "mu_pa, young_pa", "expects lambda_pa and mu_pa, or young_pa",
         edit=replace_text("lambda_pa  ", "young_pa"),
     ),
     bad(
@@ -283,7 +295,7 @@ PARAMETERS = [
         edit=replace_text(MU, "mu_pa = { fixed = 300.0, lower = 10.0 }"),
     ),
     bad(
-        "no-stiffness", "mu_pa = { fixed = 0 }", "above 0",
+        "no-stiffness", "parameters.mu_pa", "fixed = 0", "above 0",
         edit=replace_text(MU, "mu_pa = { fixed = 0 }"),
     ),
 ]  # fmt: skip
@@ -642,6 +654,6 @@ def test_every_key_refuses_what_it_cannot_be(tiny_problem, value):
     assert len(keys) > 40
     for key in keys:
         with pytest.raises(InputError) as caught:
-            read_problem_file(file, [f"{key}={value}"])
+            Problem.read(file, [f"{key}={value}"])
         assert str(caught.value).startswith(f"{file}: ")
         assert not [word for word in JARGON if word in str(caught.value)], caught.value

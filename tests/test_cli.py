@@ -220,7 +220,7 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
 
 
 def test_an_interruption_before_the_first_iterate_writes_nothing(tiny, monkeypatch):
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("collocation_sysid.problem.Problem.read", interrupt)

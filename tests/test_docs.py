@@ -70,6 +70,8 @@ def in_a_problem(code: str) -> dict[str, Any]:
     experiment = block.pop("experiment", {})
     if isinstance(experiment, dict):
         experiment = [whole["experiment"][0] | experiment]
+    if not {"mesh", "surface"} & set(block.get("object", ["mesh"])):
+        block["object"] |= whole["object"]
     return whole | block | {"experiment": experiment}
 
 

@@ -75,7 +75,7 @@ def test_energy_densities_add_up_to_the_energy(element):
     body = bar(element)
     bent = body.nodes_m + 0.5 * body.nodes_m[:, :1] ** 2 * [0.0, 0.0, 1.0]
     densities = fields_of(body).at(bent)["energy_density_j_m3"][0]
-    total = body.energy(bent, LAMBDA_PA, MU_PA)
+    total = body.energy(bent, lambda_pa=LAMBDA_PA, mu_pa=MU_PA)
     assert densities @ body.mesh.volumes_m3 == pytest.approx(total)
 
 

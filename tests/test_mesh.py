@@ -153,6 +153,23 @@ def test_point_arrays_must_have_a_value_per_node():
         TetMesh(CORNERS, [[0, 1, 2, 3]], {"grip": [1, 0]})
 
 
+def test_cell_arrays_must_have_a_value_per_element():
+    with pytest.raises(InputError, match='cell array "core" has shape'):
+        TetMesh(CORNERS, [[0, 1, 2, 3]], None, {"core": [1, 0]})
+
+
+def test_cell_arrays_are_kept_and_read_only():
+    mesh = TetMesh(TWO_POINTS, TWO_TETS, None, {"core": [True, False], "stress": [[1, 2], [3, 4]]})
+    np.testing.assert_array_equal(mesh.cell_arrays["core"], [True, False])
+    assert mesh.cell_arrays["stress"].shape == (2, 2)
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.cell_arrays["core"][0] = False
+
+
+def test_centres_are_the_means_of_the_corners(box):
+    np.testing.assert_allclose(box.centres_m, box.points_m[box.tetrahedra].mean(axis=1))
+
+
 # --- files
 
 
@@ -205,6 +222,126 @@ def test_point_sets_of_the_file_can_be_selected(tmp_path):
     meshio.write(tmp_path / "tet.inp", mesh)
     read = TetMesh.read(tmp_path / "tet.inp")
     np.testing.assert_array_equal(read.select(Named("grip")), [1, 3])
+
+
+@pytest.mark.parametrize("ending", ["vtu", "vtk"])
+def test_cell_arrays_are_written_and_read_back(tmp_path, ending):
+    arrays = {"core": np.array([True, False]), "modulus": np.array([2.5, 7.0])}
+    TetMesh(TWO_POINTS, TWO_TETS, None, arrays).write(tmp_path / f"two.{ending}")
+    again = TetMesh.read(tmp_path / f"two.{ending}")
+    np.testing.assert_array_equal(again.cell_arrays["core"], [1, 0])
+    np.testing.assert_array_equal(again.cell_arrays["modulus"], [2.5, 7.0])
+    np.testing.assert_array_equal(Named("core").resolve_cells(again), [0])
+
+
+def test_cell_arrays_are_those_of_the_tetrahedra_in_a_mixed_file(tmp_path):
+    cells = [("tetra", TWO_TETS[:1]), ("triangle", [[0, 1, 2]]), ("tetra", TWO_TETS[1:])]
+    tags = {"tag": [np.array([5]), np.array([9]), np.array([7])]}
+    meshio.write(tmp_path / "mixed.vtu", meshio.Mesh(TWO_POINTS, cells, cell_data=tags))
+    np.testing.assert_array_equal(TetMesh.read(tmp_path / "mixed.vtu").cell_arrays["tag"], [5, 7])
+
+
+def test_cell_sets_of_the_file_can_be_selected(tmp_path):
+    mesh = meshio.Mesh(TWO_POINTS, [("tetra", TWO_TETS)], cell_sets={"core": [[1]]})
+    meshio.write(tmp_path / "two.inp", mesh)
+    read = TetMesh.read(tmp_path / "two.inp")
+    np.testing.assert_array_equal(Named("core").resolve_cells(read), [1])
+
+
+# Two tetrahedra in groups of their own; a face in a group with the tag of the first's.
+MSH_FILES = {
+    "2.2": """\
+$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+2 1 "floor"
+3 1 "core"
+3 2 "skin"
+$EndPhysicalNames
+$Nodes
+5
+1 0 0 0
+2 1 0 0
+3 0 1 0
+4 0 0 1
+5 1 1 1
+$EndNodes
+$Elements
+4
+1 2 2 1 1 1 2 3
+2 2 2 5 2 3 4 5
+3 4 2 1 1 1 2 3 4
+4 4 2 2 2 2 3 4 5
+$EndElements
+""",
+    "4.1": """\
+$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+2 1 "floor"
+3 1 "core"
+3 2 "skin"
+$EndPhysicalNames
+$Entities
+0 0 2 2
+1 0 0 0 1 1 0 1 1 0
+2 0 0 0 1 1 1 1 5 0
+1 0 0 0 1 1 1 1 1 1 1
+2 0 0 0 1 1 1 1 2 1 2
+$EndEntities
+$Nodes
+1 5 1 5
+3 1 0 5
+1
+2
+3
+4
+5
+0 0 0
+1 0 0
+0 1 0
+0 0 1
+1 1 1
+$EndNodes
+$Elements
+4 4 1 4
+2 1 2 1
+1 1 2 3
+2 2 2 1
+2 3 4 5
+3 1 4 1
+3 1 2 3 4
+3 2 4 1
+4 2 3 4 5
+$EndElements
+""",
+}
+
+
+@pytest.mark.parametrize("version", MSH_FILES)
+def test_physical_groups_are_cells_and_nodes_by_name_and_dimension(tmp_path, version):
+    (tmp_path / "two.msh").write_text(MSH_FILES[version])
+    mesh = TetMesh.read(tmp_path / "two.msh")
+    assert len(mesh.tetrahedra) == 2
+    np.testing.assert_array_equal(Named("core").resolve_cells(mesh), [0])
+    np.testing.assert_array_equal(Named("skin").resolve_cells(mesh), [1])
+    np.testing.assert_array_equal(mesh.select(Named("core")), [0, 1, 2, 3])
+    np.testing.assert_array_equal(mesh.select(Named("skin")), [1, 2, 3, 4])
+    # A group of faces has nodes only, though its tag is the one of a group of cells.
+    np.testing.assert_array_equal(mesh.select(Named("floor")), [0, 1, 2])
+    with pytest.raises(InputError, match='no cell array "floor"; it has "core", "skin"'):
+        Named("floor").resolve_cells(mesh)
+
+
+@pytest.mark.parametrize("version", MSH_FILES)
+def test_groups_without_a_name_are_called_by_their_tag(tmp_path, version):
+    (tmp_path / "two.msh").write_text(MSH_FILES[version])
+    mesh = TetMesh.read(tmp_path / "two.msh")
+    np.testing.assert_array_equal(mesh.select(Named("physical_5")), [2, 3, 4])
 
 
 def test_a_file_without_tetrahedra_tells_what_it_holds(tmp_path):

@@ -302,11 +302,13 @@ def test_regions_share_names_without_a_region_and_have_their_own(rng):
     assert_derivatives(parameters, body, rng)
 
 
-def test_shared_moduli_that_a_region_takes_only_in_part_are_refused():
-    given = {"young_pa": 1.0, "poisson": 0.2, **GIVEN, "core.c10_pa": 1.0, "core.c01_pa": 1.0}
-    message = "region 'core' are young_pa, poisson; .* expects kappa_pa, or lambda_pa, or poisson"
-    with pytest.raises(InputError, match=message):
-        Parameters.of(given).fit([two_regions("mooney-rivlin")])
+def test_a_region_takes_of_shared_moduli_what_its_material_needs():
+    given = {"young_pa": 1.0, "poisson": 0.2, **GIVEN, "core.c10_pa": 1.0, "core.c01_pa": 2.0}
+    body = two_regions("mooney-rivlin")
+    Parameters.of(given).fit([body])
+    lam, mu = body.lame(body.theta(given))["core"]
+    assert mu == pytest.approx(6.0)
+    assert lam / (2 * (lam + mu)) == pytest.approx(0.2)
 
 
 def test_a_regions_own_modulus_goes_with_a_shared_one():

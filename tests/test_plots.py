@@ -121,10 +121,16 @@ def test_parameters_are_drawn_relative_to_the_truth_where_it_is_known():
     assert "truth" in axes.get_ylabel()
 
 
-def test_parameters_can_be_drawn_in_the_other_convention():
-    lines = convergence(history(), ("young_pa", "poisson")).axes[3].lines
-    assert "0.2" in str(lines[2].get_label())
+def test_parameters_to_draw_can_be_chosen_and_are_labelled_with_their_values():
+    named = [
+        replace(line, parameters={"young_pa": 720.0, "poisson": 0.2, "core.mu_pa": 450.0})
+        for line in history()
+    ]
+    lines = convergence(named, ("poisson", "core.mu_pa")).axes[3].lines
     assert len(lines) == 3
+    assert "0.2" in str(lines[1].get_label())
+    assert "450" in str(lines[2].get_label())
+    assert "core" in str(lines[2].get_label())
 
 
 @pytest.mark.parametrize("names", [(), ("mu_pa",)])

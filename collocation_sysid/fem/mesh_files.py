@@ -164,6 +164,8 @@ def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
     """Cell sets as booleans, block by block."""
     sets = {}
     for name, per_block in (data.cell_sets or {}).items():
+        if name == "gmsh:bounding_entities":  # numbers of entities, not of cells
+            continue
         sets[name] = [np.zeros(len(block.data), dtype=bool) for block in data.cells]
         for mask, cells in zip(sets[name], per_block, strict=False):
             if cells is not None:

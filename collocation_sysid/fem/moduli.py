@@ -97,8 +97,6 @@ def source_of(
         specific = {own for own in ELASTIC if region and f"{region}.{own}" in known}
         there = {own for own in ELASTIC if name_of(own) is not None}
         fitting = [c for c in elastic if set(c) <= there and specific <= set(c)]
-        if not specific:
-            fitting = [c for c in fitting if set(c) == there]
         if len(fitting) != 1:
             found = ", ".join(str(name_of(own)) for own in ELASTIC if own in there) or "none"
             raise InputError(

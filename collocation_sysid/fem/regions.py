@@ -96,49 +96,56 @@ def parts_of(
         If regions overlap, share a name, are empty, or leave no mass for the rest.
     """
     claimed = _claimed(mesh, regions)
-    masses = (density_kg_m3 is None) + (mass_kg is None)
-    if masses != 1:
+    own = _densities(mesh, regions, claimed, density_kg_m3, mass_kg)
+    rest = np.setdiff1d(
+        np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
+    )
+    whole = Part("", rest, as_material(material), as_damping(damping), own[0])
+    parts = [whole] if rest.size else []
+    for region, cells, density in zip(regions, claimed, own[1:], strict=True):
+        parts.append(
+            Part(
+                region.name,
+                cells,
+                whole.material if region.material is None else as_material(region.material),
+                whole.damping if region.damping is None else as_damping(region.damping),
+                density,
+            )
+        )
+    return tuple(parts)
+
+
+def _densities(
+    mesh: TetMesh,
+    regions: Sequence[Region],
+    claimed: Sequence[Index],
+    density_kg_m3: float | None,
+    mass_kg: float | None,
+) -> list[float]:
+    """Densities of what no region claims, and of the regions."""
+    if (density_kg_m3 is None) == (mass_kg is None):
         raise InputError("give exactly one of density_kg_m3 and mass_kg")
-    own = [region.density_kg_m3 for region in regions]
-    for region, density in zip(regions, own, strict=True):
-        if density is not None and not density > 0:
+    for region in regions:
+        if region.density_kg_m3 is not None and not region.density_kg_m3 > 0:
             raise InputError("density_kg_m3 must be positive", None, f"region '{region.name}'")
-    volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
     if density_kg_m3 is None:
-        known = [(d, v) for d, v in zip(own, volumes, strict=True) if d is not None]
-        left_kg = float(mass_kg or 0.0) - sum(d * v for d, v in known)
-        left_m3 = mesh.volume_m3 - sum(v for _, v in known)
+        volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
+        known = [(r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)]
+        known_kg = sum(density * v for density, v in known if density is not None)
+        left_m3 = mesh.volume_m3 - sum(v for density, v in known if density is not None)
         if left_m3 <= 1e-12 * mesh.volume_m3:
             raise InputError(
                 "every cell is in a region with a density of its own, so mass_kg says nothing; "
                 "leave one density out"
             )
-        rest = left_kg / left_m3
-        if not rest > 0:
-            heavier = f"the regions' densities make up {float(mass_kg or 0) - left_kg:.4g} kg of it"
-            raise InputError(f"mass_kg must be positive{'; ' + heavier if known else ''}")
+        rest, name = (float(mass_kg or 0.0) - known_kg) / left_m3, "mass_kg"
     else:
-        rest = density_kg_m3
-        if not rest > 0:
-            raise InputError("density_kg_m3 must be positive")
-    free = np.ones(len(mesh.tetrahedra), dtype=bool)
-    for cells in claimed:
-        free[cells] = False
-    body_material, body_damping = as_material(material), as_damping(damping)
-    parts = []
-    if free.any():
-        parts.append(Part("", np.flatnonzero(free), body_material, body_damping, rest))
-    for region, cells in zip(regions, claimed, strict=True):
-        parts.append(
-            Part(
-                region.name,
-                cells,
-                body_material if region.material is None else as_material(region.material),
-                body_damping if region.damping is None else as_damping(region.damping),
-                rest if region.density_kg_m3 is None else region.density_kg_m3,
-            )
-        )
-    return tuple(parts)
+        rest, name, known_kg = density_kg_m3, "density_kg_m3", 0.0
+    if not rest > 0:
+        heavy = f"; the regions' densities make up {known_kg:.4g} kg of it" if known_kg else ""
+        raise InputError(f"{name} must be positive{heavy}")
+    own = [rest if region.density_kg_m3 is None else region.density_kg_m3 for region in regions]
+    return [rest, *own]
 
 
 def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:

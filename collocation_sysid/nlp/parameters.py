@@ -319,7 +319,8 @@ class Parameters:
         Raises
         ------
         InputError
-            For a name that none of them knows, a constant that is missing or given twice.
+            For a name that none of them knows, a constant that is missing or given twice, or a
+            stiffness of zero.
         """
         bodies = list(bodies)
         known = [name for body in bodies for name in body.parameter_names]
@@ -338,6 +339,9 @@ class Parameters:
                 raise InputError(
                     "no part of the model uses it: every region has a value of its own", None, name
                 )
+        for item in self.items:
+            if item.fixed and item.guess == 0 and bare(item.name) in ("mu_pa", "young_pa"):
+                raise InputError("fixed = 0, expected a stiffness above 0", None, item.name)
 
 
 def _stated(item: Parameter) -> str:
@@ -393,18 +397,15 @@ def _with_derivatives(name: str, q: ca.SX, values: ca.SX) -> ca.Function:
 def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str, ...], ca.SX]:
     """(E, ν) of every part at small strain; (λ, μ) of those that are given by (E, ν)."""
     found: dict[str, ca.SX] = {}
-    for part, share in zip(body.parts, body.split(theta), strict=True):
+    shares = body.split(theta)
+    for part, share, source in zip(body.parts, shares, body.sources(names), strict=True):
         lame = part.material.lame(share[: len(part.material.constants)])
         young, poisson = engineering(lame[0], lame[1])
         moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
+        by_young = "young_pa" in source.names
         for own, value in moduli.items():
-            full = part.full_name(own)
-            given = full in names or own in names
-            wanted = own in ENGINEERING or {part.full_name(ENGINEERING[0]), ENGINEERING[0]} & set(
-                names
-            )
-            if wanted and not given:
-                found[full] = value
+            if own not in source.names and (own in ENGINEERING or by_young):
+                found[part.full_name(own)] = value
     return tuple(found), ca.vertcat(*found.values()) if found else ca.SX(0, 1)
 
 

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from ..errors import InputError
 from ..fem.body import Body
+from ..fem.constants import constant_named
 from ..fem.materials import Material
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
@@ -16,7 +17,7 @@ from .code import load_material
 from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file, selection
-from .schema import CodeSection, ObjectSection, ParameterSection, ProblemFile
+from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 
 T = TypeVar("T")
 
@@ -120,12 +121,12 @@ def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: 
 
 
 def _load_parameters(given: Mapping[str, ParameterSection | float], body: Body) -> Parameters:
-    parameters = Parameters.of({name: _stated(section) for name, section in given.items()})
+    parameters = Parameters.of({name: _stated(name, section) for name, section in given.items()})
     parameters.fit([body])
     return parameters
 
 
-def _stated(section: ParameterSection | float) -> Unknown | Tied | float:
+def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
     """A parameter as the file states it."""
     if not isinstance(section, ParameterSection):
         return section
@@ -134,12 +135,20 @@ def _stated(section: ParameterSection | float) -> Unknown | Tied | float:
     if section.tied_to is not None:
         return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
     assert section.guess is not None  # by the schema
-    prior = section.prior
+    linear = (section.scale or constant_named(name).scale) == "linear"
     return Unknown(
         section.guess,
         section.lower,
         section.upper,
-        None if prior is None else (prior.mean, prior.relative or prior.deviation or 0.0),
+        section.prior and _prior(section.prior, linear),
         section.scale,
         section.typical,
     )
+
+
+def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:
+    """Mean and deviation: absolute of a linear parameter, else relative."""
+    size = abs(section.mean)
+    if linear:
+        return section.mean, section.deviation or (section.relative or 0.0) * size
+    return section.mean, section.relative or (section.deviation or 0.0) / max(size, 1e-300)

@@ -32,7 +32,7 @@ class CodeSection(Section):
 
 
 def _material_form(value: Any) -> str:
-    return "<code>" if isinstance(value, dict) else "<name>"
+    return "<name>" if isinstance(value, str) else "<code>"
 
 
 Material = Annotated[
@@ -139,7 +139,7 @@ class ParameterSection(Section):
 
 
 def _parameter_form(value: Any) -> str:
-    return "<table>" if isinstance(value, dict) else "<value>"
+    return "<table>" if isinstance(value, (dict, ParameterSection)) else "<value>"
 
 
 def _flat(given: Any, front: str = "") -> Any:

@@ -17,13 +17,18 @@ mesh = "body.vtu"              # tetrahedra, any format meshio reads
 # edge_length_m = 0.02
 # length_unit = "mm"           # of the file; "m" by default
 mass_kg = 0.1                  # weighed; or density_kg_m3
-material = "neo-hookean"       # or st-venant-kirchhoff, mooney-rivlin, stable-neo-hookean, linear
+material = "neo-hookean"       # or stable-neo-hookean, st-venant-kirchhoff, mooney-rivlin, yeoh, ...
 element = "tet4"               # or tet10, for bending, a slender body, or poisson above 0.4
 
-[parameters]                   # estimated from a guess within bounds, or {{ fixed = 0.5 }}
+# [[object.region]]            # cells that differ; its parameters are "core.young_pa" and so on
+# name = "core"
+# cells = {{ ball_m = [[0, 0, 0.1], 0.02] }}
+# density_kg_m3 = 200.0
+
+[parameters]                   # estimated from a guess within bounds; a number alone is fixed
 young_pa    = {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
 poisson     = {{ guess = 0.3, lower = 0.05, upper = 0.45 }}
-# lambda_pa and mu_pa may stand in place of young_pa and poisson
+# lambda_pa and mu_pa, or kappa_pa and mu_pa, may stand in place of young_pa and poisson
 gamma_r_s   = {{ guess = 0.01, lower = 1e-5, upper = 1.0 }}
 gamma_m_1_s = {{ guess = 1.0, lower = 1e-3, upper = 100.0 }}
 

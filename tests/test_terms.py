@@ -1,0 +1,179 @@
+"""Models of several terms, identified: regions, and materials with constants of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from checks import assert_derivative, relative_error
+from problems_small import bar_in_two_hands, measured_with
+
+from collocation_sysid.experiment import Experiment
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.regions import Region
+from collocation_sysid.fem.selection import Box
+from collocation_sysid.methods import METHODS
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameters, Tied, Unknown
+from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.statistics.uncertainty import covariance
+
+LEFT_HALF = Box((-1, -1, -1), (0.075, 1, 1))
+DAMPING = {"gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+
+
+def waved_bar(steps: int = 12, **body) -> Experiment:
+    """A bar waved by its right end."""
+    bar = bar_in_two_hands(steps)
+    other = Body(bar.body.mesh, density_kg_m3=30.0, **body)
+    return replace(bar, name="waved bar", body=other, grasps=bar.grasps[1:])
+
+
+def stiffening(F: ca.SX, shear_pa: ca.SX, bulk_pa: ca.SX, stiffening: ca.SX) -> ca.SX:
+    """A user's own material of three constants, nearly linear at first."""
+    log_j = ca.log(ca.det(F))
+    strain = ca.sumsqr(F) * ca.exp(-2 / 3 * log_j) - 3
+    shear = 0.5 * shear_pa * strain * (1 + stiffening * strain)
+    return shear + 0.5 * bulk_pa * log_j**2
+
+
+# What is identified: the model, its truth, and what is known of it.
+MODELS = {
+    "two stiffnesses": (
+        {"regions": [Region("stiff", LEFT_HALF)]},
+        {"lambda_pa": 200.0, "mu_pa": 300.0, "stiff.mu_pa": 900.0, **DAMPING},
+        {"mu_pa": 450.0, "stiff.mu_pa": 600.0, "gamma_r_s": 0.006},
+    ),
+    "two materials": (
+        {"regions": [Region("stiff", LEFT_HALF, material="st-venant-kirchhoff")]},
+        {
+            "young_pa": 720.0,
+            "poisson": 0.2,
+            "stiff.young_pa": 2000.0,
+            "stiff.poisson": 0.3,
+            **DAMPING,
+        },
+        {"young_pa": 1000.0, "poisson": 0.3, "stiff.young_pa": 1400.0},
+    ),
+    "three constants": (
+        {"material": "yeoh"},
+        {"c10_pa": 150.0, "c20_pa": 60.0, "c30_pa": 0.0, "kappa_pa": 400.0, **DAMPING},
+        {"c10_pa": 220.0, "c20_pa": 20.0, "kappa_pa": 600.0, "gamma_r_s": 0.006},
+    ),
+    "a user's own": (
+        {"material": stiffening},
+        {"shear_pa": 300.0, "bulk_pa": 400.0, "stiffening": 0.3, **DAMPING},
+        {"shear_pa": 450.0, "bulk_pa": 600.0, "stiffening": 0.15},
+    ),
+}
+
+
+def parameters(truth: Mapping[str, float], guesses: Mapping[str, float]) -> Parameters:
+    """Estimated where there is a guess, fixed at the truth elsewhere."""
+    stated = {
+        name: Unknown(guesses[name]) if name in guesses else value for name, value in truth.items()
+    }
+    return Parameters.of(stated)
+
+
+def collocation_of(name: str) -> Collocation:
+    body, truth, guesses = MODELS[name]
+    experiment = measured_with(waved_bar(**body), truth)
+    return Collocation([experiment], parameters(truth, guesses))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_both_methods_recover_the_truth(name):
+    truth, guesses = MODELS[name][1:]
+    collocation = collocation_of(name)
+    reduced, interior = (METHODS[m]()(collocation) for m in ("reduced-space", "interior-point"))
+    for solution in (reduced, interior):
+        assert solution.status.converged, solution.message
+        for parameter in guesses:
+            assert solution.parameters[parameter] == pytest.approx(truth[parameter], rel=1e-3)
+    values = [[*solution.parameters.values()] for solution in (reduced, interior)]
+    np.testing.assert_allclose(*values, rtol=1e-5)
+    assert reduced.kkt_residual < 1e-8
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_derivatives_of_the_program_by_any_number_of_parameters(name, rng):
+    collocation = collocation_of(name)
+    z = METHODS["reduced-space"](max_iterations=2)(collocation).z
+    scale = np.concatenate([np.full(collocation.nq, 0.1), np.full(len(z) - collocation.nq, 0.01)])
+    jacobian = collocation.jacobian(z)
+    assert_derivative(
+        collocation.constraint_values, lambda d: jacobian @ d, z, rng, tolerance=1e-7, scale=scale
+    )
+    weights = rng.standard_normal(collocation.constraints)
+    hessian = collocation.hessian(z, 1.0, weights)
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return collocation.gradient(at) + collocation.jacobian(at).T @ weights
+
+    assert_derivative(slope, lambda d: hessian @ d, z, rng, tolerance=1e-7, scale=scale)
+
+
+def test_error_bars_of_regions_follow_the_noise(rng):
+    body, truth, guesses = MODELS["two stiffnesses"]
+    clean = measured_with(waved_bar(**body), truth)
+    tracks = clean.markers.positions_m + 1e-4 * rng.standard_normal(clean.markers.positions_m.shape)
+    markers = replace(clean.markers, positions_m=tracks, sigma_m=np.full(tracks.shape[1], 1e-4))
+    collocation = Collocation([replace(clean, markers=markers)], parameters(truth, guesses))
+    solution = METHODS["reduced-space"]()(collocation)
+    found = covariance(collocation, solution.z)
+    assert set(found.derived) >= {"young_pa", "stiff.young_pa"}
+    for name in guesses:
+        error = solution.parameters[name] - truth[name]
+        deviation = found.estimates[name].std_error
+        assert deviation is not None
+        assert abs(error) < 4 * deviation
+
+
+def test_a_tied_parameter_is_no_unknown_of_its_own():
+    body, truth, _ = MODELS["two stiffnesses"]
+    experiment = measured_with(waved_bar(**body), truth)
+    stated = {**truth, "mu_pa": Unknown(450.0), "stiff.mu_pa": Tied("mu_pa", ratio=3.0)}
+    collocation = Collocation([experiment], Parameters.of(stated))
+    assert collocation.nq == 1
+    solution = METHODS["reduced-space"]()(collocation)
+    assert solution.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-5)
+    assert solution.parameters["stiff.mu_pa"] == pytest.approx(900.0, rel=1e-5)
+
+
+def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypatch):
+    """A sweep factorises every timestep once, whatever the number of parameters."""
+    body, truth, guesses = MODELS["two stiffnesses"]
+    experiment = measured_with(waved_bar(**body), truth)
+    counts = []
+    for names in (["mu_pa"], [*guesses, "lambda_pa", "gamma_m_1_s"]):
+        stated = {n: Unknown(v) if n in names else v for n, v in truth.items()}
+        collocation = Collocation([experiment], Parameters.of(stated))
+        (segment,) = collocation.segments
+        z = METHODS["reduced-space"](max_iterations=1)(collocation).z
+        solver = BlockSolver(segment)
+        factorised = []
+        factorise_each = solver.factoriser.factorise_each
+
+        def counted(matrix, count, threads, kept=factorised, do=factorise_each):
+            kept.append(count)
+            return do(matrix, count, threads)
+
+        object.__setattr__(solver.factoriser, "factorise_each", counted)
+        setting = collocation.settings(collocation.parameters_of(z))[0]
+        tangent = solver.forward(collocation.unpack(z)[1][0], setting)
+        assert tangent.by_p.shape[2] == len(names)
+        counts.append(sum(factorised))
+    assert counts[0] == counts[1] == segment.constraint_times
+
+
+def test_regions_of_one_stiffness_are_the_body_without_regions():
+    truth = {"lambda_pa": 200.0, "mu_pa": 300.0, **DAMPING}
+    plain, divided = (
+        measured_with(waved_bar(**body), truth)
+        for body in ({}, {"regions": [Region("half", LEFT_HALF)]})
+    )
+    assert relative_error(divided.markers.positions_m, plain.markers.positions_m) < 1e-12
