@@ -116,7 +116,8 @@ class Run:
             pandas = import_module("pandas")
         except ImportError as error:
             raise InputError("a data frame needs pandas: pip install pandas") from error
-        guesses = self.problem.parameters.guesses
+        items = self.problem.parameters.items
+        guesses = {item.name: item.guess for item in items if item.tied is None}
         rows = {}
         for name, estimate in self.estimates.items():
             lower, upper = estimate.ci95 or (np.nan, np.nan)

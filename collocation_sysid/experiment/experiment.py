@@ -135,7 +135,7 @@ class Experiment:
         kind = ", validation" if self.validation else ""
         return (
             f"Experiment({self.name!r}: {len(self.t_s)} samples over {self.duration_s:.4g} s, "
-            f"{len(self.grasps)} grasps, {self.markers!r}{kind})"
+            f"grasps: {len(self.grasps)}, {self.markers!r}{kind})"
         )
 
     @property
