@@ -56,10 +56,11 @@ class Grasp:
 
     def on(self, body: Body, t_s: Array) -> Grasp:
         """The same grasp with the nodes of a body, and matrices as the poses at `t_s`."""
-        poses = self.poses
+        nodes, poses = on_body(self.nodes, body), self.poses
         if not isinstance(poses, PoseSequence):
             poses = PoseSequence.from_matrices(t_s, poses)
-        return replace(self, nodes=on_body(self.nodes, body), poses=poses)
+        given = nodes is self.nodes and poses is self.poses
+        return self if given else replace(self, nodes=nodes, poses=poses)
 
     def holds(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether the nodes are held at the times `t_s` (T,)."""

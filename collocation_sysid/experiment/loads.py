@@ -48,7 +48,8 @@ class PointMass:
 
     def on(self, body: Body) -> PointMass:
         """The same mass on the nodes of a body that are selected."""
-        return replace(self, nodes=on_body(self.nodes, body))
+        nodes = on_body(self.nodes, body)
+        return self if nodes is self.nodes else replace(self, nodes=nodes)
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Mass that each node carries at the times `t_s` (T,), (T, n) [kg]."""
@@ -92,7 +93,8 @@ class Force:
 
     def on(self, body: Body) -> Force:
         """The same force on the nodes of a body that are selected."""
-        return replace(self, nodes=on_body(self.nodes, body))
+        nodes = on_body(self.nodes, body)
+        return self if nodes is self.nodes else replace(self, nodes=nodes)
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Force on each node at the times `t_s` (T,), (T, n, 3) [N]."""
