@@ -1,48 +1,91 @@
 """Identify what a soft object is made of from how it moves in a robot's hand.
 
 >>> import collocation_sysid as cs
->>> problem = cs.load_problem("problem.toml")         # doctest: +SKIP
->>> solution = cs.solve(problem)                      # doctest: +SKIP
->>> solution.parameters                               # doctest: +SKIP
+>>> problem = cs.Problem.read("problem.toml")         # doctest: +SKIP
+>>> run = cs.run(problem)                             # doctest: +SKIP
+>>> run.parameters, run.interval("mu_pa")             # doctest: +SKIP
 """
 
 from importlib.metadata import version
 
 from .errors import InputError, SimulationError
-from .experiment import Experiment, Grasp, Markers, PoseSequence
+from .experiment import (
+    Experiment,
+    Force,
+    Grasp,
+    Markers,
+    Nuisance,
+    Placement,
+    PointMass,
+    PoseSequence,
+    place_markers,
+)
 from .fem.body import Body
+from .fem.materials import Material
 from .fem.mesh import TetMesh
-from .methods.solution import Solution, Status
+from .fem.regions import Region
+from .fem.selection import Ball, Box, Indices, Named
+from .methods.casadi_nlp import Sleqp, SqpMethod
+from .methods.continuation import Continuation
+from .methods.interior_point import InteriorPoint
+from .methods.penalty import AugmentedLagrangian, Penalty
+from .methods.reduced_space import ReducedSpace
+from .methods.shooting import Shooting
+from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameter, Parameters, Tied, Unknown
-from .nlp.simulation import Trajectory, simulate
-from .output.record import write_run
-from .problem import Problem, load_problem
-from .run import run, solve
+from .nlp.schemes import Scheme, Stencil
+from .nlp.simulation import Trajectory, simulate, with_markers
+from .problem import Problem, RolloutOptions, UncertaintyOptions
+from .run import Run, run, solve
 
 __version__ = version("collocation-sysid")
 
 __all__ = [
+    "AugmentedLagrangian",
+    "Ball",
     "Body",
+    "Box",
     "Collocation",
+    "Continuation",
     "Experiment",
+    "Force",
     "Grasp",
+    "Indices",
     "InputError",
+    "InteriorPoint",
+    "Iteration",
     "Markers",
+    "Material",
+    "Named",
+    "Nuisance",
     "Parameter",
     "Parameters",
+    "Penalty",
+    "Placement",
+    "PointMass",
     "PoseSequence",
     "Problem",
+    "ReducedSpace",
+    "Region",
+    "RolloutOptions",
+    "Run",
+    "Scheme",
+    "Shooting",
     "SimulationError",
+    "Sleqp",
     "Solution",
+    "SqpMethod",
     "Status",
+    "Stencil",
     "TetMesh",
     "Tied",
     "Trajectory",
+    "UncertaintyOptions",
     "Unknown",
-    "load_problem",
+    "place_markers",
     "run",
     "simulate",
     "solve",
-    "write_run",
+    "with_markers",
 ]

@@ -100,22 +100,25 @@ def solve(
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
     """
+    from .methods.described import require_method
     from .methods.solution import Status
     from .output.record import as_json as json_text
-    from .output.record import result, write_run
+    from .output.record import result
     from .output.writers import require_replaceable
-    from .problem import load_problem
+    from .problem import Problem
     from .run import run
     from .terminal import Progress, summary
 
+    if method is not None:
+        require_method(method, "--method")
     folder = out or Path("runs") / run_name(problem)
-    loaded = load_problem(problem, set_ or (), allow_code=allow_code)
+    loaded = Problem.read(problem, set_ or (), allow_code)
     require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
         finished = run(loaded, method, watch=progress.iteration, log=progress.say)
         progress.say("writing the run folder")
-        write_run(finished, folder)
+        finished.save(folder)
     if as_json:
         typer.echo(json_text(result(finished)))
     else:
@@ -152,11 +155,11 @@ def simulate(
     The markers' places are their reference_m, or follow from their file. The parameters are the
     guesses or fixed values: set others with --set.
     """
-    from .problem import load_problem
+    from .problem import Problem
     from .synthesis import write_data
     from .terminal import Progress
 
-    loaded = load_problem(problem, set_ or (), True, allow_code)
+    loaded = Problem.read(problem, set_ or (), allow_code, simulation=True)
     require_possible(out)
     with Progress(errors, loaded, quiet=quiet) as progress:
         written = write_data(
@@ -202,13 +205,13 @@ def compare(
 
     Finished runs are kept in the output folder: the same command resumes.
     """
-    from .problem import load_problem
+    from .problem import Problem
     from .study import Limits, plan_comparison
     from .study.arguments import parse_methods, read_truth
     from .study.table import Yardstick
 
     names, limits = parse_methods(methods), Limits(workers, scheduler, time_limit)
-    loaded = load_problem(problem, set_ or (), allow_code=allow_code)
+    loaded = Problem.read(problem, set_ or (), allow_code)
     free = [item.name for item in loaded.parameters.free]
     yardstick = Yardstick(read_truth(truth or (), loaded.parameters.names, free), within)
     options = starts, spread, seed, yardstick.truth, allow_code
@@ -244,7 +247,7 @@ def sweep(
     quiet: Quiet = False,
 ) -> None:
     """Solve for every combination of values of some keys."""
-    from .problem import load_problem
+    from .problem import Problem
     from .study import Limits, plan_sweep
     from .study.arguments import parse_methods, parse_over
     from .study.table import Yardstick
@@ -252,9 +255,7 @@ def sweep(
     chosen = parse_methods(method, "--method")[0] if method else None
     limits = Limits(workers, scheduler, time_limit)
     planned = plan_sweep(problem, parse_over(over), set_ or (), chosen, allow_code)
-    load_problem(
-        problem, planned[0].overrides, False, allow_code
-    )  # a missing file would fail every run
+    Problem.read(problem, planned[0].overrides, allow_code)  # a missing file would fail every run
     _study(_Study("sweep", problem, planned, Yardstick(), out), limits, dry_run, as_json, quiet)
 
 
@@ -332,10 +333,10 @@ def check(
 ) -> None:
     """Tell what is wrong with a problem before solving it."""
     from .check import check_problem
-    from .problem import load_problem
+    from .problem import Problem
     from .terminal import check_table
 
-    findings = check_problem(load_problem(problem, set_ or (), allow_code=allow_code))
+    findings = check_problem(Problem.read(problem, set_ or (), allow_code))
     if as_json:
         typer.echo(json.dumps(findings.as_dict(), indent=1))
     else:
@@ -451,7 +452,7 @@ def methods(
 @app.command()
 def schema() -> None:
     """Print the JSON schema of the problem file."""
-    from .problem import ProblemFile
+    from .problem.schema import ProblemFile
 
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
 

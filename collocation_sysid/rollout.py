@@ -40,16 +40,16 @@ class Rollout:
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
     """Simulate an experiment with a solution's parameters; or say why that fails."""
-    section, transcription = problem.file.rollout, problem.file.transcription
-    integrator = "newmark" if section.integrator == "newmark" else transcription.scheme
+    options = problem.rollout
+    integrator = problem.scheme if options.integrator == "scheme" else "newmark"
     try:
         segment, phi = _seen(experiment, solution)
         trajectory = simulate(
             segment.corrected(phi),
             experiment.body.theta(solution.parameters),
             integrator,
-            timestep_s=section.timestep_s,
-            substeps=transcription.substeps,
+            timestep_s=options.timestep_s,
+            substeps=problem.substeps,
         )
     except SimulationError as error:
         return str(error)
@@ -76,9 +76,10 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     for segment, phi in zip(collocation.segments, own, strict=True):
         if segment.experiment is experiment:
             return segment, phi
+    found, body = solution.parameters, experiment.body
     alone = Collocation(
         [replace(experiment, validation=False)],
-        Parameters.of(solution.parameters),
+        Parameters.of({name: found[name] for name in body.used_names(list(found))}),
         collocation.scheme,
         collocation.substeps,
         huber=collocation.huber,

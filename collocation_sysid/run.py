@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-from .errors import InputError, SimulationError
-from .methods.described import require_method
-from .methods.solution import Iteration, Solution, Status
-from .nlp.collocation import Collocation
+import numpy as np
+
+from .errors import InputError, SimulationError, hint_at
+from .fem.constants import unit_of
+from .methods.method import Method, Watch
+from .methods.solution import Solution, Status
 from .problem import Problem
 from .rollout import Rollout, roll_out
 from .statistics.diagnostics import MarkerDiagnosis, diagnose
+from .statistics.estimates import Estimate
 from .statistics.identifiability import verdicts
-from .statistics.linearised import linearised_fit
+from .statistics.linearised import Derived, linearised_fit
 from .statistics.profile import Profile
 from .statistics.profiling import profile_of
 from .statistics.uncertainty import Uncertainty, uncertainty_of
@@ -46,6 +52,104 @@ class Run:
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        solution = self.solution
+        free = [item.name for item in self.problem.parameters.free]
+        found = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
+        rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
+        return f"Run({solution.method}, {solution.status.value}: {found}; {rms})"
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Every parameter, by name."""
+        return self.solution.parameters
+
+    @cached_property
+    def derived(self) -> dict[str, float]:
+        """Moduli that follow from the parameters, by name."""
+        constants = (segment.constants for segment in self.solution.collocation.segments)
+        return dict(Derived.of(constants, self.solution.q).values)
+
+    @cached_property
+    def estimates(self) -> dict[str, Estimate]:
+        """Parameters and derived moduli with their error bars, where there are any."""
+        found = self.uncertainty
+        known = {} if found is None else {**found.estimates, **found.derived}
+        values = self.parameters | self.derived
+        return {name: known.get(name, Estimate(value)) for name, value in values.items()}
+
+    def interval(self, name: str) -> tuple[float, float] | None:
+        """95 % interval of a parameter or derived modulus; None where there is none.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        return self._estimate(name).ci95
+
+    def std_error(self, name: str) -> float | None:
+        """Standard error of a parameter or derived modulus; None where there is none.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        return self._estimate(name).std_error
+
+    def table(self) -> str:
+        """The parameters with their error bars as the terminal shows them."""
+        from .terminal import parameter_table, plain_text  # how it looks is no part of a run
+
+        return plain_text(parameter_table(self))
+
+    def to_frame(self) -> Any:
+        """The estimates as a pandas DataFrame: value, std_error, lower, upper, guess, unit.
+
+        Raises
+        ------
+        InputError
+            Without pandas.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise InputError("a data frame needs pandas: pip install pandas") from error
+        items = self.problem.parameters.items
+        guesses = {item.name: item.guess for item in items if item.tied is None}
+        rows = {}
+        for name, estimate in self.estimates.items():
+            lower, upper = estimate.ci95 or (np.nan, np.nan)
+            rows[name] = {
+                "value": estimate.value,
+                "std_error": np.nan if estimate.std_error is None else estimate.std_error,
+                "lower": lower,
+                "upper": upper,
+                "guess": guesses.get(name, np.nan),
+                "unit": unit_of(name),
+            }
+        return pandas.DataFrame.from_dict(rows, orient="index")
+
+    def save(self, folder: str | Path, frames: bool = True) -> Path:
+        """Write the run folder, whole or not at all, and return it.
+
+        Raises
+        ------
+        InputError
+            If there is anything but an earlier run.
+        """
+        from .output.record import write_run  # what files hold is no part of a run
+
+        return write_run(self, folder, frames)
+
+    def _estimate(self, name: str) -> Estimate:
+        if name not in self.estimates:
+            known = list(self.estimates)
+            expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+            raise InputError(f"no parameter {name!r}; {expected}")
+        return self.estimates[name]
+
     @property
     def all_notes(self) -> tuple[str, ...]:
         """What the user should know after the solve, and what the data say of the parameters."""
@@ -55,47 +159,33 @@ class Run:
         return (*dict.fromkeys(said), *(profile.sentence for profile in self.profiles))
 
 
-def build_collocation(problem: Problem) -> Collocation:
-    """The NLP of a problem."""
-    transcription = problem.file.transcription
-    return Collocation(
-        problem.experiments,
-        problem.parameters,
-        transcription.scheme,
-        transcription.substeps,
-        transcription.explicit_grasps,
-        problem.file.solver.huber,
-    )
+def _with_error(estimate: Estimate) -> str:
+    error = "" if estimate.std_error is None else f" ± {estimate.std_error:.2g}"
+    return f"{estimate.value:.5g}{error}"
 
 
 def solve(
-    problem: Problem,
-    method: str | None = None,
-    watch: Callable[[Iteration], None] | None = None,
-    **options: Any,
+    problem: Problem, method: str | Method | None = None, watch: Watch | None = None
 ) -> Solution:
-    """Solve a problem with a method.
+    """Solve a problem, without the checks of `run`.
 
     Parameters
     ----------
     problem : Problem
-    method : str, optional
-        A key of `methods.METHODS`; the problem file's by default.
+    method : str or Method, optional
+        A name, or anything that solves a `Collocation`, such as a method with other options; the
+        problem's own by default.
     watch : callable, optional
         Called with every `Iteration`.
-    **options
-        Options of the method, in place of those of the problem file.
 
     Raises
     ------
     InputError
-        For an unknown method or option, and when the solver refuses the problem.
+        For an unknown method, and when the solver refuses the problem.
     """
-    name = method or problem.file.solver.method
-    require_method(name, "--method")
+    solver = problem.solver(method)
     try:
-        solver = problem.file.solver.method_named(name, **options)
-        solution = solver(build_collocation(problem), watch)
+        solution = solver(problem.collocation(), watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
@@ -106,11 +196,25 @@ def solve(
 
 def run(
     problem: Problem,
-    method: str | None = None,
-    watch: Callable[[Iteration], None] | None = None,
+    method: str | Method | None = None,
+    watch: Watch | None = None,
     log: Log | None = None,
 ) -> Run:
-    """Solve a problem, simulate every experiment with the answer, and find the error bars."""
+    """Solve a problem, simulate every experiment with the answer, and find the error bars.
+
+    Parameters
+    ----------
+    problem : Problem
+    method, watch
+        See `solve`.
+    log : callable, optional
+        Called with what is being done now, a text.
+
+    Raises
+    ------
+    InputError
+        As `solve` does.
+    """
     say = log or (lambda _: None)
     solution = solve(problem, method, watch)
     say("checking the answer by a forward simulation")
@@ -125,13 +229,13 @@ def run(
     diagnoses = diagnose(fit)
     if not solution.collocation.nq:
         return Run(problem, solution, rollouts, None, diagnoses)
-    section = problem.file.uncertainty
+    options = problem.uncertainty
     try:
         uncertainty = uncertainty_of(
-            fit, problem.parameters, solution.q, section.noise, section.errors
+            fit, problem.parameters, solution.q, options.noise, options.errors
         )
         profiles = []
-        for name in section.profile:
+        for name in options.profile:
             say(f"profile likelihood of {name}")
             profiles.append(profile_of(solution, fit, uncertainty, name))
     except InputError as error:

@@ -56,9 +56,9 @@ def write_data(
     _refuse_options(integrator, timestep_s, noise_m, seed)
     _refuse_inputs(problem, place)
     rng = np.random.default_rng(seed)
-    substeps = problem.file.transcription.substeps
+    given, substeps = problem.parameters, problem.substeps
     simulated = [
-        simulate(experiment, problem.parameters, integrator, timestep_s, substeps, None, progress)
+        simulate(experiment, given, integrator, timestep_s, substeps, None, progress)
         for experiment in problem.experiments
     ]
     place.mkdir(parents=True, exist_ok=True)
@@ -94,11 +94,7 @@ def _refuse_options(integrator: str, timestep_s: float | None, noise_m: float, s
 
 def _refuse_inputs(problem: Problem, place: Path) -> None:
     """Refuse to overwrite a file that the problem reads: it may be a recording."""
-    read = set()
-    for section in problem.file.experiment:
-        for name in (section.markers.file, *(grasp.poses for grasp in section.grasps)):
-            if name is not None:
-                read.add((problem.path.parent / name).resolve())
+    read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
     for experiment in problem.experiments:
         for file in _tables(experiment, place):
             if file.exists() and file.resolve() in read:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import StringIO
 from pathlib import Path
 from types import TracebackType
 
@@ -11,14 +12,16 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from .check import Findings
+from .check import BodyFinding, Findings
 from .fem.constants import symbol_of, unit_of
 from .methods.solution import Iteration
+from .nlp.parameters import Parameter
 from .problem import Problem
 from .rollout import Rollout
 from .run import Run
 from .statistics.uncertainty import Estimate
 
+WIDE = 200
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
@@ -111,28 +114,35 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [_parameter_table(finished), *_verdict(finished), *_own_unknowns(finished)]
+    parts += [parameter_table(finished), *_verdict(finished), *_own_unknowns(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
     parts.append(Text(f"written to {folder}"))
     return Group(*parts)
 
 
-def _parameter_table(finished: Run) -> Table:
-    solution = finished.solution
-    parameters = solution.collocation.parameters
+def plain_text(shown: RenderableType) -> str:
+    """What a terminal would show, without colours and as wide as it needs."""
+    file = StringIO()
+    Console(file=file, width=WIDE, highlight=False).print(shown)
+    return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+
+
+def parameter_table(finished: Run) -> Table:
+    """Parameters and derived moduli with their error bars."""
     table = Table("", "value", "±", "95 % interval", "guess", box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"
-    estimates = dict(finished.uncertainty.estimates) if finished.uncertainty is not None else {}
-    for item in parameters.items:
-        estimate = estimates.get(item.name, Estimate(solution.parameters[item.name]))
-        last = "fixed" if item.fixed else f"{item.guess:.5g}"
-        table.add_row(*_estimate_cells(item.name, estimate), last)
-    if finished.uncertainty is not None:
-        for name, estimate in finished.uncertainty.derived.items():
-            table.add_row(*_estimate_cells(name, estimate), "")
+    guesses = {item.name: _guess(item) for item in finished.problem.parameters.items}
+    for name, estimate in finished.estimates.items():
+        table.add_row(*_estimate_cells(name, estimate), guesses.get(name, ""))
     return table
+
+
+def _guess(item: Parameter) -> str:
+    if item.tied is not None:
+        return "tied"
+    return "fixed" if item.fixed else f"{item.guess:.5g}"
 
 
 def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
@@ -209,7 +219,7 @@ def check_table(findings: Findings) -> RenderableType:
         "The derivatives do not agree with differences at the guess."
     )  # fmt: skip
     return Group(
-        _body_section(findings),
+        *map(_body_section, findings.bodies),
         *_motion_section(findings),
         _measurements_section(findings),
         _solve_section(findings),
@@ -236,21 +246,20 @@ def _sentences(kind: str, sentences: tuple[str, ...], style: str) -> list[Render
     return [table] if sentences else []
 
 
-def _body_section(findings: Findings) -> RenderableType:
-    size = " × ".join(f"{1e3 * x:.4g}" for x in findings.size_m)
-    low, mean, high = (1e3 * x for x in findings.edges_m)
-    worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in findings.worst_elements)
+def _body_section(body: BodyFinding) -> RenderableType:
+    size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
+    low, mean, high = (1e3 * x for x in body.edges_m)
+    worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
     return _section(
         "Body",
         {
-            "object": f"{size} mm, {1e6 * findings.volume_m3:.4g} cm³, "
-            f"{1e3 * findings.mass_kg:.4g} g",
-            "mesh": f"{findings.nodes:,} nodes, {findings.elements:,} {findings.element}; edges "
+            "object": f"{size} mm, {1e6 * body.volume_m3:.4g} cm³, {1e3 * body.mass_kg:.4g} g",
+            "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
-            "quality": f"median {findings.median_element_quality:.2f}, worst in elements {worst}",
+            "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
             "guess": ", ".join(
                 f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
-                for name, value in findings.guess.items()
+                for name, value in body.guess.items()
             ),
         },
     )

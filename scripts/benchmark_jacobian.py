@@ -21,7 +21,7 @@ import numpy as np
 from collocation_sysid.fem.batched import available_threads
 from collocation_sysid.fem.body import Body
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "table1" / "problem.toml"
 PAPER_MS = 57.0
@@ -43,15 +43,15 @@ def main() -> None:
 
 def measure(path: Path, scheme: str, repeats: int) -> dict:
     """Medians in milliseconds, sides of one run interleaved."""
-    problem = load_problem(path)
+    problem = Problem.read(path)
     threads = max(2, available_threads())
     sides = {"simd_1_ms": ("simd", 1), f"simd_{threads}_ms": ("simd", threads)}
     sides["casadi_map_ms"] = ("casadi", 1)
     collocations = {}
     for side, (evaluator, count) in sides.items():
         body = Body(
-            problem.body.mesh,
-            density_kg_m3=problem.body.mass_kg / problem.body.mesh.volume_m3,
+            problem.bodies[0].mesh,
+            density_kg_m3=problem.bodies[0].mass_kg / problem.bodies[0].mesh.volume_m3,
             evaluator=evaluator,
             threads=count,
         )
@@ -74,8 +74,8 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
 
     return {
         "problem": {
-            "nodes": len(problem.body.nodes_m),
-            "elements": len(problem.body.cells),
+            "nodes": len(problem.bodies[0].nodes_m),
+            "elements": len(problem.bodies[0].cells),
             "steps": sum(s.grid_rows for s in first.segments),
             "scheme": scheme,
         },

@@ -97,17 +97,10 @@ def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) ->
     angle = np.arange(8) * 2.4
     height = np.linspace(0.04, 0.16, 8)
     places = np.column_stack([0.035 * np.cos(angle), 0.035 * np.sin(angle), height])
-    markers = Markers(
-        tuple(f"m{k}" for k in range(8)),
-        t_s,
-        np.zeros((steps, 8, 3)),
-        np.full(8, 0.001),
-        place_markers(places, body.nodes_m, body, "vertex"),
-    )
+    placement = place_markers(places, body.nodes_m, body, "vertex")
+    markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
-    experiment = Experiment(
-        "swing", body, t_s, (Grasp(held, poses),), markers, np.array([0.0, 0.0, -9.81])
-    )
+    experiment = Experiment(body, t_s, [Grasp(held, poses)], markers, name="swing")
     tracks = simulate(experiment, TRUTH, "midpoint").markers_m
     tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
     return with_markers(experiment, tracks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from collocation_sysid import load_problem, simulate
+from collocation_sysid import Problem, simulate
 from collocation_sysid.output.pictures import save_pictures, shapes
 from collocation_sysid.output.replay import Replay
 
@@ -13,7 +13,7 @@ TRUTH = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 
 
 
 def main() -> None:
-    problem = load_problem(ROOT / "problems" / "foam_cylinder" / "problem.toml")
+    problem = Problem.read(ROOT / "problems" / "foam_cylinder" / "problem.toml")
     experiment = problem.experiments[0]
     trajectory = simulate(experiment, TRUTH)
     seen = Replay.of(experiment)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 from collocation_sysid.study import Limits, PlannedRun, RunStore, plan_comparison, run_all
 from collocation_sysid.study.table import Row, Yardstick, run_row
 
@@ -82,7 +82,7 @@ def run_variants(
     planned: dict[str, list[PlannedRun]] = {}
     for variant in variants:
         overrides = variant.limited(time_s).overrides
-        problem = load_problem(path, overrides)
+        problem = Problem.read(path, overrides)
         count = max(1, round(starts * variant.share)) + 1 if starts else 1
         runs = plan_comparison(
             problem, [variant.method], overrides, count, spread, seed, truth=TRUTH

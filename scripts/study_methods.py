@@ -22,7 +22,7 @@ from synthetic import swing
 
 from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 from collocation_sysid.study.table import Row, wilson_interval
 from collocation_sysid.synthesis import write_data
 
@@ -148,7 +148,7 @@ def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
     path.write_text(PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8")
     at_truth = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
     (folder / "swing_markers.csv").unlink(missing_ok=True)
-    write_data(load_problem(path, at_truth, simulation=True), folder, "midpoint")
+    write_data(Problem.read(path, at_truth, simulation=True), folder, "midpoint")
     return path
 
 

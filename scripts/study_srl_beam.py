@@ -20,7 +20,7 @@ import numpy as np
 from get_srl_beam import FOLDER, ORIGIN_M, SIZE_M
 from numpy.typing import NDArray
 
-from collocation_sysid import Collocation, Problem, Solution, load_problem, solve
+from collocation_sysid import Collocation, Problem, Solution, solve
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.segment import Segment
@@ -68,7 +68,7 @@ def main() -> None:
 def load(source: Path, *overrides: str) -> Problem:
     """The shipped problem with the recordings of a folder, and other values for some keys."""
     files = [f"experiment.{t}.markers.file={source / f'beam_{t}_V2_a.c3d'}" for t in TRIALS]
-    return load_problem(FOLDER / "problem.toml", [*files, *overrides])
+    return Problem.read(FOLDER / "problem.toml", [*files, *overrides])
 
 
 @cache
@@ -125,7 +125,7 @@ def refinement(source: Path) -> None:
             box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
             here = load(source, *near, f"object.mesh={mesh}", f"object.element={element}")
             bricks = " x ".join(map(str, divisions))
-            report(f"{element} {bricks}, {len(here.body.nodes_m)} nodes", fit(here))
+            report(f"{element} {bricks}, {len(here.bodies[0].nodes_m)} nodes", fit(here))
 
 
 def validation(source: Path) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from synthetic import swing
 
-from collocation_sysid.experiment import Experiment, Grasp, Markers, place_markers
+from collocation_sysid.experiment import Experiment, Grasp, Markers
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -99,12 +99,10 @@ def hanging_cylinder(layers: int, steps: int, scheme: str, noise_m: float = 0.0)
     heights = body.nodes_m[:, 2]
     on_side = np.linalg.norm(body.nodes_m[:, :2], axis=1) > RADIUS_M / 2
     marked = np.flatnonzero(on_side & (heights > 0.2 * HEIGHT_M))[::5]
-    names = tuple(f"m{k}" for k in range(len(marked)))
-    placement = place_markers(body.nodes_m[marked], body.nodes_m, body)
-    nowhere = np.zeros((steps, len(names), 3))
-    markers = Markers(names, t_s, nowhere, np.full(len(names), SIGMA_M), placement)
+    nowhere = np.zeros((steps, len(marked), 3))
+    markers = Markers(t_s, nowhere, SIGMA_M, places_m=body.nodes_m[marked])
     grasp = Grasp(np.flatnonzero(heights < 1e-9), poses)
-    experiment = Experiment("swing", body, t_s, (grasp,), markers, np.array([0.0, 0.0, -9.81]))
+    experiment = Experiment(body, t_s, [grasp], markers, name="swing")
     tracks = simulate(experiment, TRUTH, scheme).markers_m
     noise = np.random.default_rng(1).normal(size=tracks.shape) * noise_m
     return with_markers(experiment, tracks + noise)

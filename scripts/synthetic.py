@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence, write_poses_csv
 from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 
 HANGING = Rotation.from_rotvec([np.pi, 0, 0])
 
@@ -65,7 +65,7 @@ def unmeasured(problem: Path, poses: str, logged: PoseSequence) -> Experiment:
     write_poses_csv(problem.parent / poses, logged)
     for tracks in problem.parent.glob("*_markers.csv"):
         tracks.unlink()
-    return load_problem(problem, simulation=True).experiments[0]
+    return Problem.read(problem, simulation=True).experiments[0]
 
 
 def measure(

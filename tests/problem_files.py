@@ -17,7 +17,7 @@ from collocation_sysid import cli
 from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 from collocation_sysid.synthesis import write_data
 
 SIZE_M, DIVISIONS = (0.06, 0.06, 0.09), (2, 2, 3)
@@ -74,7 +74,7 @@ def write_problem(folder: Path, steps: dict[str, int], validation: str = "") -> 
         text += added.replace("grasp", "validation = true\ngrasp") if name == validation else added
     file = folder / "problem.toml"
     file.write_text(text)
-    write_data(load_problem(file, AT_TRUTH, simulation=True), folder, "midpoint")
+    write_data(Problem.read(file, AT_TRUTH, simulation=True), folder, "midpoint")
     return file
 
 

@@ -18,7 +18,6 @@ from collocation_sysid.experiment import (
     Nuisance,
     PointMass,
     PoseSequence,
-    place_markers,
 )
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
@@ -80,10 +79,9 @@ def vertex_markers(body: Body, nodes: ArrayLike, t_s: np.ndarray) -> Markers:
 
 def point_markers(body: Body, points_m: np.ndarray, t_s: np.ndarray) -> Markers:
     """Markers at points of the undeformed body, not measured yet."""
-    names = tuple(f"m{k}" for k in range(len(points_m)))
+    names = [f"m{k}" for k in range(len(points_m))]
     nowhere = np.zeros((len(t_s), len(points_m), 3))
-    placement = place_markers(points_m, body.nodes_m, body)
-    return Markers(names, t_s, nowhere, np.full(len(names), 1e-3), placement)
+    return Markers(t_s, nowhere, 1e-3, names, points_m).on(body)
 
 
 def times(steps: int, timestep_s: float = 0.01) -> np.ndarray:
@@ -96,7 +94,7 @@ def hung_cube(steps: int = 10, divisions: tuple[int, ...] = (2, 2, 2), **changes
     body, t_s = box(divisions=divisions), times(steps)
     grasp = Grasp(nodes_where(body, 2, EDGE_M), smooth_poses(t_s))
     markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
-    return _experiment("hung cube", body, t_s, (grasp,), markers, **changes)
+    return Experiment(body, t_s, [grasp], markers, name="hung cube", **changes)
 
 
 def released_cube(steps: int = 10) -> Experiment:
@@ -104,7 +102,7 @@ def released_cube(steps: int = 10) -> Experiment:
     body, t_s = box(), times(steps)
     grasp = Grasp(nodes_where(body, 2, EDGE_M), PoseSequence.fixed())
     markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
-    return _experiment("released cube", body, t_s, (grasp,), markers, start="undeformed")
+    return Experiment(body, t_s, [grasp], markers, name="released cube", start="undeformed")
 
 
 def bar_in_two_hands(steps: int = 10) -> Experiment:
@@ -114,7 +112,7 @@ def bar_in_two_hands(steps: int = 10) -> Experiment:
     moving = Grasp(nodes_where(body, 0, 0.15), smooth_poses(t_s))
     inside = np.flatnonzero((body.nodes_m[:, 0] > 0.01) & (body.nodes_m[:, 0] < 0.14))
     markers = vertex_markers(body, inside, t_s)
-    return _experiment("bar in two hands", body, t_s, (still, moving), markers)
+    return Experiment(body, t_s, [still, moving], markers, name="bar in two hands")
 
 
 def cube_with_gaps(steps: int = 12) -> Experiment:
@@ -125,8 +123,8 @@ def cube_with_gaps(steps: int = 12) -> Experiment:
     markers = point_markers(hung.body, points, hung.t_s)
     tracks = np.zeros_like(markers.positions_m)
     tracks[rng.random(tracks.shape[:2]) < 0.25] = np.nan
-    unmeasured = Markers(markers.names, hung.t_s, tracks, markers.sigma_m, markers.placement)
-    return _experiment("cube with gaps", hung.body, hung.t_s, hung.grasps, unmeasured)
+    unmeasured = replace(markers, positions_m=tracks)
+    return Experiment(hung.body, hung.t_s, hung.grasps, unmeasured, name="cube with gaps")
 
 
 def quadratic_bar(steps: int = 10) -> Experiment:
@@ -134,7 +132,8 @@ def quadratic_bar(steps: int = 10) -> Experiment:
     body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), "tet10"), times(steps)
     grasp = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
     points = np.vstack([body.nodes_m[-4:], [[0.13, 0.01, 0.02], [0.14, 0.03, 0.04]]])
-    return _experiment("quadratic bar", body, t_s, (grasp,), point_markers(body, points, t_s))
+    markers = point_markers(body, points, t_s)
+    return Experiment(body, t_s, [grasp], markers, name="quadratic bar")
 
 
 def bar_let_go(steps: int = 10) -> Experiment:
@@ -204,8 +203,3 @@ def noisy(
 def relative_errors(solution: Solution) -> np.ndarray:
     """Errors of the four parameters over `TRUTH`."""
     return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
-
-
-def _experiment(name, body, t_s, grasps, markers, **changes) -> Experiment:
-    gravity = changes.pop("gravity_m_s2", np.array(GRAVITY_M_S2))
-    return Experiment(name, body, t_s, grasps, markers, gravity, **changes)

@@ -29,7 +29,7 @@ from problem_files import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
@@ -654,6 +654,6 @@ def test_every_key_refuses_what_it_cannot_be(tiny_problem, value):
     assert len(keys) > 40
     for key in keys:
         with pytest.raises(InputError) as caught:
-            load_problem(file, [f"{key}={value}"])
+            Problem.read(file, [f"{key}={value}"])
         assert str(caught.value).startswith(f"{file}: ")
         assert not [word for word in JARGON if word in str(caught.value)], caught.value

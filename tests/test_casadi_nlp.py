@@ -20,7 +20,7 @@ from collocation_sysid.methods.casadi_nlp import PLUGINS, REFUSED, SqpMethod, wh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 
 
 @cache
@@ -231,7 +231,7 @@ def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
 def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 4})
     chosen = ["solver.method=casadi:sqpmethod", "solver.casadi:sqpmethod.casadi.min_iter=1"]
-    solution = solve_problem(load_problem(file, chosen))
+    solution = solve_problem(Problem.read(file, chosen))
     assert solution.status.converged
     assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)
 
@@ -246,4 +246,4 @@ def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
 def test_a_problem_file_is_told_why_a_solver_is_not_offered(tmp_path, name: str, message: str):
     file = write_problem(tmp_path, {"swing": 4})
     with pytest.raises(InputError, match=message):
-        load_problem(file, [f"solver.method={name}"])
+        Problem.read(file, [f"solver.method={name}"])

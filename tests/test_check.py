@@ -18,8 +18,7 @@ from collocation_sysid.check.motion import motion_warnings
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.problem import load_problem
-from collocation_sysid.run import build_collocation
+from collocation_sysid.problem import Problem
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
 SILICONE = (
@@ -33,7 +32,7 @@ COMPRESSIBLE = np.array([100.0, 100.0, 0.0, 0.0])
 
 
 def checked(folder: Path, *overrides: str) -> Findings:
-    return check_problem(load_problem(folder / "problem.toml", overrides))
+    return check_problem(Problem.read(folder / "problem.toml", overrides))
 
 
 def about(findings: Findings, *words: str) -> str:
@@ -201,7 +200,7 @@ def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme
     monkeypatch.setattr("collocation_sysid.check.SAMPLES", 5)
     overrides = (f"transcription.scheme={scheme}", "transcription.substeps=2")
     findings = checked(tiny, *overrides)
-    whole = build_collocation(load_problem(tiny / "problem.toml", overrides))
+    whole = Problem.read(tiny / "problem.toml", overrides).collocation()
     assert findings.jacobian_nonzeros == len(whole.jacobian_structure[1])
     assert findings.hessian_nonzeros == len(whole.hessian_structure[1])
 

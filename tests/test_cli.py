@@ -31,7 +31,8 @@ import collocation_sysid as cs
 from collocation_sysid import terminal
 from collocation_sysid.experiment import read_markers, read_poses
 from collocation_sysid.methods.solution import Iteration
-from collocation_sysid.problem import ProblemFile, read_problem_file
+from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.schema import ProblemFile
 
 ROLLOUT = import_module("collocation_sysid.rollout")
 RESULT_KEYS = {
@@ -222,7 +223,7 @@ def test_an_interruption_before_the_first_iterate_writes_nothing(tiny, monkeypat
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("collocation_sysid.problem.load_problem", interrupt)
+    monkeypatch.setattr("collocation_sysid.problem.Problem.read", interrupt)
     before = contents(tiny)
     assert run_command("solve", "problem.toml", "--out", "run").code == 130
     assert contents(tiny) == before
@@ -256,7 +257,7 @@ def test_a_real_process_keeps_its_streams_apart(tiny):
 def test_a_terminal_shows_iterations_as_they_come(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
-    with terminal.Progress(console, cs.load_problem("problem.toml")) as progress:
+    with terminal.Progress(console, cs.Problem.read("problem.toml")) as progress:
         progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, TRUTH, 0.5))
         progress.say("checking")
     assert "violation N" in screen.getvalue()
@@ -277,7 +278,7 @@ def test_notes_on_the_data_go_to_stderr(tiny, options, shown):
 def test_simulation_writes_what_a_laboratory_would(tiny):
     remove("swing_markers.csv")(tiny)
     expected = cs.simulate(
-        cs.load_problem("problem.toml", AT_TRUTH, simulation=True).experiments[0], TRUTH
+        cs.Problem.read("problem.toml", AT_TRUTH, simulation=True).experiments[0], TRUTH
     )
     outcome = run_command(
         "simulate", "problem.toml", "--out", "data", "--frames", *settings(*AT_TRUTH)
@@ -340,7 +341,8 @@ def test_check_reports_sizes_and_derivatives(tiny):
     outcome = run_command("check", "problem.toml", "--json")
     found = json.loads(outcome.out)
     assert outcome.code == 0
-    assert (found["nodes"], found["elements"], found["samples"]) == (36, 72, 27)
+    (body,) = found["bodies"]
+    assert (body["nodes"], body["elements"], found["samples"]) == (36, 72, 27)
     assert max(found["jacobian_error"], found["hessian_error"]) < 1e-6
     assert "derivatives agree" in run_command("check", "problem.toml").out
     assert contents(tiny) == before
@@ -415,7 +417,7 @@ def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
 
 
 def test_the_same_from_python(tiny):
-    problem = cs.load_problem("problem.toml")
+    problem = cs.Problem.read("problem.toml")
     solution = cs.solve(problem, method="interior-point")
     assert solution.status.converged
     assert solution.parameters == pytest.approx(TRUTH, rel=1e-5)
@@ -424,14 +426,12 @@ def test_the_same_from_python(tiny):
     np.testing.assert_allclose(trajectory.markers_m, measured, atol=1e-8)
 
 
-def test_options_of_the_method_are_given_by_name(tiny):
-    problem = cs.load_problem("problem.toml")
+def test_a_method_is_given_with_its_options(tiny):
+    problem = cs.Problem.read("problem.toml")
     seen: list[Iteration] = []
-    solution = cs.solve(problem, watch=seen.append, max_iterations=1)
+    solution = cs.solve(problem, cs.InteriorPoint(max_iterations=1), seen.append)
     assert solution.status is cs.Status.ITERATION_LIMIT
     assert len(seen) == len(solution.history) == 2
-    with pytest.raises(cs.InputError, match=r"no option 'max_iter'.*max_iterations"):
-        cs.solve(problem, max_iter=1)
     with pytest.raises(cs.InputError, match=r"found 'newton'.*interior-point"):
         cs.solve(problem, "newton")
 
@@ -439,19 +439,19 @@ def test_options_of_the_method_are_given_by_name(tiny):
 def test_reduced_space_is_the_method_unless_another_is_named(tiny):
     text = Path("problem.toml").read_text()
     Path("problem.toml").write_text(text.replace('method = "interior-point"', ""))
-    named = cs.solve(cs.load_problem("problem.toml"), "interior-point")
-    default = cs.solve(cs.load_problem("problem.toml"))
+    named = cs.solve(cs.Problem.read("problem.toml"), "interior-point")
+    default = cs.solve(cs.Problem.read("problem.toml"))
     assert default.method == "reduced-space"
     np.testing.assert_allclose(default.theta, named.theta, rtol=1e-5)
 
 
 def test_each_method_has_the_options_of_its_own_table(tiny):
     tables = ["solver.interior-point.hessian=limited-memory", "solver.reduced-space.ladder=[1.0]"]
-    problem = cs.load_problem("problem.toml", tables)
+    problem = cs.Problem.read("problem.toml", tables)
     solution = cs.solve(problem, "reduced-space")
     assert solution.status.converged
-    assert problem.file.solver.method_named("interior-point").hessian == "limited-memory"
-    assert problem.file.solver.method_named("reduced-space").hessian == "gauss-newton"
+    assert problem.methods["interior-point"].hessian == "limited-memory"
+    assert problem.methods["reduced-space"].hessian == "gauss-newton"
 
 
 def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):
@@ -469,7 +469,7 @@ def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):
 
 
 def test_a_run_from_python_is_written_like_any_other(tiny):
-    finished = cs.run(cs.load_problem("problem.toml"))
-    folder = cs.write_run(finished, tiny / "mine", frames=False)
+    finished = cs.run(cs.Problem.read("problem.toml"))
+    folder = finished.save(tiny / "mine", frames=False)
     assert result_in(folder)["status"] == "converged"
     assert not (folder / "frames").exists()

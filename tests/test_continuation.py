@@ -29,7 +29,7 @@ from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 from collocation_sysid.run import solve
 
 SHARES = (0.5, 1.0)
@@ -193,7 +193,7 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
         "solver.continuation.stage.gradient=adjoint",
         "solver.continuation.stage.tolerance=1e-9",
     ]
-    solution = solve(load_problem(file, chosen))
+    solution = solve(Problem.read(file, chosen))
     assert solution.status.converged
     assert solution.method == "continuation"
     assert [note.split(":")[0] for note in solution.notes[:2]] == [
@@ -214,4 +214,4 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
 def test_wrong_stages_of_a_problem_file_are_refused(tmp_path, chosen: str, message: str):
     file = write_problem(tmp_path, {"swing": 8})
     with pytest.raises(InputError, match=re.escape(message)):
-        solve(load_problem(file, ["solver.method=continuation", f"solver.continuation.{chosen}"]))
+        solve(Problem.read(file, ["solver.method=continuation", f"solver.continuation.{chosen}"]))

@@ -13,7 +13,7 @@ import pytest
 from problem_files import EXPERIMENT, PROBLEM, run_command
 from pydantic import ValidationError
 
-from collocation_sysid.problem import ProblemFile
+from collocation_sysid.problem.schema import ProblemFile
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]

@@ -125,12 +125,11 @@ def thrown_box(steps: int = 40, gravity_m_s2: Sequence[float] = GRAVITY_M_S2) ->
     arm = body.nodes_m - body.nodes_m.mean(axis=0)
     velocity = np.array([0.3, 0.2, 1.0]) + np.cross([2.0, -3.0, 1.0], arm)
     return Experiment(
-        "flight",
         body,
         t_s,
-        (),
+        [],
         vertex_markers(body, [0], t_s),
-        np.array(gravity_m_s2),
+        gravity_m_s2,
         start="given",
         start_positions_m=body.nodes_m + arm * [0.0, 0.0, 0.05],
         start_velocities_m_s=velocity,
@@ -176,10 +175,9 @@ def plucked_bar(steps: int = 60) -> Experiment:
     body, t_s = box((0.04, 0.04, 0.12), (1, 1, 3)), times(steps, 0.005)
     velocity = np.outer(body.nodes_m[:, 2] / 0.12, [0.4, 0.1, -0.2])
     return Experiment(
-        "plucked bar",
         body,
         t_s,
-        (Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed()),),
+        [Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())],
         vertex_markers(body, nodes_where(body, 2, 0.12), t_s),
         np.zeros(3),
         start="given",

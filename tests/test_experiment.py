@@ -37,7 +37,7 @@ def lifted(nodes, speed_m_s=1.0):
 def markers(t_s=TIMES, node_count=5, present=True):
     placement = Placement(np.array([[3]]), np.ones((1, 1)), np.zeros(1), node_count)
     positions = np.full((len(t_s), 1, 3), 0.1 if present else np.nan)
-    return Markers(("tip",), t_s, positions, np.array([1e-3]), placement)
+    return Markers(t_s, positions, 1e-3, ["tip"], placement=placement)
 
 
 def experiment(**changes) -> Experiment:

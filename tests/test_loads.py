@@ -54,12 +54,10 @@ def test_a_heavy_mass_swings_as_on_a_spring(integrator: str):
     body, t_s = box(), times(110, 0.0004)
     mass, stiff = 0.2, {**UNDAMPED, "lambda_pa": 0.0, "mu_pa": 3e4}
     spring = Experiment(
-        "spring",
         body,
         t_s,
-        (Grasp(nodes_where(body, 2, EDGE_M), PoseSequence.fixed()),),
+        [Grasp(nodes_where(body, 2, EDGE_M), PoseSequence.fixed())],
         vertex_markers(body, TIP, t_s),
-        np.array(GRAVITY_M_S2),
         start="undeformed",
         masses=(PointMass(TIP, mass),),
     )

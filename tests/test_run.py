@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from problem_files import TRUTH, run_command, settings, write_problem
 
-from collocation_sysid import load_problem, run
+from collocation_sysid import Problem, run
 from collocation_sysid.experiment import read_markers, write_markers_csv
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.output.record import result
@@ -57,7 +57,7 @@ def finished(two: Path):
         "solver.method=reduced-space",
         *(f"experiment.{name}.markers.sigma_m=2e-4" for name in ("swing", "turn")),
     ]
-    return run(load_problem(two / "problem.toml", overrides))
+    return run(Problem.read(two / "problem.toml", overrides))
 
 
 def test_unknowns_are_reported_with_unit_prior_and_error(finished):

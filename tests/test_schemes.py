@@ -18,7 +18,7 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp
-from collocation_sysid.nlp.schemes import SCHEMES, STATIC, Stencil, scheme_named
+from collocation_sysid.nlp.schemes import SCHEMES, STATIC, Stencil, as_scheme
 from collocation_sysid.nlp.simulation import simulate
 
 REGULAR = {name: scheme.regular for name, scheme in SCHEMES.items()}
@@ -69,7 +69,7 @@ def test_second_order_schemes_centre_velocity_and_force_where_the_inertia_is(nam
 
 
 def test_row_zero_is_the_static_problem():
-    scheme = scheme_named("midpoint")
+    scheme = as_scheme("midpoint")
     assert scheme.stencil(0) is STATIC
     assert scheme.stencil(1) is scheme.start[0]
     assert scheme.stencil(2) is scheme.stencil(99) is scheme.regular
@@ -85,22 +85,22 @@ def test_reach_is_the_oldest_point_in_a_row(name: str, reach: int):
 
 def test_unknown_scheme_lists_those_there_are():
     with pytest.raises(InputError, match=r"no scheme 'rk4'.*backward-euler, midpoint, bdf2"):
-        scheme_named("rk4")
+        as_scheme("rk4")
 
 
 def test_unknown_start_rule_lists_those_there_are():
     with pytest.raises(InputError, match=r"no start rule 'soft'.*standard, paper"):
-        scheme_named("midpoint", "soft")
+        as_scheme("midpoint", "soft")
 
 
 @pytest.mark.parametrize("name", ["midpoint", "bdf2"])
 def test_the_papers_start_rule_belongs_to_backward_euler(name: str):
     with pytest.raises(InputError, match="'paper' belongs to scheme 'backward-euler'"):
-        scheme_named(name, "paper")
+        as_scheme(name, "paper")
 
 
 def test_the_papers_start_rule_drops_the_first_inertia_only():
-    paper, standard = scheme_named("backward-euler", "paper"), scheme_named("backward-euler")
+    paper, standard = as_scheme("backward-euler", "paper"), as_scheme("backward-euler")
     assert paper.regular == standard.regular
     assert paper.stencil(1) == replace(standard.stencil(1), s=(0.0, 0.0), r=0.0)
 
@@ -129,7 +129,7 @@ def swung_bar(steps: int, start: str) -> Experiment:
     grasp = Grasp(nodes_where(body, 2, 0.0), smooth_poses(fine_s, angular_frequency_rad_s=30.0))
     markers = vertex_markers(body, nodes_where(body, 2, 0.12), t_s)
     gravity = np.array([0.0, 0.0, 9.81])
-    return Experiment("bar", body, t_s, (grasp,), markers, gravity, start=start)  # type: ignore[arg-type]
+    return Experiment(body, t_s, [grasp], markers, gravity, start=start)  # type: ignore[arg-type]
 
 
 def measured_order(start: str, solve: Callable[[Experiment], np.ndarray]) -> float:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collocation_sysid import Problem, load_problem, run, solve, write_run
+from collocation_sysid import Problem, run, solve
 from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
@@ -33,8 +33,8 @@ SWAPPED = {"low_1", "mid_1", "tip_1", "tip_3"}
 
 def solved(path: Path, folder: Path, method: str) -> dict:
     """The content of result.json."""
-    finished = run(load_problem(path), method)
-    return json.loads((write_run(finished, folder, frames=False) / "result.json").read_text())
+    finished = run(Problem.read(path), method)
+    return json.loads((finished.save(folder, frames=False) / "result.json").read_text())
 
 
 def relative_errors(result: dict, truth: dict) -> np.ndarray:
@@ -77,7 +77,7 @@ def measured_beam(file: str) -> Problem:
         files[table["name"]] = RECORDINGS / table["markers"]["file"]
     if not all(recording.is_file() for recording in files.values()):
         pytest.skip("needs the measured data: python scripts/get_srl_beam.py")
-    return load_problem(
+    return Problem.read(
         path, [f"experiment.{name}.markers.file={file}" for name, file in files.items()]
     )
 
@@ -119,7 +119,7 @@ def test_one_material_fits_the_measured_beam_under_three_loads():
 @cache
 def noisy_run() -> Run:
     """The noisy cylinder as its problem file has it, with both remedies."""
-    return run(load_problem(PROBLEMS / "noisy_cylinder" / "problem.toml"))
+    return run(Problem.read(PROBLEMS / "noisy_cylinder" / "problem.toml"))
 
 
 @cache
@@ -128,13 +128,13 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
     if huber and offsets:
         return noisy_run().solution
     problem = noisy_run().problem
-    (experiment,), transcription = problem.experiments, problem.file.transcription
+    (experiment,) = problem.experiments
     collocation = Collocation(
         [experiment if offsets else replace(experiment, nuisance=Nuisance())],
         problem.parameters,
-        transcription.scheme,
-        transcription.substeps,
-        huber=problem.file.solver.huber if huber else None,
+        problem.scheme,
+        problem.substeps,
+        huber=problem.huber if huber else None,
     )
     return ReducedSpace()(collocation)
 
@@ -193,7 +193,7 @@ def test_the_misplaced_marker_is_found_where_it_is_glued():
 
 
 def test_the_noisy_cylinders_gaps_and_swaps_are_reported(tmp_path: Path):
-    folder = write_run(noisy_run(), tmp_path / "run", frames=False)
+    folder = noisy_run().save(tmp_path / "run", frames=False)
     result = json.loads((folder / "result.json").read_text())
     assert result["fit"]["experiments"]["swing"]["missing"] == 58
     assert any("tip_1: 20 of 81 samples missing" in note for note in result["notes"])

@@ -38,7 +38,7 @@ def hanging_bar() -> Experiment:
     body, t_s = box((0.04, 0.04, 0.12), (2, 2, 6)), times(2)
     grasp = Grasp(nodes_where(body, 2, 0.12), PoseSequence.fixed())
     markers = vertex_markers(body, [0], t_s)
-    return Experiment("bar", body, t_s, (grasp,), markers, np.array(GRAVITY_M_S2))
+    return Experiment(body, t_s, [grasp], markers, name="bar")
 
 
 def jerked_cube(sway_m: float, timestep_s: float, **changes) -> Experiment:

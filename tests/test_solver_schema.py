@@ -12,7 +12,8 @@ from problem_files import EXPERIMENT, PROBLEM, run_command
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.options import documented
-from collocation_sysid.problem import ProblemFile, read_problem_file
+from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.problem.solver_schema import SolverSection
 
 each_method = pytest.mark.parametrize("method", METHODS)
@@ -38,7 +39,7 @@ def test_the_schema_tells_what_the_method_does_by_default(method: str):
 
 @each_method
 def test_without_a_table_a_method_has_its_defaults(method: str):
-    assert solver_of("").method_named(method) == METHODS[method]()
+    assert solver_of("").methods[method] == METHODS[method]()
 
 
 def test_tables_of_several_methods_stand_side_by_side():
@@ -57,17 +58,11 @@ def test_tables_of_several_methods_stand_side_by_side():
         """
     )
     assert solver.method == "penalty"
-    assert solver.method_named("penalty").rho == 3.0
-    assert solver.method_named("augmented-lagrangian").rho == 1e5
-    assert solver.method_named("reduced-space").ladder == (0.5, 1.0)
-    assert solver.method_named("casadi:sqpmethod").casadi == {"min_iter": 1}
-    assert solver.method_named("continuation").method == METHODS["shooting"](gradient="adjoint")
-
-
-def test_options_given_by_name_win_over_those_of_the_table():
-    solver = solver_of("[solver.penalty]\nrho = 3.0\nviolation = 0.1")
-    changed = solver.method_named("penalty", rho=5.0)
-    assert (changed.rho, changed.violation) == (5.0, 0.1)
+    assert solver.methods["penalty"].rho == 3.0
+    assert solver.methods["augmented-lagrangian"].rho == 1e5
+    assert solver.methods["reduced-space"].ladder == (0.5, 1.0)
+    assert solver.methods["casadi:sqpmethod"].casadi == {"min_iter": 1}
+    assert solver.methods["continuation"].method == METHODS["shooting"](gradient="adjoint")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from problem_files import TRUTH
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 from collocation_sysid.study import (
     Limits,
     PlannedRun,
@@ -156,7 +156,7 @@ def test_a_truth_that_cannot_be_used_is_refused(given, message):
 
 
 def test_every_method_has_the_same_starts(tiny):
-    problem = load_problem("problem.toml")
+    problem = Problem.read("problem.toml")
     planned = plan_comparison(problem, ["interior-point", "reduced-space"], starts=3, seed=4)
     assert [run.label for run in planned] == [
         f"{method}, start {start}"
@@ -170,7 +170,7 @@ def test_every_method_has_the_same_starts(tiny):
 
 
 def test_more_starts_are_further_ones(tiny):
-    problem = load_problem("problem.toml")
+    problem = Problem.read("problem.toml")
     few, many = (plan_comparison(problem, ["reduced-space"], starts=n) for n in (2, 5))
     assert many[:2] == few
     others = plan_comparison(problem, ["reduced-space"], starts=2, seed=1)
@@ -179,7 +179,7 @@ def test_more_starts_are_further_ones(tiny):
 
 
 def test_starts_lie_around_the_truth_within_the_bounds(tiny):
-    problem = load_problem("problem.toml", ["parameters.mu_pa.upper=310"])
+    problem = Problem.read("problem.toml", ["parameters.mu_pa.upper=310"])
     overrides = ["parameters.mu_pa.upper=310"]
     planned = plan_comparison(problem, ["reduced-space"], overrides, 40, spread=2.0, truth=TRUTH)
     guesses = np.array([list(run.guess.values()) for run in planned[1:]])
@@ -191,14 +191,14 @@ def test_starts_lie_around_the_truth_within_the_bounds(tiny):
 
 
 def test_starts_lie_around_the_guess_where_the_truth_is_unknown(tiny):
-    problem = load_problem("problem.toml")
+    problem = Problem.read("problem.toml")
     start = plan_comparison(problem, ["reduced-space"], starts=2, spread=1.0)[1]
     assert start.guess == pytest.approx({item.name: item.guess for item in problem.parameters.free})
 
 
 def test_fixed_parameters_stay(tiny):
     fixed = ["parameters.mu_pa={fixed = 300}"]
-    problem = load_problem("problem.toml", fixed)
+    problem = Problem.read("problem.toml", fixed)
     start = plan_comparison(problem, ["reduced-space"], fixed, starts=2)[1]
     assert list(start.guess) == ["lambda_pa", "gamma_r_s", "gamma_m_1_s"]
     assert not any("mu_pa.guess" in override for override in start.overrides)
@@ -206,7 +206,7 @@ def test_fixed_parameters_stay(tiny):
 
 def test_other_data_are_other_runs(tiny):
     def key(*overrides: str) -> str:
-        problem = load_problem("problem.toml", overrides)
+        problem = Problem.read("problem.toml", overrides)
         return plan_comparison(problem, ["reduced-space"], overrides)[0].key
 
     before = key()
@@ -261,7 +261,7 @@ def test_keys_are_shortened_while_they_differ():
 )
 def test_starts_that_cannot_be_are_refused(tiny, options, where):
     with pytest.raises(InputError, match=f"^{where}: found"):
-        plan_comparison(load_problem("problem.toml"), ["reduced-space"], **options)
+        plan_comparison(Problem.read("problem.toml"), ["reduced-space"], **options)
 
 
 # One run's process --------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
             raise ZeroDivisionError("nothing to divide by")
 
     monkeypatch.setitem(METHODS, "reduced-space", Broken)
-    planned = plan_comparison(load_problem("problem.toml"), ["reduced-space"])[0].as_dict()
+    planned = plan_comparison(Problem.read("problem.toml"), ["reduced-space"])[0].as_dict()
     record = worker.attempt(planned)
     assert record["outcome"] == "error"
     assert record["message"] == "ZeroDivisionError: nothing to divide by"

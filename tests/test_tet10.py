@@ -22,7 +22,7 @@ from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.output.writers import write_frames
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 from collocation_sysid.synthesis import write_data
 
 TET10 = element_named("tet10")
@@ -342,9 +342,9 @@ def test_frames_are_quadratic_and_read_back(tmp_path, rng):
 
 def test_a_problem_with_quadratic_elements_is_fitted(tiny):
     elements = ["object.element=tet10"]
-    problem = load_problem(tiny / "problem.toml", [*AT_TRUTH, *elements], simulation=True)
+    problem = Problem.read(tiny / "problem.toml", [*AT_TRUTH, *elements], simulation=True)
     held = problem.experiments[0].grasps[0].nodes
-    np.testing.assert_array_equal(held, np.flatnonzero(problem.body.nodes_m[:, 2] > 0.0899))
+    np.testing.assert_array_equal(held, np.flatnonzero(problem.bodies[0].nodes_m[:, 2] > 0.0899))
     assert len(held) == 25
     (tiny / "swing_markers.csv").unlink()  # of linear elements
     write_data(problem, tiny, "midpoint")
@@ -355,9 +355,9 @@ def test_a_problem_with_quadratic_elements_is_fitted(tiny):
     result = json.loads((tiny / "run" / "result.json").read_text())
     for name, value in TRUTH.items():
         assert result["parameters"][name]["value"] == pytest.approx(value, rel=1e-5)
-    assert result["problem"]["nodes"] == len(problem.body.nodes_m)
+    assert result["problem"]["nodes"] == len(problem.bodies[0].nodes_m)
     frame = meshio.read(next((tiny / "run").rglob("frame_0000.vtu")))
-    np.testing.assert_array_equal(frame.cells_dict["tetra10"], problem.body.cells)
+    np.testing.assert_array_equal(frame.cells_dict["tetra10"], problem.bodies[0].cells)
 
 
 def test_a_written_body_is_the_same_body_when_read(tmp_path):

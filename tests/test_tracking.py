@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import read_markers, read_poses, write_markers_csv
-from collocation_sysid.problem import load_problem
+from collocation_sysid.problem import Problem
 
 MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
 BASE_M = {
@@ -28,7 +28,7 @@ def places(names=BASE_M) -> str:
 
 
 def load(folder: Path, *overrides: str, **options):
-    return load_problem(folder / "problem.toml", overrides, **options)
+    return Problem.read(folder / "problem.toml", overrides, **options)
 
 
 def driven_by_markers(folder: Path, further: str = "", names=BASE_M) -> None:

@@ -12,20 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..fem.body import Body
-from ..fem.moduli import engineering
+from ..methods.method import Method
+from ..methods.reduced_space import ReducedSpace
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
-from ..nlp.schemes import scheme_named
+from ..nlp.factorisation import Choice
+from ..nlp.schemes import as_scheme
 from ..problem import Problem
-from ..run import build_collocation
 from .cost import Cost, cost_notes, cost_warnings, costs
-from .derivatives import SAMPLES, derivative_errors, shortened
-from .elements import ElementShape, element_warnings, slenderness, worst_elements
+from .derivatives import SAMPLES, derivative_errors, first_samples, shortened
+from .elements import ElementShape
 from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
 from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
+from .shape import BodyFinding, body_finding
 
 __all__ = [
+    "BodyFinding",
     "Cost",
     "ElementShape",
     "Findings",
@@ -47,13 +49,7 @@ class Findings:
 
     Attributes
     ----------
-    element : str
-    size_m : extents along the axes
-    edges_m : shortest, mean and longest edge
-    worst_elements : tuple of ElementShape, worst first
-    cells_across : float
-        Elements that share the body's thickness.
-    guess : mapping of the constants, and of E and ν at small strain, to their values at the guess
+    bodies : tuple of BodyFinding
     samples, missing : int
         Marker samples that are there and that are not, of all experiments.
     largest_marker_distance_m : float
@@ -69,18 +65,7 @@ class Findings:
     notes, warnings : tuple of str
     """
 
-    nodes: int
-    elements: int
-    element: str
-    volume_m3: float
-    mass_kg: float
-    size_m: tuple[float, float, float]
-    edges_m: tuple[float, float, float]
-    smallest_element_quality: float
-    median_element_quality: float
-    worst_elements: tuple[ElementShape, ...]
-    cells_across: float
-    guess: dict[str, float]
+    bodies: tuple[BodyFinding, ...]
     experiments: int
     timesteps: int
     samples: int
@@ -113,51 +98,37 @@ class Findings:
 
 def check_problem(problem: Problem) -> Findings:
     """Validate a loaded problem further and measure it."""
-    collocation = build_collocation(problem)
-    parameters, body = problem.parameters, problem.body
-    theta = body.theta(parameters.guesses)
+    collocation = problem.collocation()
+    guesses = problem.parameters.guesses
     z, start_notes = initial_variables(collocation)
     positions = collocation.unpack(z)[1]
-    short = build_collocation(shortened(problem, SAMPLES))
+    short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
     jacobian, hessian = _nonzeros(problem)
-    solver = problem.file.solver
-    factorisation = solver.method_named("reduced-space").factorisation
-    found_costs = costs(collocation, z, jacobian + hessian, factorisation)
-    chosen = next((cost for cost in found_costs if cost.method == solver.method), None)
+    method = _name(problem.method)
+    found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
+    chosen = next((cost for cost in found_costs if cost.method == method), None)
 
-    quality, worst, shape = body.mesh.quality(), worst_elements(body.mesh), slenderness(body.mesh)
+    bodies = _bodies(problem)
     recordings = _recordings(problem, collocation, positions)
-    scheme = scheme_named(collocation.scheme)
+    scheme = as_scheme(collocation.scheme)
     motions = tuple(
-        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(parameters.guesses))
+        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
         for s in collocation.segments
     )
-    extents = np.ptp(body.mesh.bounds_m, axis=0)
-    diagonal_m = float(np.linalg.norm(extents))
-    warnings = element_warnings(body, theta, shape, worst[0])
+    warnings = _body_warnings(bodies)
     for motion in motions:
         warnings += motion_warnings(motion)
     for recording in recordings:
-        warnings += recording_warnings(recording, quality.edge_mean_m, diagonal_m)
+        body = next(each for each in bodies if recording.experiment in each.experiments)
+        warnings += recording_warnings(recording, body.edges_m[1], body.diagonal_m)
     warnings += cost_warnings(chosen, found_costs) if chosen else []
     notes = [*problem.notes, *start_notes]
     for motion in motions:
         notes += motion_notes(motion)
     notes += cost_notes(chosen, found_costs) if chosen else []
     return Findings(
-        nodes=len(body.nodes_m),
-        elements=len(body.cells),
-        element=body.element.name,
-        volume_m3=body.mesh.volume_m3,
-        mass_kg=body.mass_kg,
-        size_m=(float(extents[0]), float(extents[1]), float(extents[2])),
-        edges_m=(quality.edge_min_m, quality.edge_mean_m, quality.edge_max_m),
-        smallest_element_quality=quality.quality_min,
-        median_element_quality=quality.quality_median,
-        worst_elements=worst,
-        cells_across=shape.cells_across,
-        guess=_guess(body, theta),
+        bodies=bodies,
         experiments=len(problem.experiments),
         timesteps=sum(segment.grid_rows for segment in collocation.segments),
         samples=sum(recording.samples for recording in recordings),
@@ -170,7 +141,7 @@ def check_problem(problem: Problem) -> Findings:
         constraints=collocation.constraints,
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
-        method=solver.method,
+        method=method,
         memory_mb=chosen.memory_mb if chosen else None,
         costs=found_costs,
         jacobian_error=jacobian_error,
@@ -180,12 +151,32 @@ def check_problem(problem: Problem) -> Findings:
     )
 
 
-def _guess(body: Body, theta: Array) -> dict[str, float]:
-    found = {}
-    for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
-        young, poisson = engineering(*lame)
-        found |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
-    return found | dict(zip(body.constants, theta.tolist(), strict=True))
+def _name(method: str | Method) -> str:
+    return method if isinstance(method, str) else getattr(method, "name", repr(method))
+
+
+def _factorisation(problem: Problem) -> Choice:
+    """That of reduced space, whichever method is chosen."""
+    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
+    return next(each.factorisation for each in named if isinstance(each, ReducedSpace))
+
+
+def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
+    found = []
+    for body in problem.bodies:
+        names = tuple(e.name for e in problem.experiments if e.body is body)
+        found.append(body_finding(body, body.theta(problem.parameters.guesses), names))
+    return tuple(found)
+
+
+def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
+    if len(bodies) == 1:
+        return list(bodies[0].warnings)
+    return [
+        f"in the body of {', '.join(map(repr, body.experiments))}: {warning}"
+        for body in bodies
+        for warning in body.warnings
+    ]
 
 
 def _recordings(
@@ -200,17 +191,18 @@ def _recordings(
 
 def _nonzeros(problem: Problem) -> tuple[int, int]:
     """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many."""
-    fitted = [experiment for experiment in problem.experiments if not experiment.validation]
-    nq = len(problem.parameters.free)
-    total = np.array([0, (1 - len(fitted)) * nq * (nq + 1) // 2])  # the block of q is shared
-    for experiment in fitted:
-        alone = replace(problem, experiments=(experiment,))
-        some, longer = (_counted(shortened(alone, SAMPLES + more)) for more in (0, 1))
-        total += some + max(0, len(experiment.t_s) - SAMPLES) * (longer - some)
+    short = shortened(problem, SAMPLES)
+    total = few = _counted(short)
+    for k, experiment in enumerate(problem.experiments):
+        if not experiment.validation:
+            parts = list(short.experiments)
+            parts[k] = first_samples(experiment, SAMPLES + 1)
+            more = _counted(replace(problem, experiments=parts)) - few
+            total = total + max(0, len(experiment.t_s) - SAMPLES) * more
     return int(total[0]), int(total[1])
 
 
 def _counted(problem: Problem) -> NDArray[np.int64]:
-    collocation = build_collocation(problem)
+    collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
     return np.array([len(indices) for _, indices in structures])

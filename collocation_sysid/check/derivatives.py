@@ -18,10 +18,13 @@ STEP = 1e-5
 
 def shortened(problem: Problem, samples: int) -> Problem:
     """The same problem with the first samples of every experiment only."""
-    return replace(problem, experiments=tuple(_first(e, samples) for e in problem.experiments))
+    return replace(
+        problem, experiments=tuple(first_samples(e, samples) for e in problem.experiments)
+    )
 
 
-def _first(experiment: Experiment, samples: int) -> Experiment:
+def first_samples(experiment: Experiment, samples: int) -> Experiment:
+    """The same experiment with its first samples only."""
     markers, here = experiment.markers, slice(samples)
     tracks = markers.positions_m[here]
     if not np.isfinite(tracks).any():

@@ -4,11 +4,12 @@ from .alignment import align
 from .clock import sample_interval_s
 from .experiment import Experiment
 from .force_files import read_forces
-from .grasp import Grasp, PoseSequence, held_nodes
+from .grasp import Grasp, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance
 from .pose_files import read_poses
+from .poses import PoseSequence
 from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
 from .writers import write_markers_csv, write_poses_csv

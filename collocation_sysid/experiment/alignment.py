@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array
 from ..errors import InputError
 from .clock import STEP_TOLERANCE, even_times_s, rounding_s, sample_interval_s
-from .grasp import PoseSequence
+from .poses import PoseSequence
 from .readers import MarkerTable
 
 # Rows of a marker file further apart than this many usual steps have lost frames between them.

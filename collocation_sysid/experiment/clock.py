@@ -11,6 +11,8 @@ from ..arrays import Array
 from ..errors import InputError
 
 STEP_TOLERANCE = 0.01
+# A window opens and closes at its times, also where they are rounded to just off a grid time.
+TIME_TOLERANCE_S = 1e-9
 # Rounding of printed times is forgiven up to this part of a step, so that no lost frame passes.
 _ROUNDING_LIMIT = 0.3
 _PRINTED_DECIMALS = range(10)

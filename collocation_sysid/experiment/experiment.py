@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
+EARTH_M_S2 = (0.0, 0.0, -9.81)
+NOTHING_ELSE = Nuisance()
+
 # Held nodes count as collinear when they deviate from a line by less than this part of its length.
 _COLLINEAR = 1e-6
 
@@ -34,18 +38,20 @@ class Experiment:
 
     Parameters
     ----------
-    name : str
-        For messages and reports.
     body : Body
         Provides `nodes_m`, `cells` and `element`.
     t_s : (T,) array
         At least three evenly spaced times.
-    grasps : tuple of Grasp
-        No node in two of them at a time.
+    grasps : sequence of Grasp
+        No node in two of them at a time. Selected nodes are looked up on the body, and poses given
+        as matrices are those at `t_s`.
     markers : Markers
-        Tracks at the times `t_s`, at least one sample present.
+        Tracks at the times `t_s`, at least one sample present. Those given by their places are put
+        on the body, see `place_markers`.
     gravity_m_s2 : (3,) array
         Acceleration of gravity.
+    name : str
+        For messages and reports; experiments of one problem have different names.
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
@@ -54,9 +60,9 @@ class Experiment:
         The state for "given"; at rest if the velocities are left out.
     validation : bool
         Predicted only, not fitted.
-    masses : tuple of PointMass
+    masses : sequence of PointMass
         Tied to the body.
-    forces : tuple of Force
+    forces : sequence of Force
         On the nodes besides gravity.
     nuisance : Nuisance
         What else is to be estimated about this recording alone.
@@ -67,29 +73,70 @@ class Experiment:
         If any of this does not hold, naming the experiment.
     """
 
-    name: str
     body: Body
     t_s: Array
     grasps: tuple[Grasp, ...]
     markers: Markers
     gravity_m_s2: Array
-    start: Start = "equilibrium"
-    start_rule: StartRule = "standard"
-    start_positions_m: Array | None = None
-    start_velocities_m_s: Array | None = None
-    validation: bool = False
-    masses: tuple[PointMass, ...] = ()
-    forces: tuple[Force, ...] = ()
-    nuisance: Nuisance = field(default_factory=Nuisance)
+    name: str
+    start: Start
+    start_rule: StartRule
+    start_positions_m: Array | None
+    start_velocities_m_s: Array | None
+    validation: bool
+    masses: tuple[PointMass, ...]
+    forces: tuple[Force, ...]
+    nuisance: Nuisance
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        body: Body,
+        t_s: ArrayLike,
+        grasps: Iterable[Grasp],
+        markers: Markers,
+        gravity_m_s2: ArrayLike = EARTH_M_S2,
+        name: str = "experiment",
+        *,
+        start: Start = "equilibrium",
+        start_rule: StartRule = "standard",
+        start_positions_m: ArrayLike | None = None,
+        start_velocities_m_s: ArrayLike | None = None,
+        validation: bool = False,
+        masses: Iterable[PointMass] = (),
+        forces: Iterable[Force] = (),
+        nuisance: Nuisance = NOTHING_ELSE,
+    ) -> None:
+        n = len(body.nodes_m)
         try:
-            self._freeze()
+            times = read_only_floats(t_s, (None,), "t_s")
+            vars(self).update(
+                body=body,
+                t_s=times,
+                grasps=tuple(grasp.on(body, times) for grasp in grasps),
+                markers=markers.on(body),
+                gravity_m_s2=read_only_floats(gravity_m_s2, (3,), "gravity_m_s2"),
+                name=name,
+                start=start,
+                start_rule=start_rule,
+                start_positions_m=_state(start_positions_m, n, "start_positions_m"),
+                start_velocities_m_s=_state(start_velocities_m_s, n, "start_velocities_m_s"),
+                validation=validation,
+                masses=tuple(mass.on(body) for mass in masses),
+                forces=tuple(force.on(body) for force in forces),
+                nuisance=nuisance,
+            )
             self._check_time()
             self._check_nodes()
             self._check_start()
         except InputError as error:
-            raise error.located(where=f"experiment '{self.name}'") from error
+            raise error.located(where=f"experiment '{name}'") from error
+
+    def __repr__(self) -> str:
+        kind = ", validation" if self.validation else ""
+        return (
+            f"Experiment({self.name!r}: {len(self.t_s)} samples over {self.duration_s:.4g} s, "
+            f"grasps: {len(self.grasps)}, {self.markers!r}{kind})"
+        )
 
     @property
     def timestep_s(self) -> float:
@@ -166,20 +213,6 @@ class Experiment:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
         return poses.carry(self.body.nodes_m, times)
 
-    def _freeze(self) -> None:
-        n = len(self.body.nodes_m)
-        arrays = {
-            "t_s": read_only_floats(self.t_s, (None,), "t_s"),
-            "gravity_m_s2": read_only_floats(self.gravity_m_s2, (3,), "gravity_m_s2"),
-        }
-        for name in ("start_positions_m", "start_velocities_m_s"):
-            if getattr(self, name) is not None:
-                arrays[name] = read_only_floats(getattr(self, name), (n, 3), name)
-        for name, array in arrays.items():
-            object.__setattr__(self, name, array)
-        for name in ("grasps", "masses", "forces"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-
     def _check_time(self) -> None:
         if len(self.t_s) < 3:
             raise InputError(
@@ -224,8 +257,8 @@ class Experiment:
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
-                at_rest = read_only_floats(np.zeros_like(self.body.nodes_m), (None, 3), "velocity")
-                object.__setattr__(self, "start_velocities_m_s", at_rest)
+                n = len(self.body.nodes_m)
+                vars(self)["start_velocities_m_s"] = _state(np.zeros((n, 3)), n, "velocity")
         elif given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
         held = np.flatnonzero(self.grasped(self.t_s[:1])[0][0])
@@ -235,6 +268,10 @@ class Experiment:
                 "otherwise the body can turn freely and its rest state is not unique; "
                 f"{len(held)} nodes are held then. Grasp more nodes, or start 'undeformed'"
             )
+
+
+def _state(given: ArrayLike | None, nodes: int, name: str) -> Array | None:
+    return None if given is None else read_only_floats(given, (nodes, 3), name)
 
 
 def _fixes_a_body(points_m: Array) -> bool:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import read_only_floats, read_only_nodes
-from .clock import first_time_fault
+from .arrays import on_body, read_only_floats, some_nodes
+from .clock import TIME_TOLERANCE_S, first_time_fault
 
-# A window opens and closes at its times, also where they are rounded to just off a grid time.
-TIME_TOLERANCE_S = 1e-9
+if TYPE_CHECKING:
+    from ..fem.body import Body
+    from ..fem.selection import Selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,8 @@ class PointMass:
 
     Parameters
     ----------
-    nodes : (k,) int array
+    nodes : (k,) int array or Selection
+        An experiment looks a selection up.
     mass_kg : float
         Of all nodes together.
     from_s : float
@@ -33,12 +36,19 @@ class PointMass:
 
     nodes: Index
     mass_kg: float
-    from_s: float = -np.inf
+    from_s: float
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "nodes", _some_nodes(self.nodes, "the point mass"))
-        if not (np.isfinite(self.mass_kg) and self.mass_kg > 0):
-            raise InputError(f"mass_kg of a point mass is {self.mass_kg:g}; expected more than 0")
+    def __init__(
+        self, nodes: ArrayLike | Selection, mass_kg: float, from_s: float = -np.inf
+    ) -> None:
+        if not (np.isfinite(mass_kg) and mass_kg > 0):
+            raise InputError(f"mass_kg of a point mass is {mass_kg:g}; expected more than 0")
+        tied = some_nodes(nodes, "the point mass")
+        vars(self).update(nodes=tied, mass_kg=mass_kg, from_s=from_s)
+
+    def on(self, body: Body) -> PointMass:
+        """The same mass on the nodes of a body that are selected."""
+        return replace(self, nodes=on_body(self.nodes, body))
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Mass that each node carries at the times `t_s` (T,), (T, n) [kg]."""
@@ -55,7 +65,8 @@ class Force:
 
     Parameters
     ----------
-    nodes : (k,) int array
+    nodes : (k,) int array or Selection
+        An experiment looks a selection up.
     force_n : (m, 3) array
         Total force [N], in the frame of the measurements.
     t_s : (m,) array, optional
@@ -64,20 +75,24 @@ class Force:
 
     nodes: Index
     force_n: Array
-    t_s: Array | None = None
+    t_s: Array | None
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "nodes", _some_nodes(self.nodes, "the force"))
-        rows = read_only_floats(np.atleast_2d(self.force_n), (None, 3), "force_n")
-        object.__setattr__(self, "force_n", rows)
-        if self.t_s is None:
-            if len(rows) != 1:
-                raise InputError(f"{len(rows)} rows of force_n without times; expected t_s")
-            return
-        t_s = read_only_floats(self.t_s, (len(rows),), "t_s of the force")
-        if fault := first_time_fault(t_s):
-            raise InputError(fault[1], where=f"row {fault[0] + 1}")
-        object.__setattr__(self, "t_s", t_s)
+    def __init__(
+        self, nodes: ArrayLike | Selection, force_n: ArrayLike, t_s: ArrayLike | None = None
+    ) -> None:
+        pulled = some_nodes(nodes, "the force")
+        rows = read_only_floats(np.atleast_2d(force_n), (None, 3), "force_n")
+        if t_s is None and len(rows) != 1:
+            raise InputError(f"{len(rows)} rows of force_n without times; expected t_s")
+        if t_s is not None:
+            t_s = read_only_floats(t_s, (len(rows),), "t_s of the force")
+            if fault := first_time_fault(t_s):
+                raise InputError(fault[1], where=f"row {fault[0] + 1}")
+        vars(self).update(nodes=pulled, force_n=rows, t_s=t_s)
+
+    def on(self, body: Body) -> Force:
+        """The same force on the nodes of a body that are selected."""
+        return replace(self, nodes=on_body(self.nodes, body))
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Force on each node at the times `t_s` (T,), (T, n, 3) [N]."""
@@ -90,11 +105,3 @@ class Force:
         force = np.zeros((len(times), node_count, 3))
         force[:, self.nodes] = total[:, None] / len(self.nodes)
         return force
-
-
-def _some_nodes(nodes: ArrayLike, what: str) -> Index:
-    chosen = np.unique(read_only_nodes(nodes, (None,), f"nodes of {what}"))
-    if chosen.size == 0:
-        raise InputError(f"{what} needs at least one node; its selection found none")
-    chosen.setflags(write=False)
-    return chosen

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +16,12 @@ from ..errors import InputError
 from .arrays import read_only_floats, read_only_tracks
 from .placement import Placement, place_markers
 
+if TYPE_CHECKING:
+    from ..fem.body import Body
+
 __all__ = ["Markers", "Placement", "place_markers"]
+
+SHOWN = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,54 +30,77 @@ class Markers:
 
     Parameters
     ----------
-    names : tuple of str
-        M distinct names.
     t_s : (T,) array
         Sample times.
     positions_m : (T, M, 3) array
         Measured positions; NaN where missing. A sample with one coordinate missing is missing.
     sigma_m : (M,) array or float
         Standard deviation of each marker's coordinates.
-    placement : Placement
-        Weights of the nodes, one row per marker.
+    names : sequence of str, optional
+        M distinct names; m1, m2, … by default.
+    places_m : (M, 3) array, optional
+        Where the markers sit on the undeformed body; the experiment makes the placement of it.
+    placement : Placement, optional
+        Weights of the nodes, one row per marker, in place of `places_m`.
 
     Raises
     ------
     InputError
-        If shapes disagree, names repeat or a sigma is not positive.
+        If shapes disagree, names repeat, a sigma is not positive, or not exactly one of places
+        and placement is given.
     """
 
-    names: tuple[str, ...]
     t_s: Array
     positions_m: Array
     sigma_m: Array
+    names: tuple[str, ...]
+    places_m: Array | None
     placement: Placement
 
-    def __post_init__(self) -> None:
-        names = tuple(self.names)
-        m = len(names)
-        if len(set(names)) != m:
-            repeated = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"the marker name '{repeated}' is given more than once")
-        t_s = read_only_floats(self.t_s, (None,), "t_s of the markers")
-        shape = (len(t_s), m, 3)
-        positions = read_only_tracks(self.positions_m, shape, "marker positions")
-        sigma = read_only_floats(
-            np.broadcast_to(self.sigma_m, (m,)) if np.ndim(self.sigma_m) == 0 else self.sigma_m,
-            (m,),
-            "sigma_m",
-        )
-        if not (sigma > 0.0).all():
-            worst = int(np.argmin(sigma))
+    def __init__(
+        self,
+        t_s: ArrayLike,
+        positions_m: ArrayLike,
+        sigma_m: ArrayLike,
+        names: Sequence[str] | None = None,
+        places_m: ArrayLike | None = None,
+        placement: Placement | None = None,
+    ) -> None:
+        times = read_only_floats(t_s, (None,), "t_s of the markers")
+        tracks = read_only_tracks(positions_m, (len(times), None, 3), "marker positions")
+        m = tracks.shape[1]
+        if (places_m is None) == (placement is None):
+            found = "neither places_m nor" if placement is None else "places_m and"
             raise InputError(
-                f"sigma_m of marker '{names[worst]}' is {sigma[worst]:g}; expected > 0"
+                f"the markers have {found} a placement; expected places_m, where they sit on the "
+                "undeformed body in metres, or a placement that place_markers made"
             )
-        if len(self.placement.nodes) != m:
-            raise InputError(f"{len(self.placement.nodes)} places on the body for {m} markers")
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "t_s", t_s)
-        object.__setattr__(self, "positions_m", positions)
-        object.__setattr__(self, "sigma_m", sigma)
+        if places_m is not None:
+            places_m = read_only_floats(places_m, (m, 3), "places_m", finite=False)
+        elif placement is not None and len(placement.nodes) != m:
+            raise InputError(f"{len(placement.nodes)} places on the body for {m} markers")
+        labels = tuple(f"m{k}" for k in range(1, m + 1)) if names is None else tuple(names)
+        vars(self).update(
+            t_s=times,
+            positions_m=tracks,
+            sigma_m=_deviations(sigma_m, _distinct(labels, m)),
+            names=labels,
+            places_m=places_m,
+            placement=placement,
+        )
+
+    def __repr__(self) -> str:
+        shown = self.names if len(self.names) <= SHOWN else (*self.names[:SHOWN], "…")
+        missing = int(self.missing.sum())
+        gaps = f", {missing} missing" if missing else ""
+        return f"Markers({', '.join(shown)}: {self.samples} samples{gaps})"
+
+    def on(self, body: Body) -> Markers:
+        """The same markers with their placement on a body."""
+        if self.places_m is None:
+            return self
+        placement = place_markers(self.places_m, body.nodes_m, body, names=self.names)
+        return replace(self, places_m=None, placement=placement)
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
@@ -107,3 +137,21 @@ class Markers:
         )
         per_node.eliminate_zeros()
         return sparse.csr_array(sparse.kron(per_node, sparse.eye_array(3), format="csr"))
+
+
+def _distinct(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    if len(names) != count:
+        raise InputError(f"{len(names)} marker names for {count} tracks; expected one for each")
+    repeated = [name for name in names if names.count(name) > 1]
+    if repeated:
+        raise InputError(f"the marker name '{repeated[0]}' is given more than once")
+    return names
+
+
+def _deviations(sigma_m: ArrayLike, names: tuple[str, ...]) -> Array:
+    each = np.broadcast_to(sigma_m, len(names)) if np.ndim(sigma_m) == 0 else sigma_m
+    sigma = read_only_floats(each, (len(names),), "sigma_m")
+    if not (sigma > 0.0).all():
+        worst = int(np.argmin(sigma))
+        raise InputError(f"sigma_m of marker '{names[worst]}' is {sigma[worst]:g}; expected > 0")
+    return sigma

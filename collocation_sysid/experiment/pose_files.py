@@ -15,7 +15,7 @@ from ..errors import InputError
 from .formats.plain import read_grid
 from .formats.text import Grid, Row, decode, listed, numbers, read_bytes
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
-from .grasp import PoseSequence, first_pose_fault
+from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
 QuaternionOrder = Literal["xyzw", "wxyz"]
 
@@ -23,7 +23,6 @@ POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 _MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 _ORDERS = ("xyzw", "wxyz")
-_ORTHONORMAL, _LAST_ROW = 1e-3, 1e-6
 _ZIP = b"PK\x03\x04"
 
 
@@ -199,33 +198,8 @@ def _from_matrices(
     length_unit: str | None,
     places: list[str],
 ) -> PoseSequence:
-    """Poses of rigid motions; SciPy would make any matrix orthonormal without a word."""
-    rotations = matrices[:, :3, :3]
-    with np.errstate(invalid="ignore"):
-        gram = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2))
-        last = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
-        last_column = np.abs(matrices[:, :3, 3]).max(axis=1)
-    for k, place in enumerate(places):
-        at = f"the matrix at t_s = {t_s[k]:.9g}"
-        fault = None
-        if not np.isfinite(matrices[k]).all():
-            fault = f"{at} holds a value that is not a finite number"
-        elif last[k] > _LAST_ROW:
-            hint = "; is it written column by column?" if last_column[k] <= _LAST_ROW else ""
-            fault = f"{at} has the last row {_row(matrices[k, 3])}; expected 0, 0, 0, 1{hint}"
-        elif gram[k] > _ORTHONORMAL:
-            fault = (
-                f"{at} is no rotation: its RᵀR differs from the identity by {gram[k]:.3g}; "
-                f"expected at most {_ORTHONORMAL:g}"
-            )
-        elif np.linalg.det(rotations[k]) < 0:
-            fault = f"{at} mirrors: its determinant is −1; expected a rotation"
-        if fault:
-            raise InputError(fault, path, place)
+    if fault := first_matrix_fault(t_s, matrices):
+        raise InputError(fault[1], path, places[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]
-    quaternions = Rotation.from_matrix(rotations).as_quat()
+    quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
     return _sequence(path, t_s, matrices[:, :3, 3] * metres, quaternions, places)
-
-
-def _row(values: Array) -> str:
-    return ", ".join(f"{value:.4g}" for value in values)

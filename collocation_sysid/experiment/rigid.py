@@ -19,7 +19,7 @@ from ..arrays import Array
 from ..errors import InputError
 from .arrays import read_only_floats, read_only_tracks
 from .clock import STEP_TOLERANCE
-from .grasp import PoseSequence
+from .poses import PoseSequence
 from .readers import MarkerTable
 
 # Markers whose spread across their line is below this part of that along it do not fix a rotation.

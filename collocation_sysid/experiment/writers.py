@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from .grasp import PoseSequence
 from .pose_files import POSE_COLUMNS
+from .poses import PoseSequence
 from .readers import MarkerTable
 
 _DIGITS = "%.12g"

@@ -233,6 +233,10 @@ class Body:
             for part in self.parts
         ]
 
+    def used_names(self, known: Sequence[str]) -> set[str]:
+        """Those of the names that are known which give its constants."""
+        return {name for source in self.sources(known) for name in source.names.values()}
+
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names that a parameter may have: constants, what may stand for them, and shared ones."""

@@ -36,6 +36,7 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from .parameters import Parameters
+from .schemes import Scheme
 from .segment import Segment
 from .setting import Setting
 
@@ -65,7 +66,7 @@ class Collocation:
     experiments : sequence of Experiment
         They share the parameters; those for validation are left out.
     parameters : Parameters
-    scheme : str, default "midpoint"
+    scheme : str or Scheme, default "midpoint"
     substeps : int, default 1
         Grid steps between samples.
     explicit_grasps : bool, default False
@@ -83,7 +84,7 @@ class Collocation:
         self,
         experiments: Sequence[Experiment],
         parameters: Parameters,
-        scheme: str = "midpoint",
+        scheme: str | Scheme = "midpoint",
         substeps: int = 1,
         explicit_grasps: bool = False,
         huber: float | None = None,

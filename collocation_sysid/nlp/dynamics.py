@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
-from .schemes import Scheme, scheme_named
+from .schemes import Scheme, as_scheme
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +70,12 @@ class Dynamics:
     start_velocity_m_s: Array
 
     @classmethod
-    def of(cls, experiment: Experiment, scheme_name: str, substeps: int = 1) -> Dynamics:
+    def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
         """Discretise an experiment with `substeps` steps between samples."""
         rows = (len(experiment.t_s) - 1) * substeps + 1
         t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
         first_row = 0 if experiment.start == "equilibrium" else 1
-        scheme = scheme_named(scheme_name, experiment.start_rule)
-        tables = Tables.of(scheme, rows, first_row)
+        tables = Tables.of(as_scheme(scheme, experiment.start_rule), rows, first_row)
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
         lag_s = tables.p @ np.arange(tables.p.shape[1]) * (t_s[1] - t_s[0])

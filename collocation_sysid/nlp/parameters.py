@@ -221,6 +221,9 @@ class Parameters:
                     item.name,
                 )
 
+    def __repr__(self) -> str:
+        return f"Parameters({', '.join(map(_stated, self.items))})"
+
     @classmethod
     def of(cls, given: Mapping[str, Unknown | Tied | float]) -> Parameters:
         """Parameters by name; a number is a fixed value."""
@@ -329,7 +332,7 @@ class Parameters:
                     None,
                     name,
                 )
-        used = {n for body in bodies for s in body.sources(self.names) for n in s.names.values()}
+        used = {name for body in bodies for name in body.used_names(self.names)}
         used |= {item.tied.to for item in self.items if item.tied is not None}
         for name in self.names:
             if name not in used:
@@ -339,6 +342,14 @@ class Parameters:
         for item in self.items:
             if item.fixed and item.guess == 0 and bare(item.name) in ("mu_pa", "young_pa"):
                 raise InputError("fixed = 0, expected a stiffness above 0", None, item.name)
+
+
+def _stated(item: Parameter) -> str:
+    if item.tied is not None:
+        return f"{item.name} = {item.tied.ratio:g} × {item.tied.to}"
+    if item.fixed:
+        return f"{item.name} = {item.guess:g}"
+    return f"{item.name} from {item.guess:g} in [{item.lower:g}, {item.upper:g}]"
 
 
 class ThetaMap:

@@ -87,13 +87,12 @@ SCHEMES: dict[str, Scheme] = {
 }
 
 
-def scheme_named(name: str, start_rule: str = "standard") -> Scheme:
-    """Look a scheme up, with the start rule of its first step.
+def as_scheme(given: str | Scheme, start_rule: str = "standard") -> Scheme:
+    """A scheme from a name in `SCHEMES` or itself, with the start rule of its first step.
 
     Parameters
     ----------
-    name : str
-        A key of `SCHEMES`.
+    given : str or Scheme
     start_rule : {"standard", "paper"}
         "paper" drops the inertia of the first step (a = 0); only for backward Euler.
 
@@ -102,13 +101,15 @@ def scheme_named(name: str, start_rule: str = "standard") -> Scheme:
     InputError
         For unknown names and combinations.
     """
-    if name not in SCHEMES:
-        raise InputError(f"no scheme {name!r}; available: {', '.join(SCHEMES)}")
-    scheme = SCHEMES[name]
+    if isinstance(given, str) and given not in SCHEMES:
+        raise InputError(f"no scheme {given!r}; available: {', '.join(SCHEMES)}")
+    scheme = SCHEMES[given] if isinstance(given, str) else given
     if start_rule == "standard":
         return scheme
     if start_rule != "paper":
         raise InputError(f"no start rule {start_rule!r}; available: standard, paper")
-    if name != "backward-euler":
-        raise InputError(f"start rule 'paper' belongs to scheme 'backward-euler', not {name!r}")
+    if scheme != SCHEMES["backward-euler"]:
+        raise InputError(
+            f"start rule 'paper' belongs to scheme 'backward-euler', not {scheme.name!r}"
+        )
     return replace(scheme, start=(replace(_FIRST_STEP, s=(0.0, 0.0), r=0.0),))

@@ -22,6 +22,7 @@ from .local import Local
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
+from .schemes import Scheme
 from .setting import Setting
 
 
@@ -31,7 +32,7 @@ class Segment:
     Parameters
     ----------
     experiment : Experiment
-    scheme : str
+    scheme : str or Scheme
     substeps : int
     parameters : Parameters
         At their guess the constraints are scaled.
@@ -55,7 +56,7 @@ class Segment:
     def __init__(
         self,
         experiment: Experiment,
-        scheme: str,
+        scheme: str | Scheme,
         substeps: int,
         parameters: Parameters,
         explicit_grasps: bool = False,

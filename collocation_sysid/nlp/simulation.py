@@ -16,6 +16,7 @@ from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
 from .parameters import Parameters, theta_of
+from .schemes import Scheme
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,7 @@ class Trajectory:
 def simulate(
     experiment: Experiment,
     parameters: Parameters | Mapping[str, float] | Sequence[float] | Array,
-    integrator: str = "newmark",
+    integrator: str | Scheme = "newmark",
     timestep_s: float | None = None,
     substeps: int = 1,
     options: NewtonOptions | None = None,
@@ -51,8 +52,8 @@ def simulate(
     ----------
     experiment : Experiment
     parameters : Parameters (their guesses), values by name, or θ in the order of the body
-    integrator : str
-        "newmark", or a scheme of `schemes.SCHEMES` on the collocation grid.
+    integrator : str or Scheme
+        "newmark", or a scheme, by its name in `schemes.SCHEMES`, on the collocation grid.
     timestep_s : float, optional
         Newmark's step, rounded to divide the sample interval; a quarter of it by default.
     substeps : int

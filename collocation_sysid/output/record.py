@@ -19,12 +19,12 @@ from ..check.motion import motion_of
 from ..errors import SimulationError
 from ..experiment import Experiment
 from ..methods.solution import Solution
-from ..nlp.schemes import scheme_named
+from ..nlp.schemes import as_scheme
+from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run
 from ..statistics.estimates import Estimate
 from ..statistics.identifiability import verdicts
-from ..statistics.linearised import Derived
 from .fields import ElementFields
 from .replay import Replay
 from .writers import run_folder, write_frames
@@ -35,13 +35,15 @@ SCHEMA_VERSION = 2
 def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
     """Write the run folder, whole or not at all, and return it.
 
-    ``result.json``, ``problem.toml`` as run, ``trajectory.npz``, pictures, and ``frames/`` with
-    ``trajectory.pvd`` for ParaView. With several experiments the arrays' names and the frames'
-    folders have the experiment's name in front.
+    ``result.json``, ``problem.toml`` as run where the problem has a file, ``trajectory.npz``,
+    pictures, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several experiments the
+    arrays' names and the frames' folders have the experiment's name in front.
     """
     solution = finished.solution
     with run_folder(folder) as place:
-        (place / "problem.toml").write_text(finished.problem.text, encoding="utf-8")
+        origin = finished.problem.origin
+        if origin is not None:
+            (place / "problem.toml").write_text(origin.text, encoding="utf-8")
         (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
         seen = replays(finished)
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
@@ -113,7 +115,7 @@ def _natural_hz(experiment: Experiment, solution: Solution) -> Array | None:
     """Natural frequencies with the answer; a method that failed has none worth the search."""
     if not solution.status.converged:
         return None
-    scheme = scheme_named(solution.collocation.scheme)
+    scheme = as_scheme(solution.collocation.scheme)
     try:
         motion = motion_of(
             experiment, scheme, experiment.timestep_s, experiment.body.theta(solution.parameters)
@@ -145,9 +147,9 @@ def result(finished: Run) -> dict[str, Any]:
         "converged": solution.status.converged,
         "message": solution.message,
         "method": solution.method,
-        "title": problem.file.title,
+        "title": problem.title,
         "parameters": _parameters(finished),
-        "derived": _derived(finished),
+        "derived": {name: _with_error_bar(finished.estimates[name]) for name in finished.derived},
         "unknowns": _unknowns(finished),
         "uncertainty": _uncertainty(finished),
         "fit": _fit(solution),
@@ -181,18 +183,14 @@ def result(finished: Run) -> dict[str, Any]:
             field.name: getattr(solution.timing, field.name) for field in fields(solution.timing)
         },
         "problem": {
-            "nodes": len(problem.body.nodes_m),
-            "elements": len(problem.body.cells),
+            "nodes": sum(len(body.nodes_m) for body in problem.bodies),
+            "elements": sum(len(body.cells) for body in problem.bodies),
             "timesteps": sum(segment.grid_rows for segment in collocation.segments),
             "variables": collocation.variables,
             "constraints": collocation.constraints,
-            "scheme": collocation.scheme,
+            "scheme": as_scheme(collocation.scheme).name,
         },
-        "notes": list(
-            dict.fromkeys(
-                [*problem.notes, *problem.body.notes, *solution.notes, *finished.all_notes]
-            )
-        ),
+        "notes": list(dict.fromkeys([*problem.notes, *solution.notes, *finished.all_notes])),
         "history": [
             {
                 "iteration": line.number,
@@ -204,16 +202,22 @@ def result(finished: Run) -> dict[str, Any]:
             }
             for line in solution.history
         ],
-        "provenance": {
-            "version": version("collocation-sysid"),
-            "casadi": casadi.CasadiMeta.version(),
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            "problem_file": str(problem.path),
-            "problem_sha256": hashlib.sha256(problem.text.encode()).hexdigest(),
-            "mesh_sha256": problem.body.mesh.sha256,
-        },
+        "provenance": _provenance(problem),
+    }
+
+
+def _provenance(problem: Problem) -> dict[str, Any]:
+    origin = problem.origin
+    text = None if origin is None else origin.text.encode()
+    return {
+        "version": version("collocation-sysid"),
+        "casadi": casadi.CasadiMeta.version(),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "problem_file": None if origin is None else str(origin.path),
+        "problem_sha256": None if text is None else hashlib.sha256(text).hexdigest(),
+        "mesh_sha256": [body.mesh.sha256 for body in problem.bodies],
     }
 
 
@@ -231,34 +235,19 @@ def _finite(content: Any) -> Any:
 
 
 def _parameters(finished: Run) -> dict[str, Any]:
-    parameters = finished.solution.collocation.parameters
-    values = finished.solution.parameters
-    estimates = finished.uncertainty.estimates if finished.uncertainty is not None else {}
     return {
         item.name: {
-            "value": values[item.name],
             "guess": item.guess,
             "fixed": item.fixed or item.tied is not None,
-            **_error_bar(estimates.get(item.name, Estimate(values[item.name]))),
+            **_with_error_bar(finished.estimates[item.name]),
         }
-        for item in parameters.items
+        for item in finished.problem.parameters.items
     }
 
 
-def _derived(finished: Run) -> dict[str, Any]:
-    if finished.uncertainty is None:
-        solution = finished.solution
-        constants = (segment.constants for segment in solution.collocation.segments)
-        derived = Derived.of(constants, solution.q)
-        return {name: {"value": value} for name, value in derived.values.items()}
+def _with_error_bar(estimate: Estimate) -> dict[str, Any]:
     return {
-        name: {"value": estimate.value, **_error_bar(estimate)}
-        for name, estimate in finished.uncertainty.derived.items()
-    }
-
-
-def _error_bar(estimate: Estimate) -> dict[str, Any]:
-    return {
+        "value": estimate.value,
         "std_error": estimate.std_error,
         "ci95": None if estimate.ci95 is None else list(estimate.ci95),
         "at_bound": estimate.at_bound,

@@ -1,7 +1,5 @@
-"""The problem file: schema, validation, loading."""
+"""Problems, and the problem file: schema, validation, reading."""
 
-from .loading import Problem, load_problem
-from .reading import read_problem_file
-from .schema import ProblemFile
+from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
 
-__all__ = ["Problem", "ProblemFile", "load_problem", "read_problem_file"]
+__all__ = ["Origin", "Problem", "RolloutOptions", "UncertaintyOptions"]

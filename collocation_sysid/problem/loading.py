@@ -1,14 +1,12 @@
-"""From a validated problem file to body, experiments and parameters."""
+"""From a problem file to a `Problem`: its body, experiments and parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from ..errors import InputError
-from ..experiment import Experiment
 from ..fem.body import Body
 from ..fem.constants import constant_named
 from ..fem.materials import Material
@@ -16,6 +14,7 @@ from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..nlp.parameters import Parameters, Tied, Unknown
 from .code import load_material
+from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file, selection
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
@@ -23,53 +22,10 @@ from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A loaded problem: everything a method needs.
-
-    Attributes
-    ----------
-    path : Path of the problem file
-    file : ProblemFile, validated
-    text : str, the problem as run
-    body : Body
-    experiments : tuple of Experiment, those for validation included
-    parameters : Parameters
-    notes : tuple of str, what was cleaned or assumed on the way
-    """
-
-    path: Path
-    file: ProblemFile
-    text: str
-    body: Body
-    experiments: tuple[Experiment, ...]
-    parameters: Parameters
-    notes: tuple[str, ...]
-
-
-def load_problem(
-    path: str | Path,
-    overrides: Sequence[str] = (),
-    simulation: bool = False,
-    allow_code: bool = False,
+def read_problem(
+    path: str | Path, overrides: Sequence[str], allow_code: bool, simulation: bool
 ) -> Problem:
-    """Load a problem file and the files it names.
-
-    Parameters
-    ----------
-    path : str or Path
-    overrides : sequence of "dotted.key=value"
-    simulation : bool
-        Markers need no file then: those with a `reference_m` are sampled at the poses' times.
-        And every experiment may be for validation.
-    allow_code : bool
-        Run the Python files that materials name.
-
-    Raises
-    ------
-    InputError
-        One clear message for the first thing that is wrong.
-    """
+    """Read a problem file and the files it names, see `Problem.read`."""
     path = Path(path)
     file, text = read_problem_file(path, overrides)
     if not simulation and all(section.validation for section in file.experiment):
@@ -80,12 +36,36 @@ def load_problem(
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
     body = _located(path, "object", lambda: _load_body(file.object, mesh, folder, allow_code))
     parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))
-    experiments, notes = [], [*mesh.notes, *body.notes]
+    experiments, notes = [], []
     for section in file.experiment:
         reader = RecordingReader(section, folder, body, parameters, simulation)
         experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
         notes += reader.notes
-    return Problem(path, file, text, body, tuple(experiments), parameters, tuple(notes))
+    try:
+        return Problem(
+            experiments,
+            parameters,
+            **file.transcription.model_dump(),
+            huber=file.solver.huber,
+            method=file.solver.method,
+            methods=file.solver.methods,
+            rollout=RolloutOptions(**file.rollout.model_dump()),
+            uncertainty=UncertaintyOptions(**file.uncertainty.model_dump()),
+            title=file.title,
+            notes=notes,
+            origin=Origin(path, text, _named_files(file, folder)),
+        )
+    except InputError as error:
+        raise error.located(path) from error
+
+
+def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
+    """The files of data that a problem names, whether they are there or not."""
+    names = [file.object.mesh, file.object.surface]
+    for section in file.experiment:
+        names += [section.markers.file, *(grasp.poses for grasp in section.grasps)]
+        names += [force.file for force in section.force]
+    return tuple(folder / name for name in names if name is not None)
 
 
 def _located(path: Path, table: str, build: Callable[[], T]) -> T:

@@ -304,7 +304,7 @@ class RecordingReader:
             )
 
         def with_placement(placement: Placement) -> Experiment:
-            return build(Markers(names, t_s, table.positions_m, sigma_m, placement))
+            return build(Markers(t_s, table.positions_m, sigma_m, names, placement=placement))
 
         parts = []
         if known:

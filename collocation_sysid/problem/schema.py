@@ -218,37 +218,3 @@ class ProblemFile(Section):
     solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()
     uncertainty: UncertaintySection = UncertaintySection()
-
-    @model_validator(mode="after")
-    def _names_differ(self) -> ProblemFile:
-        names = [experiment.name for experiment in self.experiment]
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        if repeated:
-            raise ValueError(f"two experiments are named {repeated[0]!r}; names must differ")
-        return self
-
-    @model_validator(mode="after")
-    def _profiles_are_of_estimated_parameters(self) -> ProblemFile:
-        free = [
-            name
-            for name, section in self.parameters.items()
-            if isinstance(section, ParameterSection) and section.guess is not None
-        ]
-        for name in self.uncertainty.profile:
-            if name not in free:
-                raise ValueError(
-                    f"uncertainty.profile names {name!r}; expected estimated parameters, "
-                    f"{', '.join(free)}"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _paper_rule_has_its_scheme(self) -> ProblemFile:
-        scheme = self.transcription.scheme
-        for experiment in self.experiment:
-            if experiment.start_rule == "paper" and scheme != "backward-euler":
-                raise ValueError(
-                    f"experiment {experiment.name!r} has start_rule = 'paper' and the scheme is "
-                    f"{scheme!r}; that rule expects transcription.scheme = 'backward-euler'"
-                )
-        return self

@@ -21,6 +21,7 @@ from ..errors import InputError
 from ..methods import METHODS
 from ..methods.casadi_nlp import why_not
 from ..methods.described import options_schema
+from ..methods.method import Method
 from ..methods.options import built
 from .section import Section
 
@@ -59,12 +60,10 @@ class MethodSection(Section):
             raise ValueError(f"the options of a method have a table of their own: {remedy}")
         return given
 
-    def method_named(self, name: str, **changed: Any) -> Any:
-        """A method with the options of its table, but for some."""
-        in_file = getattr(self, name)
-        if not changed:
-            return in_file
-        return _read(name, {option: getattr(in_file, option) for option in OPTIONS[name]} | changed)
+    @property
+    def methods(self) -> dict[str, Method]:
+        """The methods by name, with the options of their tables."""
+        return {name: getattr(self, name) for name in METHODS}
 
 
 def _read(method: str, given: Any) -> Any:

@@ -17,7 +17,7 @@ mesh = "body.vtu"              # tetrahedra, any format meshio reads
 # edge_length_m = 0.02
 # length_unit = "mm"           # of the file; "m" by default
 mass_kg = 0.1                  # weighed; or density_kg_m3
-material = "neo-hookean"       # or stable-neo-hookean, st-venant-kirchhoff, mooney-rivlin, yeoh …
+material = "neo-hookean"       # or stable-neo-hookean, mooney-rivlin, yeoh, gent, ...
 element = "tet4"               # or tet10, for bending, a slender body, or poisson above 0.4
 
 # [[object.region]]            # cells that differ; its parameters are "core.young_pa" and so on

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..problem import Problem, ProblemFile, read_problem_file
-from ..problem.schema import ParameterSection
+from ..problem import Problem
+from ..problem.reading import read_problem_file
+from ..problem.schema import ParameterSection, ProblemFile
 
 KEY_LENGTH = 20
 
@@ -86,7 +87,7 @@ def plan_comparison(
     Parameters
     ----------
     problem : Problem
-        Loaded with the same overrides.
+        Read from its file with the same overrides.
     methods : sequence of str
     overrides : sequence of "key=value"
     starts : int
@@ -101,9 +102,14 @@ def plan_comparison(
     Raises
     ------
     InputError
-        For a number of starts, spread or seed that cannot be.
+        For a number of starts, spread or seed that cannot be, and a problem without a file.
     """
     _refuse_options(starts, spread, seed)
+    if problem.path is None:
+        raise InputError(
+            "this problem has no file, which a study's processes read; write one, and take "
+            "Problem.read"
+        )
     planned = []
     for start in range(starts):
         moved = list(overrides) + _start_overrides(problem, truth or {}, start, spread, seed)

@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import InputError, SimulationError
 from ..experiment.grasp import held_nodes
 from ..output.record import as_json, result
-from ..problem import load_problem
+from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run, run
 from .store import ERROR, FINISHED, write_whole
@@ -35,9 +35,7 @@ def main() -> None:
 def attempt(planned: dict[str, Any]) -> dict[str, Any]:
     """Do a planned run; what goes wrong becomes part of its record."""
     try:
-        problem = load_problem(
-            planned["problem"], planned["overrides"], allow_code=planned["allow_code"]
-        )
+        problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
         finished = run(problem, planned["method"])
         return {
             "outcome": FINISHED,

@@ -776,13 +776,13 @@ FOLDER = PROBLEMS / "foam_cylinder"
 print((FOLDER / "problem.toml").read_text())
 
 # %%
-problem = cs.load_problem(FOLDER / "problem.toml")
+problem = cs.Problem.read(FOLDER / "problem.toml")
 cylinder = problem.experiments[0]
 finished = cs.run(problem, "reduced-space")
 solution, uncertainty = finished.solution, finished.uncertainty
 assert solution.status.converged
 assert uncertainty is not None
-assert (len(problem.body.nodes_m), len(problem.body.cells)) == (84, 198)
+assert (len(problem.bodies[0].nodes_m), len(problem.bodies[0].cells)) == (84, 198)
 print(solution.message, f"{solution.iterations} sweeps, {solution.timing.total:.1f} s")
 
 # %% [markdown]
@@ -823,7 +823,7 @@ for name, estimate in uncertainty.derived.items():
 
 # %%
 figure, axes = panels(1, height_mm=58)
-surface, moved = problem.body.mesh.surface, solution.positions_m[0]
+surface, moved = problem.bodies[0].mesh.surface, solution.positions_m[0]
 every = np.linspace(0, len(moved) - 1, 6).astype(int)
 for place, step in enumerate(every):
     x_mm, z_mm = 1e3 * moved[step][:, 0] + 205 * place, 1e3 * moved[step][:, 2]
@@ -873,7 +873,7 @@ assert rollout.rms_m < 1.1 * solution.rms_m
 
 # %%
 collocation = solution.collocation
-width, height = 3 * len(problem.body.nodes_m), collocation.segments[0].rows_per_time
+width, height = 3 * len(problem.bodies[0].nodes_m), collocation.segments[0].rows_per_time
 jacobian = collocation.jacobian(solution.z)
 figure, (left, right) = panels(2, height_mm=80)
 left.spy(jacobian[: 4 * height, : 4 + 4 * width], markersize=0.25, color=BLUE, aspect="auto")
@@ -1204,7 +1204,7 @@ for mine_name, name in (
 typo = MY_PROBLEM.replace("mass_kg = 0.012", "mass_g = 12")
 (mine / "problem.toml").write_text(typo)
 try:
-    cs.load_problem(mine / "problem.toml")
+    cs.Problem.read(mine / "problem.toml")
 except cs.InputError as error:
     print(str(error).replace(str(mine), "."))
 
@@ -1215,9 +1215,10 @@ except cs.InputError as error:
 
 # %%
 (mine / "problem.toml").write_text(MY_PROBLEM)
-my_problem = cs.load_problem(mine / "problem.toml")
+my_problem = cs.Problem.read(mine / "problem.toml")
 findings = check_problem(my_problem)
-print(f"{findings.nodes} nodes, {findings.elements} elements, {findings.timesteps} timesteps")
+(body,) = findings.bodies
+print(f"{body.nodes} nodes, {body.elements} elements, {findings.timesteps} timesteps")
 print(f"{findings.variables} unknowns, {findings.jacobian_nonzeros} nonzeros in the Jacobian")
 print(f"derivatives agree with differences: {findings.derivatives_agree}")
 print(f"farthest marker from the body: {1e3 * findings.largest_marker_distance_m:.1f} mm")
@@ -1232,7 +1233,7 @@ for sentence in (*findings.notes, *findings.warnings):
 my_run = cs.run(my_problem)
 assert my_run.uncertainty is not None
 table({**my_run.uncertainty.estimates, **my_run.uncertainty.derived})
-cs.write_run(my_run, mine / "run")
+my_run.save(mine / "run")
 print("run/:", ", ".join(sorted(path.name for path in (mine / "run").iterdir())))
 
 # %%
@@ -1378,7 +1379,7 @@ unknown = "[experiment.estimate]\nmarker_offsets = { prior_m = 0.005 }\n\n"
 with_offsets = MY_PROBLEM[:first] + unknown + MY_PROBLEM[last:]
 for name, text in (("places from the first frame", no_ruler), ("offsets too", with_offsets)):
     (mine / "problem.toml").write_text(text)
-    loaded = cs.load_problem(mine / "problem.toml")
+    loaded = cs.Problem.read(mine / "problem.toml")
     found, local = fit(loaded.experiments[0], loaded.parameters)
     print(f"{name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(uncertainty_of(local, loaded.parameters, found.q, errors="independent").estimates)

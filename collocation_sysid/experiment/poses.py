@@ -1,0 +1,220 @@
+"""Rigid motions over time, as they carry what a robot holds.
+
+A pose maps undeformed to current positions, x = R X + p. Between the samples of a sequence it is
+either interpolated (linear in position, SLERP in rotation) or held (zero-order hold).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ..arrays import Array
+from ..errors import InputError
+from .arrays import read_only_floats
+from .clock import TIME_TOLERANCE_S, first_time_fault
+
+Interpolation = Literal["linear", "hold"]
+
+QUATERNION_NORM_TOLERANCE = 1e-3
+# A held pose starts at its sample, also where the time asked for is rounded to just before it.
+_HOLD_SNAP = 1e-6
+_ORTHONORMAL, _LAST_ROW = 1e-3, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSequence:
+    """Rigid motion x(t) = R(t) X + p(t) from undeformed to current positions.
+
+    Parameters
+    ----------
+    t_s : (m,) array
+        Sample times, strictly increasing. A single sample is a pose that never changes.
+    positions_m : (m, 3) array
+        p.
+    quaternions_xyzw : (m, 4) array
+        R, scalar last as in SciPy. Norms within 1e-3 of one are normalised; signs are made
+        continuous in time.
+    interpolation : {"linear", "hold"}
+        Between samples: linear in position with SLERP in rotation, or the latest sample.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, a value is not finite, time does not increase, or a quaternion is not
+        of unit norm; the first bad row is named, counting from 1.
+    """
+
+    t_s: Array
+    positions_m: Array
+    quaternions_xyzw: Array
+    interpolation: Interpolation = "linear"
+
+    def __post_init__(self) -> None:
+        t_s = read_only_floats(self.t_s, (None,), "t_s of the poses", finite=False)
+        m = len(t_s)
+        if m == 0:
+            raise InputError("a pose sequence needs at least one pose")
+        positions = read_only_floats(self.positions_m, (m, 3), "positions_m", finite=False)
+        quaternions = read_only_floats(
+            self.quaternions_xyzw, (m, 4), "quaternions_xyzw", finite=False
+        )
+        if self.interpolation not in get_args(Interpolation):
+            raise InputError(
+                f"interpolation of poses is {self.interpolation!r}; expected 'linear' or 'hold'"
+            )
+        if fault := first_pose_fault(t_s, positions, quaternions):
+            raise InputError(fault[1], where=f"row {fault[0] + 1}")
+        object.__setattr__(self, "t_s", t_s)
+        object.__setattr__(self, "positions_m", positions)
+        object.__setattr__(self, "quaternions_xyzw", _unit_and_continuous(quaternions))
+
+    @classmethod
+    def fixed(cls, t0_s: float = 0.0) -> PoseSequence:
+        """Return the identity pose for all time: grasped nodes stay where they are undeformed."""
+        return cls(np.array([t0_s]), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
+
+    @classmethod
+    def from_matrices(
+        cls, t_s: ArrayLike, matrices: ArrayLike, interpolation: Interpolation = "linear"
+    ) -> PoseSequence:
+        """Poses from 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) in metres, at the times `t_s` (m,).
+
+        Raises
+        ------
+        InputError
+            If shapes disagree, or a matrix is no rigid motion; the first bad one is named.
+        """
+        times = read_only_floats(t_s, (None,), "t_s of the poses", finite=False)
+        given = read_only_floats(matrices, (len(times), 4, 4), "matrices of the poses", False)
+        if fault := first_matrix_fault(times, given):
+            raise InputError(fault[1], where=f"matrix {fault[0] + 1}")
+        quaternions = Rotation.from_matrix(given[:, :3, :3]).as_quat()
+        return cls(times, given[:, :3, 3], quaternions, interpolation)
+
+    def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
+        """Return the poses at the times `t_s` (k,).
+
+        Up to half a sample before the first and after the last pose is allowed: "linear" continues
+        the motion of the end interval there, "hold" repeats the end pose.
+
+        Returns
+        -------
+        rotation_matrices : (k, 3, 3) array
+        translations : (k, 3) array
+            Metres.
+
+        Raises
+        ------
+        InputError
+            If a time lies outside the sequence.
+        """
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        if len(self.t_s) == 1:
+            first = np.zeros(len(times), dtype=np.int64)
+            return self._rotations.as_matrix()[first], self.positions_m[first]
+        self._require_covered(times)
+        if self.interpolation == "hold":
+            snap_s = _HOLD_SNAP * np.diff(self.t_s).min() + TIME_TOLERANCE_S
+            k = np.maximum(np.searchsorted(self.t_s, times + snap_s, side="right") - 1, 0)
+            return self._rotations.as_matrix()[k], self.positions_m[k]
+        k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
+        fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
+        step_m = self.positions_m[k + 1] - self.positions_m[k]
+        turn = Rotation.from_rotvec(fraction * self._turns[k])
+        rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
+        return rotations, self.positions_m[k] + fraction * step_m
+
+    def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
+        """Return where the undeformed points (k, 3) are carried at `t_s` (T,), as (T, k, 3)."""
+        rotations, translations = self.at(t_s)
+        points = np.asarray(points_m, dtype=np.float64)
+        return np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
+
+    @cached_property
+    def _rotations(self) -> Rotation:
+        return Rotation.from_quat(self.quaternions_xyzw)
+
+    @cached_property
+    def _turns(self) -> Array:
+        """Rotation vector from each sample to the next, in the frame of the earlier one."""
+        return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
+
+    def _require_covered(self, times: Array) -> None:
+        first_step, last_step = np.diff(self.t_s)[[0, -1]]
+        earliest = self.t_s[0] - max(0.5 * first_step, TIME_TOLERANCE_S)
+        latest = self.t_s[-1] + max(0.5 * last_step, TIME_TOLERANCE_S)
+        outside = ~((times >= earliest) & (times <= latest))
+        if outside.any():
+            raise InputError(
+                f"a pose is needed at t = {times[outside][0]:.9g} s, but the poses run from "
+                f"{self.t_s[0]:.9g} s to {self.t_s[-1]:.9g} s; record poses over the whole "
+                "experiment, or cut it with window_s"
+            )
+
+
+def first_pose_fault(
+    t_s: Array, positions_m: Array, quaternions_xyzw: Array
+) -> tuple[int, str] | None:
+    """Return the index of the first unusable pose and what is wrong with it; None if all are fine.
+
+    Values that are not finite are looked for first, then times that do not increase, then
+    quaternions that are not of unit norm.
+    """
+    finite = np.isfinite(np.column_stack([t_s, positions_m, quaternions_xyzw])).all(axis=1)
+    if not finite.all():
+        return int(np.argmin(finite)), "the pose holds a value that is not a finite number"
+    if fault := first_time_fault(t_s):
+        return fault
+    norms = np.linalg.norm(quaternions_xyzw, axis=1)
+    off = np.flatnonzero(np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE)
+    if off.size:
+        row = int(off[0])
+        return row, (
+            f"the quaternion at t_s = {t_s[row]:.9g} has the norm {norms[row]:.6g}; expected 1 "
+            f"within {QUATERNION_NORM_TOLERANCE:g} (order x, y, z, w)"
+        )
+    return None
+
+
+def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
+    """Return the index of the first matrix that is no rigid motion, and why; None if all are.
+
+    SciPy would make any matrix orthonormal without a word.
+    """
+    rotations = matrices[:, :3, :3]
+    with np.errstate(invalid="ignore"):
+        gram = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2))
+        last = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
+        last_column = np.abs(matrices[:, :3, 3]).max(axis=1)
+    for k, time_s in enumerate(t_s):
+        at = f"the matrix at t_s = {time_s:.9g}"
+        if not np.isfinite(matrices[k]).all():
+            return k, f"{at} holds a value that is not a finite number"
+        if last[k] > _LAST_ROW:
+            row = ", ".join(f"{value:.4g}" for value in matrices[k, 3])
+            hint = "; is it written column by column?" if last_column[k] <= _LAST_ROW else ""
+            return k, f"{at} has the last row {row}; expected 0, 0, 0, 1{hint}"
+        if gram[k] > _ORTHONORMAL:
+            return k, (
+                f"{at} is no rotation: its RᵀR differs from the identity by {gram[k]:.3g}; "
+                f"expected at most {_ORTHONORMAL:g}"
+            )
+        if np.linalg.det(rotations[k]) < 0:
+            return k, f"{at} mirrors: its determinant is −1; expected a rotation"
+    return None
+
+
+def _unit_and_continuous(quaternions: Array) -> Array:
+    """Normalise, and flip signs so that neighbours lie in the same half of the sphere."""
+    unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    aligned = np.sum(unit[1:] * unit[:-1], axis=1) >= 0.0
+    signs = np.cumprod(np.concatenate([[1.0], np.where(aligned, 1.0, -1.0)]))
+    continuous = unit * signs[:, None]
+    continuous.setflags(write=False)
+    return continuous

@@ -1,0 +1,250 @@
+"""A problem as plain data: what was recorded, what is estimated, and how it is to be solved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ..checked import Positive
+from ..errors import InputError
+from ..experiment import Experiment
+from ..fem.body import Body
+from ..methods import METHODS
+from ..methods.described import require_method
+from ..methods.method import Method
+from ..methods.options import Options
+from ..nlp.collocation import Collocation
+from ..nlp.parameters import Parameters, Tied, Unknown
+from ..nlp.schemes import Scheme, as_scheme
+from ..statistics.uncertainty import ErrorsOption, Noise
+
+
+@dataclass(frozen=True)
+class RolloutOptions(Options):
+    """The forward simulation that checks the answer.
+
+    Attributes
+    ----------
+    integrator : {"newmark", "scheme"}
+    timestep_s : float, optional
+        Newmark's step; a quarter of the sample interval by default.
+    """
+
+    integrator: Literal["newmark", "scheme"] = "newmark"
+    timestep_s: Positive | None = None
+
+
+@dataclass(frozen=True)
+class UncertaintyOptions(Options):
+    """How the error bars are found.
+
+    Attributes
+    ----------
+    noise : {"given", "estimated"}
+        Trust the markers' sigma_m, or scale it by the residuals.
+    errors : {"auto", "independent", "autocorrelated"}
+        What to assume of the errors; "auto" tests the residuals.
+    profile : tuple of str
+        Parameters whose profile likelihood is wanted.
+    """
+
+    noise: Noise = "given"
+    errors: ErrorsOption = "auto"
+    profile: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a problem came from.
+
+    Attributes
+    ----------
+    path : Path of the problem file
+    text : str, the problem as run, with what was overridden
+    files : tuple of Path, those it names
+    """
+
+    path: Path
+    text: str = field(repr=False)
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Experiments that share parameters, and how these are to be found.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        With names that differ; those for validation are predicted only. Their bodies may differ.
+    parameters : Parameters, or mapping of name to Unknown, Tied or a fixed number
+    scheme : str or Scheme, default "midpoint"
+    substeps : int, default 1
+        Grid steps between samples.
+    explicit_grasps : bool, default False
+        Grasped nodes as constraint rows instead of bounds.
+    huber : float, optional
+        Huber's loss beyond this many standard deviations.
+    method : str or Method, default "reduced-space"
+        A name in `methods` or `METHODS`, or anything that solves a `Collocation`.
+    methods : mapping of name to Method
+        What names stand for, where not for a method of `METHODS` with its default options.
+    rollout : RolloutOptions
+    uncertainty : UncertaintyOptions
+    title : str
+    notes : sequence of str
+        What was assumed on the way; what was cleaned in the meshes joins it.
+    origin : Origin, optional
+        The problem file, if there is one.
+
+    Raises
+    ------
+    InputError
+        For experiments of one name, parameters that do not give the constants of the bodies, an
+        unknown scheme or method, or a profile of what is not estimated.
+    """
+
+    experiments: tuple[Experiment, ...]
+    parameters: Parameters
+    scheme: str | Scheme
+    substeps: int
+    explicit_grasps: bool
+    huber: float | None
+    method: str | Method
+    methods: Mapping[str, Method]
+    rollout: RolloutOptions
+    uncertainty: UncertaintyOptions
+    title: str
+    notes: tuple[str, ...]
+    origin: Origin | None
+
+    def __init__(
+        self,
+        experiments: Iterable[Experiment],
+        parameters: Parameters | Mapping[str, Unknown | Tied | float],
+        *,
+        scheme: str | Scheme = "midpoint",
+        substeps: int = 1,
+        explicit_grasps: bool = False,
+        huber: float | None = None,
+        method: str | Method = "reduced-space",
+        methods: Mapping[str, Method] | None = None,
+        rollout: RolloutOptions = RolloutOptions(),
+        uncertainty: UncertaintyOptions = UncertaintyOptions(),
+        title: str = "",
+        notes: Iterable[str] = (),
+        origin: Origin | None = None,
+    ) -> None:
+        vars(self).update(
+            experiments=tuple(experiments),
+            parameters=(
+                parameters if isinstance(parameters, Parameters) else Parameters.of(parameters)
+            ),
+            scheme=scheme,
+            substeps=substeps,
+            explicit_grasps=explicit_grasps,
+            huber=huber,
+            method=method,
+            methods=dict(methods or {}),
+            rollout=rollout,
+            uncertainty=uncertainty,
+            title=title,
+            origin=origin,
+        )
+        cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
+        vars(self)["notes"] = tuple(dict.fromkeys((*cleaned, *notes)))
+        self._check()
+
+    def __repr__(self) -> str:
+        names = ", ".join(repr(experiment.name) for experiment in self.experiments)
+        title = f"{self.title!r}, " if self.title else ""
+        return f"Problem({title}experiments {names}; {self.parameters!r})"
+
+    @classmethod
+    def read(
+        cls,
+        path: str | Path,
+        overrides: Sequence[str] = (),
+        allow_code: bool = False,
+        simulation: bool = False,
+    ) -> Problem:
+        """Read a problem file (TOML) and the files it names.
+
+        Parameters
+        ----------
+        path : str or Path
+        overrides : sequence of "dotted.key=value"
+        allow_code : bool
+            Run the Python files that materials name.
+        simulation : bool
+            Markers need no file then: those with a `reference_m` are sampled at the poses' times.
+            And every experiment may be for validation.
+
+        Raises
+        ------
+        InputError
+            One clear message for the first thing that is wrong.
+        """
+        from .loading import read_problem  # files are one way to make a problem
+
+        return read_problem(path, overrides, allow_code, simulation)
+
+    @property
+    def path(self) -> Path | None:
+        """The problem file, if there is one."""
+        return None if self.origin is None else self.origin.path
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The bodies of the experiments, each once."""
+        return tuple({id(e.body): e.body for e in self.experiments}.values())
+
+    def collocation(self) -> Collocation:
+        """The nonlinear program of the problem."""
+        return Collocation(
+            self.experiments,
+            self.parameters,
+            self.scheme,
+            self.substeps,
+            self.explicit_grasps,
+            self.huber,
+        )
+
+    def solver(self, method: str | Method | None = None) -> Method:
+        """The method that a name stands for, the problem's own by default.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        chosen = self.method if method is None else method
+        if not isinstance(chosen, str):
+            return chosen
+        if chosen in self.methods:
+            return self.methods[chosen]
+        require_method(chosen, "method")
+        return METHODS[chosen]()
+
+    def _check(self) -> None:
+        names = [experiment.name for experiment in self.experiments]
+        if not names:
+            raise InputError("there is no experiment; expected at least one")
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"two experiments are named {repeated[0]!r}; names must differ")
+        self.parameters.fit(self.bodies)
+        for experiment in self.experiments:
+            try:
+                as_scheme(self.scheme, experiment.start_rule)
+            except InputError as error:
+                raise error.located(where=f"experiment '{experiment.name}'") from error
+        self.solver()
+        free = [item.name for item in self.parameters.free]
+        for name in self.uncertainty.profile:
+            if name not in free:
+                raise InputError(
+                    f"found {name!r}; expected estimated parameters, {', '.join(free)}",
+                    where="uncertainty.profile",
+                )
