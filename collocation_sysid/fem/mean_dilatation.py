@@ -121,4 +121,6 @@ class MeanDilatation:
         if field == "x":
             return ca.SX.eye(count)
         rates = range(1, count, 2)
-        return ca.SX(ca.DM.triplet(list(rates), [k - 1 for k in rates], [1.0] * len(rates), count, count))
+        return ca.SX(
+            ca.DM.triplet(list(rates), [k - 1 for k in rates], [1.0] * len(rates), count, count)
+        )
