@@ -27,13 +27,10 @@ import casadi as ca
 
 from .damping import Damping
 from .elements import Element
-from .kernel import Contraction, PointKernel
+from .kernel import PointKernel
 from .materials import Material
-from .mean_dilatation import MeanDilatation
-from .point import Pieces, Point
-
-# A derivative of a scalar: by none, one or two of x, v and θ.
-By = tuple[str, ...]
+from .mean_dilatation import averaging_kernel
+from .point import By, Pieces, Point, contraction_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,35 +60,14 @@ class Law:
 
 
 def kernel_of(name: str, point: Point, scalar: ca.SX, derivatives: dict[str, By]) -> PointKernel:
-    """The kernel of derivatives of a scalar, by x, v and θ; by none of them, it may be several."""
-    mean = None
-    if point.volumes:
-        mean = MeanDilatation.of(point, scalar, max(map(len, derivatives.values())))
-    pieces: Pieces = {key: (_how(by), _piece(point, scalar, by)) for key, by in derivatives.items()}
-    if mean is None:
-        last = point.phase(name, pieces)
-        return PointKernel(last.pieces, tuple(point.fields), last.contractions)
-    for key, by in derivatives.items():
-        if _how(by) == "pairs":
-            pieces[key] = "pairs", pieces[key][1] + mean.piece(by)
-    last = point.phase(name, pieces, mean.sums)
-    couplings = [mean.coupling(by) for by in derivatives.values()]
-    coupling = ca.Function("coupling", [mean.sums], couplings, ["sums"], list(derivatives))
-    return PointKernel(last.pieces, tuple(point.fields), last.contractions, mean.phases(), coupling)
-
-
-def _how(by: By) -> Contraction:
-    hows: tuple[Contraction, ...] = ("none", "nodes", "pairs")
-    return hows[len(by) - by.count("theta")]
-
-
-def _piece(point: Point, scalar: ca.SX, by: By) -> ca.SX:
-    """A derivative at fixed volumes of the element."""
-    inputs = [point.theta if name == "theta" else point.gradients[name] for name in by]
-    if not inputs:
-        return scalar
-    gradient = ca.gradient(scalar, inputs[0])
-    return ca.jacobian(gradient, inputs[1]) if inputs[1:] else gradient
+    """The kernel of derivatives of a scalar of a point."""
+    if point.stretches:
+        return averaging_kernel(name, point, scalar, derivatives)
+    pieces: Pieces = {
+        key: (contraction_of(by), point.derivative(scalar, by)) for key, by in derivatives.items()
+    }
+    last = point.phase(name, pieces)
+    return PointKernel(last.pieces, tuple(point.fields), last.contractions)
 
 
 def _energy(point: Point, law: Law) -> ca.SX:

@@ -6,15 +6,14 @@ numbers whatever the element, its *pieces*. How they meet the shape gradients is
 instructions.
 
 Most kernels are one sum over the points. In others a point needs to know of the whole element, such
-as its volume. They have earlier `Phase`s, each a sum over the points of its own, and a coupling: with
-A (3·nodes, m) holding the node vectors that those phases summed, it adds A C to an output that is
-one vector or k, and the lower triangle of A D Aᵀ to one that is a matrix.
+as its volume. They have earlier `Phase`s, each a sum over the points of its own, and a coupling:
+with A (3·nodes, m) holding the node vectors so summed, it adds A C to an output that is contracted
+to node vectors, and the lower triangle of A D Aᵀ to one that is a matrix.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -81,20 +80,24 @@ class PointKernel:
     fields : tuple of str
         Names of the inputs that come first, each 3·nodes long.
     earlier : tuple of Phase
+    coupled : dict of str to Contraction
+        Further outputs of the pieces, which are summed for the coupling alone.
     coupling : casadi.Function, optional
-        C or D for each output, sparse, from the vector of all uncontracted sums.
+        C or D for each output, sparse, from the vector of all uncontracted sums: those of the
+        earlier phases, then of `coupled`.
     """
 
     pieces: ca.Function
     fields: tuple[str, ...]
     contractions: dict[str, Contraction]
     earlier: tuple[Phase, ...] = ()
+    coupled: dict[str, Contraction] = field(default_factory=dict)
     coupling: ca.Function | None = None
 
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """All of them, the last one included."""
-        return (*self.earlier, Phase(self.pieces, self.contractions))
+        return (*self.earlier, Phase(self.pieces, self.contractions | self.coupled))
 
     def element_function(self, points: int) -> ca.Function:
         """The sum over an element, of fields, geometry (3·nodes + 1, points) and θ."""
@@ -104,14 +107,16 @@ class PointKernel:
         inputs[place] = ca.MX.sym("geometry", self.pieces.size1_in(place), points)
         size = 3 * self.phases[0].nodes
         sums, vectors = ca.MX(0, 1), ca.MX(size, 0)
-        for phase in self.earlier:
-            found = phase.over_points(*inputs, *_unless_empty(sums))
-            for total, how in zip(found, phase.contractions.values(), strict=True):
-                if how == "none":
+        outputs: list[ca.MX] = []
+        for phase in self.phases:
+            found = phase.over_points(*inputs, *([sums] if sums.numel() else []))
+            for key, total in zip(phase.contractions, found, strict=True):
+                if key in self.contractions:
+                    outputs.append(total)
+                elif phase.contractions[key] == "none":
                     sums = ca.vertcat(sums, total)
                 else:
                     vectors = ca.horzcat(vectors, ca.reshape(total, size, -1))
-        outputs = self.phases[-1].over_points(*inputs, *_unless_empty(sums))
         if self.coupling:
             couplings = self.coupling.call([sums])
             hows = self.contractions.values()
@@ -124,10 +129,6 @@ class PointKernel:
 def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
     """(nodes, 3) shape gradients."""
     return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
-
-
-def _unless_empty(sums: ca.MX) -> Sequence[ca.MX]:
-    return [sums] if sums.numel() else []
 
 
 def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:

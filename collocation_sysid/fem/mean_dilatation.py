@@ -1,126 +1,211 @@
 """Elements that average the dilatation, so that they do not lock near incompressibility.
 
-Their material feels F* = (J̄/J)^⅓ F with J̄ = v/V, the element's current volume over its undeformed
-one (Nagtegaal, Parks & Rice 1974; Simo, Taylor & Pister 1985); for ψ = ψ_iso(J^−⅓ F) + U(J) the
-energy is Σ_q V_q ψ_iso + V U(J̄). A scalar of the element is then Σ_q g(F_q, Ḟ_q, W_q, s; θ), where
+Their material feels F* = eᵐ F with m = ⅓ ln(J̄/J), J̄ = v/V, the element's current volume over its
+undeformed one (Nagtegaal, Parks & Rice 1974; Simo, Taylor & Pister 1985). For ψ_iso(J^−⅓ F) + U(J)
+the energy is Σ_q V_q ψ_iso + V U(J̄); for any other it has the same limit under refinement.
 
-    s = Σ_q σ(F_q, Ḟ_q, W_q)
+A scalar of the element is then Σ_q g(F_q, Ḟ_q, W_q, m_q; θ). Here s = Σ_q σ(F_q, Ḟ_q, W_q) are v,
+its derivative along the velocities, and those of both along w; m their likes of ⅓ ln(J̄/J); and
 
-are v, its derivative along the velocities, and those of both along w. With Π = Σ_q ∂g/∂s, the
-derivatives by nodal fields α, β are Σ_q ∂g/∂α + Π·∂s/∂α, and
+    m_q = n(s, V) − n(σ_q, V_q),   n = ⅓ ln(v/V) and its likes.
 
-    Σ_q (∂²g/∂α∂β + Π·∂²σ_q/∂α∂β)
-        + (Σ_q ∂²g/∂α∂s) ∂s/∂β + ∂s/∂α (Σ_q ∂²g/∂s∂β) + ∂s/∂α (Σ_q ∂²g/∂s²) ∂s/∂β.
+By the chain rule, twice, and with α, β any of x and v, the scalar's derivatives are Σ_q of those at
+fixed s, and with Γ = Σ_q ∂g/∂m
 
-So there are two phases before the last: s with ∂s/∂x, then what of g needs s. The node vectors are
-A = (∂s/∂x, Σ_q ∂²g/∂x∂s); those by v are among them, as s changes with v only where it holds a
-derivative along v, and there like what this is the derivative of.
+    Γ ∂n/∂s ∂s/∂α                                                           of the first, and
+    (Σ_q ∂²g/∂α∂m) ∂n/∂s ∂s/∂β + its transpose of α and β
+        + ∂s/∂α [∂n/∂s (Σ_q ∂²g/∂m²) ∂n/∂s + Γ ∂²n/∂s²] ∂s/∂β + Γ ∂n/∂s ∂²s/∂α∂β   of the second.
+
+So two phases go before the last, for s and for Γ. The node vectors coupled are ∂s/∂x and
+Σ_q ∂²g/∂x∂m; those by v are among them, since what of s is a rate changes with v as that which it is
+the rate of changes with x.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import casadi as ca
 
-from .kernel import Phase
-from .point import Pieces, Point
+from .kernel import PointKernel
+from .point import By, Pieces, Point, contraction_of
+
+
+def averaging_kernel(
+    name: str, point: Point, scalar: ca.SX, derivatives: dict[str, By]
+) -> PointKernel:
+    """The kernel of derivatives of a scalar that depends on `Point.stretches`."""
+    order = max(map(len, derivatives.values()))
+    chain = _Chain.of(point, scalar)
+    own: Pieces = {key: (contraction_of(by), chain.piece(by)) for key, by in derivatives.items()}
+    slopes: Pieces = {"slopes": ("none", chain.by_stretch)}
+    coupled: Pieces = slopes if order == 1 else chain.second() if order else {}
+    sums = ca.vertcat(chain.volume, chain.volumes)
+    earlier = [point.phase("volumes", chain.first(order))]
+    if order > 1:
+        earlier.append(point.phase("slopes", chain.at_sums(slopes), sums))
+        sums = ca.vertcat(sums, chain.slopes)
+    last = point.phase(name, chain.at_sums(own | coupled), sums)
+    return PointKernel(
+        last.pieces,
+        tuple(point.fields),
+        {key: last.contractions[key] for key in own},
+        tuple(earlier),
+        {key: last.contractions[key] for key in coupled},
+        chain.coupling(derivatives, order) if order else None,
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class MeanDilatation:
-    """What a scalar's derivatives need besides those at fixed s.
-
-    Attributes
-    ----------
-    point : Point
-    scalar : SX
-        g.
-    order : int
-        Of the highest derivative by nodal fields and θ.
-    slopes, second, by_theta : SX
-        Symbols of Π, Σ_q ∂²g/∂s² and ∂Π/∂θ, of the order that is needed.
-    """
+class _Chain:
+    """A scalar g in the symbols of a point; V, s and Γ as symbols of sums; σ; and n of σ."""
 
     point: Point
     scalar: ca.SX
-    order: int
+    volume: ca.SX
+    volumes: ca.SX
     slopes: ca.SX
-    second: ca.SX
-    by_theta: ca.SX
+    own_volumes: ca.SX
 
     @classmethod
-    def of(cls, point: Point, scalar: ca.SX, order: int) -> MeanDilatation:
-        """Of a scalar that may depend on `Point.volumes`."""
-        count, constants = len(point.volumes), point.theta.numel()
-        return cls(
-            point,
-            scalar,
-            order,
-            ca.SX.sym("slopes", count * (order > 0)),
-            ca.SX.sym("second", *[count * (order > 1)] * 2),
-            ca.SX.sym("by_theta", count * (order > 1), constants),
-        )
+    def of(cls, point: Point, scalar: ca.SX) -> _Chain:
+        count = len(point.stretches)
+        F, *rates = point.gradients.values()
+        own = point.volume * ca.det(ca.reshape(F, 3, 3))
+        for rate in rates:
+            own = ca.vertcat(own, ca.jtimes(own, F, rate))
+        s, slopes = ca.SX.sym("volumes", count), ca.SX.sym("slopes", count)
+        return cls(point, scalar, ca.SX.sym("volume"), s, slopes, own)
 
-    @property
-    def sums(self) -> ca.SX:
-        """What the last phase may depend on."""
-        later = [ca.vec(symbol) for symbol in (self.slopes, self.second, self.by_theta)]
-        return ca.vertcat(self._first_sums, *later)
+    @cached_property
+    def _of_sums(self) -> list[ca.SX]:
+        """The n of s, ∂n/∂s, and Γ ∂²n/∂s²."""
+        return _logarithms(self.volumes.numel()).call([self.volumes, self.volume, self.slopes])
 
-    @property
-    def _first_sums(self) -> ca.SX:
-        return ca.vertcat(self.point.whole_volume, *self.point.volumes)
+    @cached_property
+    def _of_own(self) -> list[ca.SX]:
+        """The n of σ, ∂n/∂σ, and ∂g/∂m ∂²n/∂σ²."""
+        own = self.own_volumes
+        return _logarithms(own.numel()).call([own, self.point.volume, self.by_stretch])
 
-    def phases(self) -> tuple[Phase, ...]:
-        """Those before the last."""
-        point, F, s = self.point, self.point.gradients["x"], ca.vertcat(*self.point.volumes)
-        volumes = self._own_volumes()
-        first: Pieces = {"whole_volume": ("none", point.volume), "volumes": ("none", volumes)}
-        if not self.order:
-            return (point.phase("volumes", first),)
-        first["volumes_by_x"] = "nodes", ca.jacobian(volumes, F).T
-        slopes = ca.gradient(self.scalar, s)
-        second: Pieces = {"slopes": ("none", slopes)}
-        if self.order > 1:
-            second["second"] = "none", ca.vec(ca.jacobian(slopes, s))
-            second["slopes_by_theta"] = "none", ca.vec(ca.jacobian(slopes, point.theta))
-            second["slopes_by_x"] = "nodes", ca.jacobian(slopes, F).T
-        return point.phase("volumes", first), point.phase("slopes", second, self._first_sums)
+    @cached_property
+    def by_stretch(self) -> ca.SX:
+        """∂g/∂m."""
+        return ca.gradient(self.scalar, self._stretches)
 
-    def piece(self, by: tuple[str, ...]) -> ca.SX:
-        """Π·∂²σ/∂α∂β."""
-        alpha, beta = (self.point.gradients[field] for field in by)
-        work = ca.dot(self.slopes, self._own_volumes())
-        return ca.jacobian(ca.gradient(work, alpha), beta)
+    def at_sums(self, pieces: Pieces) -> Pieces:
+        """Pieces with m put in."""
+        m = self._of_sums[0] - self._of_own[0]
+        return {
+            key: (how, ca.substitute(piece, self._stretches, m))
+            for key, (how, piece) in pieces.items()
+        }
 
-    def coupling(self, by: tuple[str, ...]) -> ca.SX:
-        """C or D of a derivative, in the symbols of the sums; see `kernel`."""
+    def first(self, order: int) -> Pieces:
+        """V, s and, to couple, ∂s/∂x."""
+        sums: Pieces = {
+            "volume": ("none", self.point.volume),
+            "volumes": ("none", self.own_volumes),
+        }
+        if order:
+            sums["volumes_by_x"] = "nodes", self._own_by("x").T
+        return sums
+
+    def second(self) -> Pieces:
+        """Σ_q of what couples in second derivatives besides: ∂²g by (m, m), (m, θ) and (x, m)."""
+        by_theta = ca.jacobian(self.by_stretch, self.point.theta)
+        by_m = (self._lifted("x").T @ self._hessian("x"))[:, 9:]
+        return {
+            "second": ("none", ca.vec(self._hessian("x")[9:, 9:])),
+            "slopes_by_theta": ("none", ca.vec(by_theta)),
+            "slopes_by_x": ("nodes", by_m),
+        }
+
+    def piece(self, by: By) -> ca.SX:
+        """A derivative at fixed s, and Γ ∂n/∂s ∂²σ/∂α∂β."""
         nodal = [field for field in by if field != "theta"]
         if not nodal:
-            return ca.SX(0, 0)
-        count = self.slopes.numel()
-        along = self._as_by_x(nodal[-1])
-        if len(nodal) == 2:
-            nothing = ca.SX(count, count)
-            return ca.blockcat([[self.second @ along, along.T], [along, nothing]])
-        slopes = self.slopes if len(by) == 1 else self.by_theta
-        return ca.vertcat(along.T @ slopes, ca.SX(count * (self.order > 1), slopes.shape[1]))
+            return self.point.derivative(self.scalar, by)
+        if len(nodal) == 1:
+            gradient = ca.gradient(self.scalar, self.point.gradients[nodal[0]])
+            gradient += (self._lifted(nodal[0])[9:, :]).T @ self.by_stretch
+            return gradient if len(by) == 1 else ca.jacobian(gradient, self.point.theta)
+        alpha, beta = nodal
+        weights = ca.SX.sym("weights", self.volumes.numel())
+        _, by_s, _ = self._of_sums
+        _, by_own, bent_by_own = self._of_own
+        bent = ca.jacobian(
+            ca.gradient(ca.dot(weights, self.own_volumes), self.point.gradients[alpha]),
+            self.point.gradients[beta],
+        )
+        weighed = by_s.T @ self.slopes - by_own.T @ self.by_stretch
+        return (
+            self._lifted(alpha).T @ self._hessian(beta) @ self._lifted(beta)
+            - self._own_by(alpha).T @ bent_by_own @ self._own_by(beta)
+            + ca.substitute(bent, weights, weighed)
+        )
 
-    def _own_volumes(self) -> ca.SX:
-        """σ."""
-        volumes = self.point.current_volume
-        for field in list(self.point.fields)[1:]:
-            along = ca.jtimes(volumes, self.point.gradients["x"], self.point.gradients[field])
-            volumes = ca.vertcat(volumes, along)
-        return volumes
+    def coupling(self, derivatives: dict[str, By], order: int) -> ca.Function:
+        """C or D of each derivative; see `kernel`."""
+        count, constants = self.volumes.numel(), self.point.theta.numel()
+        second = ca.SX.sym("second", count, count)
+        by_theta = ca.SX.sym("slopes_by_theta", count, constants)
+        sums = [self.volume, self.volumes, self.slopes]
+        if order > 1:
+            sums += [ca.vec(second), ca.vec(by_theta)]
+        _, by_s, bent = self._of_sums
+        couplings = []
+        for by in derivatives.values():
+            if contraction_of(by) == "none":
+                couplings.append(ca.SX(0, 0))
+                continue
+            as_x = self._as_by_x(by[-1] if by[-1] != "theta" else by[0])
+            by_field = by_s @ as_x
+            if contraction_of(by) == "pairs":
+                own = (by_s.T @ second @ by_s + bent) @ as_x
+                couplings.append(ca.blockcat([[own, by_field.T], [by_field, ca.SX(count, count)]]))
+            else:
+                slopes = by_theta if len(by) > 1 else self.slopes
+                rest = ca.SX(count if order > 1 else 0, slopes.shape[1])
+                couplings.append(ca.vertcat(by_field.T @ slopes, rest))
+        return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(derivatives))
+
+    @property
+    def _stretches(self) -> ca.SX:
+        return ca.vertcat(*self.point.stretches)
+
+    def _own_by(self, field: str) -> ca.SX:
+        """∂σ by F or its like."""
+        return ca.jacobian(self.own_volumes, self.point.gradients[field])
+
+    def _lifted(self, field: str) -> ca.SX:
+        """∂(F, m)/∂F at fixed s, or its like for another field."""
+        return ca.vertcat(ca.SX.eye(9), -self._of_own[1] @ self._own_by(field))
+
+    def _hessian(self, field: str) -> ca.SX:
+        """∂²g by (F, m), and (F, m) or its like for another field."""
+        rows, columns = (
+            ca.vertcat(self.point.gradients[name], self._stretches) for name in ("x", field)
+        )
+        return ca.jacobian(ca.gradient(self.scalar, rows), columns)
 
     def _as_by_x(self, field: str) -> ca.SX:
-        """∂s/∂x to ∂s/∂field, one row for each s."""
-        count = self.slopes.numel()
+        """∂s/∂field = this ∂s/∂x."""
+        count = self.volumes.numel()
         if field == "x":
             return ca.SX.eye(count)
-        rates = range(1, count, 2)
-        return ca.SX(
-            ca.DM.triplet(list(rates), [k - 1 for k in rates], [1.0] * len(rates), count, count)
-        )
+        # Every second one is the rate of the one before.
+        return ca.diagcat(*[ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (count // 2))
+
+
+@cache
+def _logarithms(count: int) -> ca.Function:
+    """What n is of (s, V, c), with ∂n/∂s and Σ_k c_k ∂²n_k/∂s²; n has as many entries as s."""
+    s, volume, weights = ca.SX.sym("s", count), ca.SX.sym("V"), ca.SX.sym("c", count)
+    n = ca.log(s[0] / volume) / 3
+    for known in (1, 2):
+        if count > known:
+            n = ca.vertcat(n, ca.jtimes(n, s[:known], s[known : 2 * known]))
+    bent, _ = ca.hessian(ca.dot(weights, n), s)
+    return ca.Function("logarithms", [s, volume, weights], [n, ca.jacobian(n, s), bent])

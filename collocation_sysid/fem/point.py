@@ -9,6 +9,8 @@ import casadi as ca
 from .elements import Element
 from .kernel import Contraction, Phase, node_gradients
 
+# A derivative of a scalar: by none, one or two of x, v and θ, θ last.
+By = tuple[str, ...]
 # For each output its contraction, and its piece in the symbols of a `Point`.
 Pieces = dict[str, tuple[Contraction, ca.SX]]
 
@@ -26,11 +28,9 @@ class Point:
         See `expressions`.
     gradients : dict of str to SX
         Of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column (9): F, Ḟ and W.
-    whole_volume : SX
-        The element's undeformed volume (1) if it averages the dilatation, otherwise empty (0).
-    volumes : tuple of SX
-        Likewise its current volume and, with v, that one's derivative along v, and with w, those
-        of both along w: one, two or four.
+    stretches : tuple of SX
+        Where the element averages the dilatation, the logarithm m of the stretch that does so and,
+        with v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
     """
 
     nodes: int
@@ -38,56 +38,54 @@ class Point:
     geometry: ca.SX
     theta: ca.SX
     gradients: dict[str, ca.SX]
-    whole_volume: ca.SX
-    volumes: tuple[ca.SX, ...]
+    stretches: tuple[ca.SX, ...]
 
     @classmethod
     def of(cls, element: Element, constants: int, *fields: str) -> Point:
         """A point of an element, with θ of so many constants."""
-        count = element.mean_dilatation * 2 ** (len(fields) - 1)
+        stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
         return cls(
             element.nodes,
             {name: ca.SX.sym(name, 3 * element.nodes) for name in fields},
             ca.SX.sym("geometry", 3 * element.nodes + 1),
             ca.SX.sym("theta", constants),
             {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
-            ca.SX.sym("whole_volume", int(element.mean_dilatation)),
-            tuple(ca.SX.sym(f"volume_{k}") for k in range(count)),
+            tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
         )
 
     @property
     def volume(self) -> ca.SX:
-        """The point's share of the undeformed volume."""
+        """The point's share of the element's."""
         return self.geometry[3 * self.nodes]
 
     @property
-    def current_volume(self) -> ca.SX:
-        """The point's share of it."""
-        return self.volume * ca.det(ca.reshape(self.gradients["x"], 3, 3))
-
-    @property
     def felt(self) -> ca.SX:
-        """The deformation gradient that the material feels, (3, 3); see `mean_dilatation`."""
+        """The deformation gradient that the material feels, (3, 3)."""
         F = ca.reshape(self.gradients["x"], 3, 3)
-        if not self.volumes:
-            return F
-        mean = self.volumes[0] / self.whole_volume
-        return ca.exp(ca.log(mean * self.volume / self.current_volume) / 3) * F
+        return ca.exp(self.stretches[0]) * F if self.stretches else F
 
     @property
     def strain(self) -> ca.SX:
-        """What of an energy changes with x: F and, if it matters, the element's volume."""
-        return ca.vertcat(self.gradients["x"], *self.volumes[:1])
+        """What of an energy changes with x: F and m."""
+        return ca.vertcat(self.gradients["x"], *self.stretches[:1])
 
     @property
     def strain_rate(self) -> ca.SX:
-        """The derivative of the strain along v."""
-        return ca.vertcat(self.gradients["v"], *self.volumes[1:2])
+        """Its derivative along v."""
+        return ca.vertcat(self.gradients["v"], *self.stretches[1:2])
 
     def along_w(self, scalar: ca.SX) -> ca.SX:
         """Derivative of a scalar of x and v by x, along w."""
-        inputs = ca.vertcat(self.gradients["x"], *self.volumes[:2])
-        return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.volumes[2:]))
+        inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
+        return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))
+
+    def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
+        """A derivative of a scalar, by the fields' gradients for the fields."""
+        inputs = [self.theta if name == "theta" else self.gradients[name] for name in by]
+        if not inputs:
+            return scalar
+        gradient = ca.gradient(scalar, inputs[0])
+        return ca.jacobian(gradient, inputs[1]) if inputs[1:] else gradient
 
     def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """A phase of these pieces, which may depend on sums of earlier ones."""
@@ -108,3 +106,9 @@ class Point:
             name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
         )
         return Phase(function, {key: how for key, (how, _) in pieces.items()})
+
+
+def contraction_of(by: By) -> Contraction:
+    """What becomes of the piece of a derivative: it has as many node indices as fields."""
+    hows: tuple[Contraction, ...] = ("none", "nodes", "pairs")
+    return hows[len(by) - by.count("theta")]

@@ -106,12 +106,12 @@ class _Layout:
         ]
         self.outputs = (first + np.cumsum([0, *outputs])).tolist()
 
-    def entries(self, how: Contraction, step: int) -> list[int]:
-        """Places of what is so contracted, each of `step` entries."""
+    def entries(self, first: int, how: Contraction, step: int) -> list[int]:
+        """Places of what is so contracted, each of `step` entries, from an output on."""
         return [
             place
             for k, mine in enumerate(self.contractions)
-            if mine == how
+            if k >= first and mine == how
             for place in range(self.outputs[k], self.outputs[k + 1], step)
         ]
 
@@ -132,8 +132,11 @@ class _Emitter:
         for phase in kernel.earlier:
             before = self.earlier[-1] if self.earlier else self.last
             self.earlier.append(_Layout(phase, before.outputs[-1]))
-        self.sums = [at for phase in self.earlier for at in phase.entries("none", 1)]
-        self.vectors = [at for phase in self.earlier for at in phase.entries("nodes", self.size)]
+        # What they hold for the coupling, and for later phases.
+        self.own = len(kernel.contractions)
+        shared = [(phase, 0) for phase in self.earlier] + [(self.last, self.own)]
+        self.sums = [at for phase, k in shared for at in phase.entries(k, "none", 1)]
+        self.vectors = [at for phase, k in shared for at in phase.entries(k, "nodes", self.size)]
         self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
@@ -151,7 +154,7 @@ class _Emitter:
         geometry, nodes, destinations, theta, out = args[6 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         phases = [*self.earlier, self.last]
-        outputs, total = self.last.outputs[-1], max(phase.outputs[-1] for phase in phases)
+        outputs, total = self.last.outputs[self.own], max(phase.outputs[-1] for phase in phases)
         totals = self._buffer(total, "totals")
         pieces = self._buffer(max(phase.pieces[-1] for phase in phases), "pieces")
         half = self._buffer(27, "half")
