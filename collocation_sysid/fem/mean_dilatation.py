@@ -17,19 +17,23 @@ fixed s, and with Γ = Σ_q ∂g/∂m
         + ∂s/∂α [∂n/∂s (Σ_q ∂²g/∂m²) ∂n/∂s + Γ ∂²n/∂s²] ∂s/∂β + Γ ∂n/∂s ∂²s/∂α∂β   of the second.
 
 So two phases go before the last, for s and for Γ. The node vectors coupled are ∂s/∂x and
-Σ_q ∂²g/∂x∂m; those by v are among them, since what of s is a rate changes with v as that which it is
-the rate of changes with x.
+Σ_q ∂²g/∂x∂m; those by v are among them, since what of s is a rate along v changes with v as that
+which it is the rate of changes with x.
+
+Of an element only the mean dilatation and the 4 · 5 distortions at its points are resisted: alone,
+it does not resist the three conformal motions that leave its volume as it is. Four elements whose
+centroids are not in a plane do.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import casadi as ca
 
 from .kernel import PointKernel
-from .point import By, Pieces, Point, contraction_of
+from .point import By, Pieces, Point, contraction_of, mirrored
 
 
 def averaging_kernel(
@@ -39,13 +43,14 @@ def averaging_kernel(
     order = max(map(len, derivatives.values()))
     chain = _Chain.of(point, scalar)
     own: Pieces = {key: (contraction_of(by), chain.piece(by)) for key, by in derivatives.items()}
-    slopes: Pieces = {"slopes": ("none", chain.by_stretch)}
-    coupled: Pieces = slopes if order == 1 else chain.second() if order else {}
+    slopes: Pieces = {"slopes": ("none", chain.by_stretch)} if order else {}
     sums = ca.vertcat(chain.volume, chain.volumes)
     earlier = [point.phase("volumes", chain.first(order))]
+    coupled = slopes
     if order > 1:
         earlier.append(point.phase("slopes", chain.at_sums(slopes), sums))
         sums = ca.vertcat(sums, chain.slopes)
+        coupled = chain.second()
     last = point.phase(name, chain.at_sums(own | coupled), sums)
     return PointKernel(
         last.pieces,
@@ -79,24 +84,14 @@ class _Chain:
         return cls(point, scalar, ca.SX.sym("volume"), s, slopes, own)
 
     @cached_property
-    def _of_sums(self) -> list[ca.SX]:
-        """The n of s, ∂n/∂s, and Γ ∂²n/∂s²."""
-        return _logarithms(self.volumes.numel()).call([self.volumes, self.volume, self.slopes])
-
-    @cached_property
-    def _of_own(self) -> list[ca.SX]:
-        """The n of σ, ∂n/∂σ, and ∂g/∂m ∂²n/∂σ²."""
-        own = self.own_volumes
-        return _logarithms(own.numel()).call([own, self.point.volume, self.by_stretch])
-
-    @cached_property
     def by_stretch(self) -> ca.SX:
         """∂g/∂m."""
         return ca.gradient(self.scalar, self._stretches)
 
     def at_sums(self, pieces: Pieces) -> Pieces:
         """Pieces with m put in."""
-        m = self._of_sums[0] - self._of_own[0]
+        m = _stretches(self.volumes, self.volume)
+        m -= _stretches(self.own_volumes, self.point.volume)
         return {
             key: (how, ca.substitute(piece, self._stretches, m))
             for key, (how, piece) in pieces.items()
@@ -133,14 +128,14 @@ class _Chain:
             return gradient if len(by) == 1 else ca.jacobian(gradient, self.point.theta)
         alpha, beta = nodal
         weights = ca.SX.sym("weights", self.volumes.numel())
-        _, by_s, _ = self._of_sums
-        _, by_own, bent_by_own = self._of_own
+        by_s, _ = _slopes(self.volumes, self.volume, self.slopes)
+        by_own, bent_by_own = _slopes(self.own_volumes, self.point.volume, self.by_stretch)
         bent = ca.jacobian(
             ca.gradient(ca.dot(weights, self.own_volumes), self.point.gradients[alpha]),
             self.point.gradients[beta],
         )
         weighed = by_s.T @ self.slopes - by_own.T @ self.by_stretch
-        return (
+        return mirrored(
             self._lifted(alpha).T @ self._hessian(beta) @ self._lifted(beta)
             - self._own_by(alpha).T @ bent_by_own @ self._own_by(beta)
             + ca.substitute(bent, weights, weighed)
@@ -154,7 +149,7 @@ class _Chain:
         sums = [self.volume, self.volumes, self.slopes]
         if order > 1:
             sums += [ca.vec(second), ca.vec(by_theta)]
-        _, by_s, bent = self._of_sums
+        by_s, bent = _slopes(self.volumes, self.volume, self.slopes)
         couplings = []
         for by in derivatives.values():
             if contraction_of(by) == "none":
@@ -181,14 +176,26 @@ class _Chain:
 
     def _lifted(self, field: str) -> ca.SX:
         """∂(F, m)/∂F at fixed s, or its like for another field."""
-        return ca.vertcat(ca.SX.eye(9), -self._of_own[1] @ self._own_by(field))
+        by_own, _ = _slopes(self.own_volumes, self.point.volume, self.by_stretch)
+        return ca.vertcat(ca.SX.eye(9), -by_own @ self._own_by(field))
 
     def _hessian(self, field: str) -> ca.SX:
         """∂²g by (F, m), and (F, m) or its like for another field."""
-        rows, columns = (
-            ca.vertcat(self.point.gradients[name], self._stretches) for name in ("x", field)
+        if field == "x":
+            return self._hessian_by_x
+        rate = self.point.gradients[field]
+        return ca.horzcat(
+            ca.vertcat(
+                self.point.derivative(self.scalar, ("x", field)),
+                ca.jacobian(self.by_stretch, rate),
+            ),
+            self._hessian_by_x[:, 9:],
         )
-        return ca.jacobian(ca.gradient(self.scalar, rows), columns)
+
+    @cached_property
+    def _hessian_by_x(self) -> ca.SX:
+        inputs = ca.vertcat(self.point.gradients["x"], self._stretches)
+        return mirrored(ca.jacobian(ca.gradient(self.scalar, inputs), inputs))
 
     def _as_by_x(self, field: str) -> ca.SX:
         """∂s/∂field = this ∂s/∂x."""
@@ -199,13 +206,20 @@ class _Chain:
         return ca.diagcat(*[ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (count // 2))
 
 
-@cache
-def _logarithms(count: int) -> ca.Function:
-    """What n is of (s, V, c), with ∂n/∂s and Σ_k c_k ∂²n_k/∂s²; n has as many entries as s."""
-    s, volume, weights = ca.SX.sym("s", count), ca.SX.sym("V"), ca.SX.sym("c", count)
+def _stretches(volumes: ca.SX, volume: ca.SX) -> ca.SX:
+    """What n is: ⅓ ln(v/V), its derivative along the velocities, and those of both along w."""
+    s = ca.SX.sym("s", volumes.numel())
     n = ca.log(s[0] / volume) / 3
     for known in (1, 2):
-        if count > known:
+        if s.numel() > known:
             n = ca.vertcat(n, ca.jtimes(n, s[:known], s[known : 2 * known]))
-    bent, _ = ca.hessian(ca.dot(weights, n), s)
-    return ca.Function("logarithms", [s, volume, weights], [n, ca.jacobian(n, s), bent])
+    return ca.substitute(n, s, volumes)
+
+
+def _slopes(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """∂n/∂s, and Σ_k weights_k ∂²n_k/∂s²."""
+    s, c = ca.SX.sym("s", volumes.numel()), ca.SX.sym("c", volumes.numel())
+    n = _stretches(s, volume)
+    found = [ca.jacobian(n, s), ca.hessian(ca.dot(c, n), s)[0]]
+    first, second = ca.substitute(found, [s, c], [volumes, weights])
+    return first, second

@@ -84,8 +84,10 @@ class Point:
         inputs = [self.theta if name == "theta" else self.gradients[name] for name in by]
         if not inputs:
             return scalar
-        gradient = ca.gradient(scalar, inputs[0])
-        return ca.jacobian(gradient, inputs[1]) if inputs[1:] else gradient
+        if len(inputs) < 2:
+            return ca.jacobian(scalar, inputs[0]).T
+        found = ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
+        return mirrored(found) if contraction_of(by) == "pairs" else found
 
     def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """A phase of these pieces, which may depend on sums of earlier ones."""
@@ -106,6 +108,11 @@ class Point:
             name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
         )
         return Phase(function, {key: how for key, (how, _) in pieces.items()})
+
+
+def mirrored(matrix: ca.SX) -> ca.SX:
+    """A matrix that is known to be symmetric, half of which need not be computed."""
+    return ca.tril2symm(ca.tril(ca.densify(matrix)))
 
 
 def contraction_of(by: By) -> Contraction:

@@ -10,7 +10,7 @@ mesh = "body.vtu"              # tetrahedra, any format meshio reads
 # length_unit = "mm"           # of the file; "m" by default
 mass_kg = 0.1                  # weighed; or density_kg_m3
 material = "neo-hookean"       # or st-venant-kirchhoff, mooney-rivlin, stable-neo-hookean, linear
-element = "tet4"               # or tet10, for bending, a slender body, or poisson above 0.4
+element = "tet4"               # or tet10 if it bends or is slender; tet10-p0, poisson above 0.4
 
 [parameters]                   # estimated from a guess within bounds, or {{ fixed = 0.5 }}
 young_pa    = {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
