@@ -1,4 +1,4 @@
-"""From arrays to an answer without a file, with schemes, methods and materials of the user's own."""
+"""From arrays to an answer without a file, with schemes, methods and materials of one's own."""
 
 from __future__ import annotations
 
