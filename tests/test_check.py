@@ -101,9 +101,11 @@ def test_a_recording_shorter_than_a_period_is_warned_of(tiny: Path):
 def test_nearly_incompressible_linear_elements_are_warned_of(tiny: Path):
     nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
     warning = about(checked(tiny, *nearly), "Poisson's ratio is 0.49")
-    assert 'set object.element = "tet10"' in warning
+    assert 'set object.element = "tet10-p0"' in warning
     quadratic = checked(tiny, *nearly, "object.element=tet10")
-    assert not any("Poisson" in warning for warning in quadratic.warnings)
+    assert "tet10 elements lock from 0.45 on" in about(quadratic, "Poisson's ratio is 0.49")
+    averaging = checked(tiny, *nearly, "object.element=tet10-p0")
+    assert not any("Poisson" in warning for warning in averaging.warnings)
 
 
 def test_the_worst_element_is_named():

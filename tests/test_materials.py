@@ -318,3 +318,12 @@ def test_unknown_material_is_refused_with_the_names_there_are():
         as_material("rubber")
     with pytest.raises(InputError, match="did you mean 'mooney-rivlin'"):
         as_material("moony-rivlin")
+
+
+def test_beyond_its_limit_gents_material_has_neither_energy_nor_stress():
+    F = ca.SX.sym("F", 3, 3)
+    psi = MATERIALS["gent"].psi(F, ca.SX([300.0, 8.0, 400.0]))
+    law = ca.Function("law", [F], [psi, ca.gradient(psi, ca.vec(F))])
+    inside, outside = (law(np.diag([s, s**-0.5, s**-0.5])) for s in (2.5, 3.5))
+    assert all(np.isfinite(value.full()).all() for value in inside)
+    assert all(np.isnan(value.full()).any() for value in outside)

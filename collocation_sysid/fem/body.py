@@ -89,7 +89,8 @@ class Body:
         Exactly one of them. Regions may have densities of their own; the mass is that of all.
     element : str, default "tet4"
         A name in `elements.ELEMENTS`. "tet10" puts a node on every edge of the mesh: some eight
-        times the unknowns, and far better in bending or when nearly incompressible.
+        times the unknowns, and far better in bending. "tet10-p0" also averages the dilatation over
+        each element: right up to a Poisson's ratio of 0.4999.
     damping : str or Damping, default "rayleigh"
         A name in `damping.DAMPINGS`.
     regions : sequence of Region
@@ -107,7 +108,7 @@ class Body:
     constants : dict of name to Constant
         What θ holds, in its order.
     nodes_m : (n, 3) undeformed node positions
-        The mesh's nodes, then, for "tet10", the middle of each of `mesh.edges`.
+        The mesh's nodes, then, for quadratic elements, the middle of each of `mesh.edges`.
     cells : (E, nodes per element) node numbers
     node_mass : (n,) lumped mass [kg]
     pattern : SymmetricPattern of K

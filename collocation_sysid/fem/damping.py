@@ -1,4 +1,4 @@
-"""Damping laws: a stress from the rate of deformation, and the constants it needs.
+"""Damping laws: a potential of the rate of deformation, and the constants it needs.
 
 Beside it the mass of a region is damped by γ_m, see `body`.
 """
@@ -13,7 +13,7 @@ import casadi as ca
 from ..errors import InputError, hint_at
 from .constants import GAMMA_R, Constant
 
-Viscous = Callable[..., ca.SX]
+Potential = Callable[..., ca.SX]
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,21 +23,22 @@ class Damping:
     Attributes
     ----------
     name : str
-    stress : callable
-        ``stress(elastic, F, rate, **constants)`` → the first Piola–Kirchhoff stress of the
-        damping, (9,) like all its arguments, columns stacked; linear in the rate Ḟ, and its
-        derivatives by F and by Ḟ symmetric.
+    potential : callable
+        ``potential(psi, F, rate, **constants)`` → a density ψ_d linear in the rate Ḟ, from the
+        energy's as an expression in F. The first Piola–Kirchhoff stress of the damping is
+        ∂ψ_d/∂F, and ∂²ψ_d/∂F∂Ḟ must be symmetric. F and Ḟ are stacked (9,); where an element
+        averages the dilatation, its volume and the rate of that follow them.
     constants : tuple of Constant
     """
 
     name: str
-    stress: Viscous = field(repr=False)
+    potential: Potential = field(repr=False)
     constants: tuple[Constant, ...]
 
 
-def rayleigh(elastic: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
-    """γ_r (∂²ψ/∂F²):Ḟ, which makes the damping force −γ_r K(x) v."""
-    return gamma_r_s * ca.jtimes(elastic, F, rate)
+def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
+    """γ_r ∂ψ/∂F:Ḟ, which makes the damping force −γ_r K(x) v."""
+    return gamma_r_s * ca.jtimes(psi, F, rate)
 
 
 DAMPINGS: dict[str, Damping] = {"rayleigh": Damping("rayleigh", rayleigh, (GAMMA_R,))}

@@ -7,7 +7,7 @@ table and know nothing else about the element.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,8 @@ class Element:
         Cell name for writing files.
     edges : tuple of pairs
         For each node after the corners, the two corners that it lies halfway between.
+    mean_dilatation : bool
+        Whether the material feels the mean dilatation of the element, see `mean_dilatation`.
     """
 
     name: str
@@ -49,11 +51,24 @@ class Element:
     mass_shares: Array
     meshio_type: str
     edges: tuple[tuple[int, int], ...] = ()
+    mean_dilatation: bool = False
 
 
 def _linear_gradients(barycentric: Array) -> Array:
     return np.broadcast_to(np.eye(4), (len(barycentric), 4, 4))
 
+
+_TET10 = Element(
+    name="tet10",
+    nodes=10,
+    shape_functions=quadratic.shape_functions,
+    shape_gradients=quadratic.shape_gradients,
+    points=quadratic.POINTS,
+    weights=quadratic.WEIGHTS,
+    mass_shares=quadratic.MASS_SHARES,
+    meshio_type="tetra10",
+    edges=quadratic.EDGES,
+)
 
 ELEMENTS: dict[str, Element] = {
     # One point integrates the constant deformation gradient exactly; equal mass shares.
@@ -67,19 +82,10 @@ ELEMENTS: dict[str, Element] = {
         mass_shares=np.full(4, 0.25),
         meshio_type="tetra",
     ),
-    # Bends without locking, and hardly locks near incompressibility; what is chosen for it, and
-    # why, is in `quadratic`.
-    "tet10": Element(
-        name="tet10",
-        nodes=10,
-        shape_functions=quadratic.shape_functions,
-        shape_gradients=quadratic.shape_gradients,
-        points=quadratic.POINTS,
-        weights=quadratic.WEIGHTS,
-        mass_shares=quadratic.MASS_SHARES,
-        meshio_type="tetra10",
-        edges=quadratic.EDGES,
-    ),
+    # Bends without locking; what is chosen for it, and why, is in `quadratic`.
+    "tet10": _TET10,
+    # One pressure for its ten nodes: keeps its volume without locking, however incompressible.
+    "tet10-p0": replace(_TET10, name="tet10-p0", mean_dilatation=True),
 }
 
 

@@ -11,152 +11,26 @@ theta    k             constants of the material, then of the damping law
 ======== ============= ==============================================================
 
 and outputs that are summed over points and elements. Symmetric matrices are given by their
-lower triangles, column after column. With S = −V (∂ψ/∂F + P_d), P_d the stress of the damping law,
-the force on node a is S ∇N_a; for Rayleigh's f = −∂Ψ/∂x − γ_r K v.
+lower triangles, column after column.
 
-Up to that last product a kernel knows only F, Ḟ and the like: 9 or 9 × 9 numbers whatever the
-element, its *pieces*. How they meet the shape gradients is told by a `Contraction`, which an
-evaluator may do in loops: written out for ten nodes it is most of the instructions.
+All of them are derivatives of one scalar: with the energy and the potential of the damping law,
+Θ(x, v) = Σ_q V_q (ψ + ψ_d), the internal force is −∂Θ/∂x, and its virtual power wᵀf is −D_wΘ. For
+Rayleigh's law that force is −∂Ψ/∂x − γ_r K v.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal
 
 import casadi as ca
 
 from .damping import Damping
 from .elements import Element
+from .kernel import PointKernel
 from .materials import Material
-
-# What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
-# to the lower triangle of (3·nodes, 3·nodes).
-Contraction = Literal["none", "nodes", "pairs"]
-
-
-@dataclass(frozen=True, eq=False)
-class PointKernel:
-    """What one quadrature point contributes.
-
-    Attributes
-    ----------
-    pieces : casadi.Function
-        Of the fields, geometry and θ; one output for each piece.
-    fields : tuple of str
-        Names of the inputs that come first, each 3·nodes long.
-    contractions : dict of str to Contraction
-        For each output.
-    """
-
-    pieces: ca.Function
-    fields: tuple[str, ...]
-    contractions: dict[str, Contraction]
-
-    @property
-    def nodes(self) -> int:
-        """Nodes per element."""
-        return self.pieces.nnz_in(0) // 3
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """The whole kernel, contractions written out."""
-        sx = self.pieces
-        names = sx.name_in()
-        inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
-        gradients = _gradients(inputs[-2], self.nodes)
-        outputs = [
-            _contracted(piece, how, gradients)
-            for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
-        ]
-        dense = [ca.densify(ca.vec(output)) for output in outputs]
-        return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """Symbols of one quadrature point and the quantities every kernel starts from."""
-
-    nodes: int
-    x: ca.SX
-    v: ca.SX
-    w: ca.SX
-    geometry: ca.SX
-    theta: ca.SX
-    gradients: ca.SX  # (nodes, 3)
-    volume: ca.SX
-
-
-def _point(nodes: int, constants: int) -> _Point:
-    geometry = ca.SX.sym("geometry", 3 * nodes + 1)
-    return _Point(
-        nodes=nodes,
-        x=ca.SX.sym("x", 3 * nodes),
-        v=ca.SX.sym("v", 3 * nodes),
-        w=ca.SX.sym("w", 3 * nodes),
-        geometry=geometry,
-        theta=ca.SX.sym("theta", constants),
-        gradients=_gradients(geometry, nodes),
-        volume=geometry[3 * nodes],
-    )
-
-
-def _gradients(geometry: ca.SX, nodes: int) -> ca.SX:
-    return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
-
-
-def _material_gradient(point: _Point, field: ca.SX) -> ca.SX:
-    """Σ_a field_a ⊗ ∇N_a, stacked column after column (9)."""
-    return ca.vec(ca.reshape(field, 3, point.nodes) @ point.gradients)
-
-
-def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
-    if how == "none":
-        return piece
-    nodes = gradients.shape[0]
-    half = ca.vertcat(*[_at_node(piece, gradients[a, :]) for a in range(nodes)])
-    if how == "nodes":
-        return half
-    # By symmetry the (3·nodes, 9) just found, read along its rows, has the columns contracted.
-    columns = []
-    for b in range(nodes):
-        rows = half[3 * b : 3 * b + 3, :].T
-        blocks = [_at_node(rows, gradients[a, :]) for a in range(b, nodes)]
-        whole = ca.vertcat(*blocks)
-        columns += [whole[j:, j] for j in range(3)]
-    return ca.vertcat(*columns)
-
-
-def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
-    """Columns of (9, k), conjugate to F, times one node's shape gradient: (3, k)."""
-    columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
-    return ca.horzcat(*columns)
-
-
-def _kernel(
-    name: str,
-    point: _Point,
-    fields: tuple[str, ...],
-    outputs: dict[str, tuple[Contraction, ca.SX]],
-) -> PointKernel:
-    inputs = {field: getattr(point, field) for field in fields}
-    inputs |= {"geometry": point.geometry, "theta": point.theta}
-    pieces = [ca.densify(piece) for _, piece in outputs.values()]
-    function = ca.Function(
-        name, list(inputs.values()), pieces, list(inputs), list(outputs), {"cse": True}
-    )
-    return PointKernel(function, fields, {key: how for key, (how, _) in outputs.items()})
-
-
-@dataclass(frozen=True, eq=False)
-class _Stress:
-    """S(F, Ḟ) and its pieces at symbolic F and Ḟ."""
-
-    F: ca.SX
-    rate: ca.SX
-    stress: ca.SX
+from .mean_dilatation import averaging_kernel
+from .point import By, Pieces, Point, contraction_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,55 +49,59 @@ class Law:
         return len(self.material.constants) + len(self.damping.constants)
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
-        """Energy density at F (9)."""
-        return self.material.psi(ca.reshape(F, 3, 3), theta[: len(self.material.constants)])
+        """Energy density at F (3, 3)."""
+        return self.material.psi(F, theta[: len(self.material.constants)])
 
-    def viscous(self, elastic: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """Damping stress (9), from the elastic one as an expression in F."""
+    def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
+        """The damping law's, from the energy as an expression in F."""
         own = theta[len(self.material.constants) :]
         named = {c.name: own[k] for k, c in enumerate(self.damping.constants)}
-        return self.damping.stress(elastic, F, rate, **named)
+        return self.damping.potential(psi, F, rate, **named)
 
 
-def _stress(point: _Point, law: Law) -> _Stress:
-    F, rate = ca.SX.sym("F", 9), ca.SX.sym("rate", 9)
-    elastic = ca.gradient(point.volume * law.psi(F, point.theta), F)
-    return _Stress(F, rate, -elastic - law.viscous(elastic, F, rate, point.theta))
+def kernel_of(name: str, point: Point, scalar: ca.SX, derivatives: dict[str, By]) -> PointKernel:
+    """The kernel of derivatives of a scalar of a point."""
+    if point.stretches:
+        return averaging_kernel(name, point, scalar, derivatives)
+    pieces: Pieces = {
+        key: (contraction_of(by), point.derivative(scalar, by)) for key, by in derivatives.items()
+    }
+    last = point.phase(name, pieces)
+    return PointKernel(last.pieces, tuple(point.fields), last.contractions)
+
+
+def _energy(point: Point, law: Law) -> ca.SX:
+    return point.volume * law.psi(point.felt, point.theta)
+
+
+def _potential(point: Point, law: Law) -> ca.SX:
+    """Θ of one point, whose slope is the internal force but for the sign."""
+    energy = _energy(point, law)
+    return energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
 
 
 def energy_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic energy Ψ of the point [J]."""
-    point = _point(element.nodes, law.constants)
-    psi = point.volume * law.psi(_material_gradient(point, point.x), point.theta)
-    return _kernel("energy", point, ("x",), {"energy": ("none", psi)})
+    point = Point.of(element, law.constants, "x")
+    return kernel_of("energy", point, _energy(point, law), {"energy": ()})
 
 
 def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
-    point = _point(element.nodes, law.constants)
-    at = _stress(point, law)
-    force = _at(point, at, at.stress)
-    return _kernel("force", point, ("x", "v"), {"force": ("nodes", force)})
+    point = Point.of(element, law.constants, "x", "v")
+    return kernel_of("force", point, -_potential(point, law), {"force": ("x",)})
 
 
 def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
-    point = _point(element.nodes, law.constants)
-    at = _stress(point, law)
-    pieces = [
-        at.stress,
-        ca.jacobian(at.stress, at.F),
-        ca.jacobian(at.stress, at.rate),
-        ca.jacobian(at.stress, point.theta),
-    ]
-    stress, by_f, by_rate, by_theta = (_at(point, at, piece) for piece in pieces)
-    outputs: dict[str, tuple[Contraction, ca.SX]] = {
-        "force": ("nodes", stress),
-        "by_position": ("pairs", by_f),
-        "by_velocity": ("pairs", by_rate),
-        "by_theta": ("nodes", by_theta),
+    point = Point.of(element, law.constants, "x", "v")
+    derivatives = {
+        "force": ("x",),
+        "by_position": ("x", "x"),
+        "by_velocity": ("x", "v"),
+        "by_theta": ("x", "theta"),
     }
-    return _kernel("linearisation", point, ("x", "v"), outputs)
+    return kernel_of("linearisation", point, -_potential(point, law), derivatives)
 
 
 def curvature_kernel(element: Element, law: Law) -> PointKernel:
@@ -232,41 +110,16 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
     ∂²φ/∂v² vanishes and ∂²φ/∂x∂v (Rayleigh: −γ_r D_wK) is symmetric, so two lower triangles hold
     the position–velocity part.
     """
-    point = _point(element.nodes, law.constants)
-    at = _stress(point, law)
-    W = ca.SX.sym("W", 9)
-    power = ca.dot(at.stress, W)
-    by_f, by_rate, by_theta = (ca.gradient(power, z) for z in (at.F, at.rate, point.theta))
-    pieces = [
-        ca.jacobian(by_f, at.F),
-        ca.jacobian(by_f, at.rate),
-        ca.jacobian(by_f, point.theta),
-        ca.jacobian(by_rate, point.theta),
-        ca.jacobian(by_theta, point.theta),
-        by_theta,
-    ]
-    w_gradient = _material_gradient(point, point.w)
-    xx, xv, x_theta, v_theta, theta_theta, first = (
-        ca.substitute(_at(point, at, piece), W, w_gradient) for piece in pieces
-    )
-    outputs: dict[str, tuple[Contraction, ca.SX]] = {
-        "position_position": ("pairs", xx),
-        "position_velocity": ("pairs", xv),
-        "position_theta": ("nodes", x_theta),
-        "velocity_theta": ("nodes", v_theta),
-        "theta_theta": ("none", theta_theta),
-        "gradient_theta": ("none", first),
+    point = Point.of(element, law.constants, "x", "v", "w")
+    derivatives = {
+        "position_position": ("x", "x"),
+        "position_velocity": ("x", "v"),
+        "position_theta": ("x", "theta"),
+        "velocity_theta": ("v", "theta"),
+        "theta_theta": ("theta", "theta"),
+        "gradient_theta": ("theta",),
     }
-    return _kernel("curvature", point, ("x", "v", "w"), outputs)
-
-
-def _at(point: _Point, at: _Stress, expression: ca.SX) -> ca.SX:
-    """Evaluate an expression in (F, Ḟ) at the point's node positions and velocities."""
-    return ca.substitute(
-        expression,
-        ca.vertcat(at.F, at.rate),
-        ca.vertcat(_material_gradient(point, point.x), _material_gradient(point, point.v)),
-    )
+    return kernel_of("curvature", point, -point.along_w(_potential(point, law)), derivatives)
 
 
 KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {

@@ -166,8 +166,10 @@ def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX)
 
 def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     """ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U: no stretch has an Ī₁ beyond 3 + J_m (Gent 1996)."""
-    past = _isochoric_invariants(F)[0] - 3
-    return -0.5 * mu_pa * gent_limit * ca.log(1 - past / gent_limit) + _volumetric(F, kappa_pa)
+    room = 1 - (_isochoric_invariants(F)[0] - 3) / gent_limit
+    # By way of the root also the slopes are no numbers beyond it: a solver that looks at forces
+    # alone would settle there.
+    return -mu_pa * gent_limit * ca.log(ca.sqrt(room)) + _volumetric(F, kappa_pa)
 
 
 def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) -> ca.SX:

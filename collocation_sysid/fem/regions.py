@@ -103,15 +103,12 @@ def parts_of(
     whole = Part("", rest, as_material(material), as_damping(damping), own[0])
     parts = [whole] if rest.size else []
     for region, cells, density in zip(regions, claimed, own[1:], strict=True):
-        parts.append(
-            Part(
-                region.name,
-                cells,
-                whole.material if region.material is None else as_material(region.material),
-                whole.damping if region.damping is None else as_damping(region.damping),
-                density,
-            )
-        )
+        try:
+            law = whole.material if region.material is None else as_material(region.material)
+            drag = whole.damping if region.damping is None else as_damping(region.damping)
+        except InputError as error:
+            raise error.located(None, f"region '{region.name}'") from error
+        parts.append(Part(region.name, cells, law, drag, density))
     return tuple(parts)
 
 

@@ -5,7 +5,8 @@ is Cauchy's, elastic without the damping's part: with P = ∂ψ/∂F,
 
     σ = P Fᵀ / J,   s = σ − ⅓ (tr σ) I,   von Mises: √(3/2 s:s)
 
-(Holzapfel 2000, eqs. 3.9 and 6.4); uniaxial stress is its own von Mises stress.
+(Holzapfel 2000, eqs. 3.9 and 6.4); uniaxial stress is its own von Mises stress. F is the one that
+the material feels: where an element averages the dilatation, J is its volume's ratio everywhere.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from ..arrays import Array
 from ..fem.batched import Batch, Evaluator
 from ..fem.body import Body
 from ..fem.elements import Element
-from ..fem.expressions import PointKernel
+from ..fem.expressions import kernel_of
+from ..fem.kernel import PointKernel
 from ..fem.materials import Material
+from ..fem.point import Point
 
 NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
@@ -74,18 +77,10 @@ class ElementFields:
 
 def field_kernel(element: Element, material: Material) -> PointKernel:
     """The fields at a quadrature point times its volume, see `expressions` for the inputs."""
-    x = ca.SX.sym("x", 3 * element.nodes)
-    geometry = ca.SX.sym("geometry", 3 * element.nodes + 1)
-    theta = ca.SX.sym("theta", len(material.constants))
-    gradients = ca.reshape(geometry[:-1], 3, element.nodes)
-    f = ca.vec(ca.reshape(x, 3, element.nodes) @ gradients.T)
-    values = ca.substitute(ca.vertcat(*_point_fields(material, theta)), _F, f)
-    pieces = ca.densify(geometry[-1] * values)
-    inputs: Sequence[ca.SX] = (x, geometry, theta)
-    function = ca.Function(
-        "fields", inputs, [pieces], ["x", "geometry", "theta"], ["fields"], {"cse": True}
-    )
-    return PointKernel(function, ("x",), {"fields": "none"})
+    point = Point.of(element, len(material.constants), "x")
+    fields = ca.vertcat(*_point_fields(material, point.theta))
+    felt = ca.substitute(fields, _F, ca.vec(point.felt))
+    return kernel_of("fields", point, point.volume * felt, {"fields": ()})
 
 
 _F = ca.SX.sym("F", 9)

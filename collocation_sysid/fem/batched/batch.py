@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import InputError
-from ..expressions import PointKernel
+from ..kernel import PointKernel
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,12 @@ class CasadiEvaluator:
     def __init__(self, batch: Batch) -> None:
         count, points, size = batch.geometry.shape
         kernel = batch.kernel
-        self._theta_slot = len(kernel.fields) + 1
-        self._mapped = kernel.function.map(
-            f"{kernel.function.name()}_map", "serial", count * points, [self._theta_slot], []
+        self._mapped = kernel.element_function(points).map(
+            "element_map", "serial", count, [len(kernel.fields) + 1], []
         )
         self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
-        self._dofs = np.repeat(dofs_of(batch.cells), points, axis=0).T
-        destinations = np.repeat(batch.destinations, points, axis=0).ravel()
+        self._dofs = dofs_of(batch.cells).T
+        destinations = batch.destinations.ravel()
         self._sum = sp.csr_array(
             (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
             shape=(batch.width, len(destinations)),

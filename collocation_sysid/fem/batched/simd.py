@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import reduce
 
+import casadi as ca
 import numpy as np
 from llvmlite import ir
 from numpy.typing import NDArray
 
-from ..expressions import Contraction, PointKernel
+from ..kernel import Contraction, Phase, PointKernel
 from .batch import Array, Batch
 from .instructions import FUSE, function_values
 from .jit import CompiledFunction, vector_lanes
@@ -47,7 +49,11 @@ class SimdEvaluator:
         self._width = batch.width
         self._points = batch.geometry.shape[1]
         self._fields = len(kernel.fields)
-        source = f"{kernel.contractions} {kernel.pieces.serialize()}"
+        functions = [phase.pieces for phase in kernel.phases]
+        if kernel.coupling:
+            functions.append(kernel.coupling)
+        source = f"{[phase.contractions for phase in kernel.phases]}"
+        source += " ".join(function.serialize() for function in functions)
         key = f"{lanes} {self._points} {hashlib.sha256(source.encode()).hexdigest()}"
         signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
         self._run = CompiledFunction(
@@ -84,22 +90,54 @@ def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray
     return np.ascontiguousarray(np.swapaxes(blocked, 1, 2), dtype=np.int32)
 
 
+class _Layout:
+    """Where the pieces of a phase are kept, and where among the totals its outputs."""
+
+    def __init__(self, phase: Phase, first: int) -> None:
+        self.sx = phase.pieces
+        self.contractions = list(phase.contractions.values())
+        size = 3 * phase.nodes
+        self.lengths = [self.sx.nnz_out(k) for k in range(self.sx.n_out())]
+        self.pieces = np.cumsum([0, *self.lengths]).tolist()
+        contracted = {"none": 1, "nodes": size / 9, "pairs": size * (size + 1) / 2 / 81}
+        outputs = [
+            round(contracted[how] * length)
+            for how, length in zip(self.contractions, self.lengths, strict=True)
+        ]
+        self.outputs = (first + np.cumsum([0, *outputs])).tolist()
+
+    def entries(self, first: int, how: Contraction, step: int) -> list[int]:
+        """Places of what is so contracted, each of `step` entries, from an output on."""
+        return [
+            place
+            for k, mine in enumerate(self.contractions)
+            if k >= first and mine == how
+            for place in range(self.outputs[k], self.outputs[k + 1], step)
+        ]
+
+
 class _Emitter:
     """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out)``."""
 
     def __init__(self, kernel: PointKernel, points: int, lanes: int) -> None:
-        self.sx = kernel.pieces
-        self.contractions = list(kernel.contractions.values())
         self.fields = len(kernel.fields)
         self.points = points
         self.lanes = lanes
         self.vector = ir.VectorType(DOUBLE, lanes)
-        self.nodes, self.size = kernel.nodes, 3 * kernel.nodes
-        lengths = [self.sx.nnz_out(k) for k in range(self.sx.n_out())]
-        self.piece_offsets = np.cumsum([0, *lengths]).tolist()
-        self.output_offsets = np.cumsum(
-            [0, *map(self._contracted_length, self.contractions, lengths)]
-        ).tolist()
+        self.nodes = kernel.phases[0].nodes
+        self.size = 3 * self.nodes
+        # The kernel's own outputs come first among the totals.
+        self.last = _Layout(kernel.phases[-1], 0)
+        self.earlier: list[_Layout] = []
+        for phase in kernel.earlier:
+            before = self.earlier[-1] if self.earlier else self.last
+            self.earlier.append(_Layout(phase, before.outputs[-1]))
+        # What they hold for the coupling, and for later phases.
+        self.own = len(kernel.contractions)
+        shared = [(phase, 0) for phase in self.earlier] + [(self.last, self.own)]
+        self.sums = [at for phase, k in shared for at in phase.entries(k, "none", 1)]
+        self.vectors = [at for phase, k in shared for at in phase.entries(k, "nodes", self.size)]
+        self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
         kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
@@ -109,21 +147,19 @@ class _Emitter:
                 argument.add_attribute("noalias")
         self.builder: Builder = ir.IRBuilder(self.run.append_basic_block("entry"))
 
-    def _contracted_length(self, how: Contraction, length: int) -> int:
-        pairs = self.size * (self.size + 1) // 2
-        return {"none": length, "nodes": self.size * length // 9, "pairs": pairs}[how]
-
     def emit(self) -> ir.Module:
         b, args = self.builder, self.run.args
         t0, t1, blocks, field_stride, out_stride, add = args[:6]
         field_rows = args[6 : 6 + self.fields]
         geometry, nodes, destinations, theta, out = args[6 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
-        total = self.output_offsets[-1]
-        outputs = self._buffer(total, "outputs")
-        pieces = self._buffer(self.piece_offsets[-1], "pieces")
+        phases = [*self.earlier, self.last]
+        outputs, total = self.last.outputs[self.own], max(phase.outputs[-1] for phase in phases)
+        totals = self._buffer(total, "totals")
+        pieces = self._buffer(max(phase.pieces[-1] for phase in phases), "pieces")
         half = self._buffer(27, "half")
-        geometry_size, theta_size = self.sx.nnz_in(self.fields), self.sx.nnz_in(self.fields + 1)
+        combined = self._buffer(len(self.vectors) * self.size, "combined")
+        geometry_size, theta_size = (self.last.sx.nnz_in(self.fields + k) for k in range(2))
         parameters = [self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(theta_size)]
         with counting(b, t0, t1, "t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
@@ -134,20 +170,23 @@ class _Emitter:
                 here = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
                 self._gather(rows, here, gathered)
                 with counting(b, I64(0), I64(total), "zero") as k:
-                    self._store(self.vector(None), outputs, k)
+                    self._store(self.vector(None), totals, k)
                 first = b.mul(block, I64(self.points))
-                with counting(b, first, b.add(first, I64(self.points)), "point") as point:
-                    here = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
-                    self._pieces(gathered, here, parameters, pieces)
-                    self._contract(pieces, here, half, outputs)
+                for phase in phases:
+                    with counting(b, first, b.add(first, I64(self.points)), "point") as point:
+                        here = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
+                        self._pieces(phase, [*gathered, here, parameters, totals], pieces)
+                        self._contract(phase, pieces, here, half, totals)
+                if self.coupling:
+                    self._couple(self.coupling, totals, combined)
                 here = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
                 volume = self._load(here, I64(geometry_size - 1))
                 zero = self.vector(None)
                 # Not left to the product with the volume, which makes NaN of what is infinite.
                 is_element = b.fcmp_ordered("!=", volume, zero)
-                targets = b.gep(destinations, [b.mul(block, I64(total * self.lanes))])
-                with counting(b, I64(0), I64(total), "output") as k:
-                    value = b.select(is_element, self._load(outputs, k), zero)
+                targets = b.gep(destinations, [b.mul(block, I64(outputs * self.lanes))])
+                with counting(b, I64(0), I64(outputs), "output") as k:
+                    value = b.select(is_element, self._load(totals, k), zero)
                     self._scatter(value, targets, k, out_row)
         b.ret_void()
         return self.module
@@ -207,24 +246,27 @@ class _Emitter:
             address = b.gep(row, [target])
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
-    def _pieces(self, gathered: list, geometry: Value, parameters: list, pieces: Value) -> None:
+    def _pieces(self, phase: _Layout, inputs: list, pieces: Value) -> None:
         """Find the pieces of one quadrature point."""
 
         def read(slot: int, entry: int) -> Value:
-            if slot > self.fields:
-                return parameters[entry]
-            return self._load(geometry if slot == self.fields else gathered[slot], I64(entry))
+            if slot == self.fields + 1:
+                return inputs[slot][entry]
+            place = self.sums[entry] if slot == self.fields + 2 else entry
+            return self._load(inputs[slot], I64(place))
 
-        for piece, entry, value in function_values(self.builder, self.sx, self.vector, read):
-            self._store(value, pieces, I64(self.piece_offsets[piece] + entry))
+        for piece, entry, value in function_values(self.builder, phase.sx, self.vector, read):
+            self._store(value, pieces, I64(phase.pieces[piece] + entry))
 
-    def _contract(self, pieces: Value, geometry: Value, half: Value, outputs: Value) -> None:
-        """Add the pieces of one quadrature point to the outputs, as `expressions._contracted`."""
+    def _contract(
+        self, phase: _Layout, pieces: Value, geometry: Value, half: Value, totals: Value
+    ) -> None:
+        """Add the pieces of one quadrature point to the totals, as `kernel._contracted`."""
         b = self.builder
-        for k, how in enumerate(self.contractions):
-            here = self._at(pieces, self.piece_offsets[k])
-            there = self._at(outputs, self.output_offsets[k])
-            length = self.piece_offsets[k + 1] - self.piece_offsets[k]
+        for k, how in enumerate(phase.contractions):
+            here = self._at(pieces, phase.pieces[k])
+            there = self._at(totals, phase.outputs[k])
+            length = phase.lengths[k]
             if how == "none":
                 with counting(b, I64(0), I64(length), "entry") as entry:
                     self._add(self._load(here, entry), there, entry)
@@ -249,11 +291,64 @@ class _Emitter:
         for column, row, value in self._at_node(half, 3, gradient):
             if a is node and row < column:
                 continue
-            # Entry (r, c) of the lower triangle is at c (2 size − c − 1) / 2 + r.
             c = b.add(b.mul(node, I64(3)), I64(column))
             r = b.add(b.mul(a, I64(3)), I64(row))
-            start = b.lshr(b.mul(c, b.sub(I64(2 * self.size - 1), c)), I64(1))
-            self._add(value, outputs, b.add(start, r))
+            self._add(value, outputs, b.add(self._column_start(c), r))
+
+    def _column_start(self, c: Value) -> Value:
+        """Entry (r, c) of a lower triangle is at c (2 size − c − 1) / 2 + r."""
+        b = self.builder
+        return b.lshr(b.mul(c, b.sub(I64(2 * self.size - 1), c)), I64(1))
+
+    def _couple(self, coupling: ca.Function, totals: Value, combined: Value) -> None:
+        """Add to the outputs what couples the node vectors, see `kernel`."""
+        b = self.builder
+        for k, columns in enumerate(self._coefficients(coupling, totals)):
+            how, there = self.last.contractions[k], self._at(totals, self.last.outputs[k])
+            if how == "nodes":
+                self._combine(columns, totals, there, self._add)
+            elif how == "pairs":
+                self._combine(columns, totals, combined, self._store)
+                with counting(b, I64(0), I64(self.size), "column") as c:
+                    factors = [
+                        (j * self.size, self._load(self._at(totals, self.vectors[j]), c))
+                        for j in columns
+                    ]
+                    start = b.gep(there, [b.mul(self._column_start(c), I64(self.lanes))])
+                    with counting(b, c, I64(self.size), "row") as r:
+                        self._add(self._combination(factors, combined, r), start, r)
+
+    def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
+        """For each output, column after column, the node vectors' places and coefficients."""
+        outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
+        entries = [list(zip(*output.get_triplet(), strict=True)) for output in outputs]
+        columns: list[dict[int, list]] = [{} for _ in outputs]
+
+        def read(_: int, entry: int) -> Value:
+            return self._load(totals, I64(self.sums[entry]))
+
+        for k, entry, value in function_values(self.builder, coupling, self.vector, read):
+            row, column = entries[k][entry]
+            columns[k].setdefault(column, []).append((self.vectors[row], value))
+        return columns
+
+    def _combine(
+        self, columns: dict[int, list], totals: Value, out: Value, put: Callable[..., None]
+    ) -> None:
+        """Put combinations of node vectors where the columns of a matrix are."""
+        for column, factors in columns.items():
+            here = self._at(out, column * self.size)
+            with counting(self.builder, I64(0), I64(self.size), "entry") as entry:
+                put(self._combination(factors, totals, entry), here, entry)
+
+    def _combination(self, factors: list, base: Value, entry: Value) -> Value:
+        """One entry of the sum of vectors, which begin at places of `base`, times factors."""
+        b = self.builder
+        terms = [
+            b.fmul(self._load(self._at(base, place), entry), factor, flags=FUSE)
+            for place, factor in factors
+        ]
+        return reduce(lambda x, y: b.fadd(x, y, flags=FUSE), terms)
 
     def _at_node(self, stress: Value, columns: int, gradient: list) -> Iterator[tuple]:
         """Columns of (9, k) times one node's shape gradient, by column and row."""

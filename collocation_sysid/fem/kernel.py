@@ -1,0 +1,163 @@
+"""Kernels: what the quadrature points of an element contribute, as CasADi functions.
+
+Up to the last product with the shape gradients a kernel knows only F, Ḟ and the like: 9 or 9 × 9
+numbers whatever the element, its *pieces*. How they meet the shape gradients is told by a
+`Contraction`, which an evaluator may do in loops: written out for ten nodes it is most of the
+instructions.
+
+Most kernels are one sum over the points. In others a point needs to know of the whole element, such
+as its volume. They have earlier `Phase`s, each a sum over the points of its own, and a coupling:
+with A (3·nodes, m) holding the node vectors so summed, it adds A C to an output that is contracted
+to node vectors, and the lower triangle of A D Aᵀ to one that is a matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import casadi as ca
+
+# What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
+# to the lower triangle of (3·nodes, 3·nodes).
+Contraction = Literal["none", "nodes", "pairs"]
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """One sum over the quadrature points of an element.
+
+    Attributes
+    ----------
+    pieces : casadi.Function
+        Of the fields, geometry, θ and, unless it is the first phase, one vector of all outputs
+        of earlier phases that are not contracted; one output for each piece.
+    contractions : dict of str to Contraction
+        For each output.
+    """
+
+    pieces: ca.Function
+    contractions: dict[str, Contraction]
+
+    @property
+    def nodes(self) -> int:
+        """Nodes per element."""
+        return self.pieces.nnz_in(0) // 3
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """What one point contributes, contractions written out."""
+        sx = self.pieces
+        names = sx.name_in()
+        inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
+        gradients = node_gradients(inputs[names.index("geometry")], self.nodes)
+        outputs = [
+            _contracted(piece, how, gradients)
+            for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
+        ]
+        dense = [ca.densify(ca.vec(output)) for output in outputs]
+        return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
+
+    def over_points(self, *inputs: Any) -> list[Any]:
+        """The sums, each in one column; the geometry has a column for every point."""
+        place = self.pieces.name_in().index("geometry")
+        points = [
+            self.function.call([*inputs[:place], geometry, *inputs[place + 1 :]])
+            for geometry in ca.horzsplit(inputs[place])
+        ]
+        return [sum(outputs[1:], outputs[0]) for outputs in zip(*points, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class PointKernel:
+    """What the quadrature points of an element contribute.
+
+    Attributes
+    ----------
+    pieces, contractions
+        Of the last phase, whose outputs are the kernel's.
+    fields : tuple of str
+        Names of the inputs that come first, each 3·nodes long.
+    earlier : tuple of Phase
+    coupled : dict of str to Contraction
+        Further outputs of the pieces, which are summed for the coupling alone.
+    coupling : casadi.Function, optional
+        C or D for each output, sparse, from the vector of all uncontracted sums: those of the
+        earlier phases, then of `coupled`.
+    """
+
+    pieces: ca.Function
+    fields: tuple[str, ...]
+    contractions: dict[str, Contraction]
+    earlier: tuple[Phase, ...] = ()
+    coupled: dict[str, Contraction] = field(default_factory=dict)
+    coupling: ca.Function | None = None
+
+    @cached_property
+    def phases(self) -> tuple[Phase, ...]:
+        """All of them, the last one included."""
+        return (*self.earlier, Phase(self.pieces, self.contractions | self.coupled))
+
+    def element_function(self, points: int) -> ca.Function:
+        """The sum over an element, of fields, geometry (3·nodes + 1, points) and θ."""
+        names = self.phases[0].pieces.name_in()
+        inputs = [ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)]
+        place = names.index("geometry")
+        inputs[place] = ca.MX.sym("geometry", self.pieces.size1_in(place), points)
+        size = 3 * self.phases[0].nodes
+        sums, vectors = ca.MX(0, 1), ca.MX(size, 0)
+        outputs: list[ca.MX] = []
+        for phase in self.phases:
+            found = phase.over_points(*inputs, *([sums] if sums.numel() else []))
+            for key, total in zip(phase.contractions, found, strict=True):
+                if key in self.contractions:
+                    outputs.append(total)
+                elif phase.contractions[key] == "none":
+                    sums = ca.vertcat(sums, total)
+                else:
+                    vectors = ca.horzcat(vectors, ca.reshape(total, size, -1))
+        if self.coupling:
+            couplings = self.coupling.call([sums])
+            hows = self.contractions.values()
+            outputs = [
+                _coupled(*each, vectors) for each in zip(outputs, couplings, hows, strict=True)
+            ]
+        return ca.Function(self.pieces.name(), inputs, outputs, names, list(self.contractions))
+
+
+def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
+    """(nodes, 3) shape gradients."""
+    return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
+
+
+def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
+    if how == "none":
+        return output
+    if how == "nodes":
+        return output + ca.vec(vectors @ coupling)
+    lower = ca.project(vectors @ coupling @ vectors.T, ca.Sparsity.lower(vectors.shape[0]))
+    return output + lower.nz[:]
+
+
+def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
+    if how == "none":
+        return piece
+    nodes = gradients.shape[0]
+    half = ca.vertcat(*[_at_node(piece, gradients[a, :]) for a in range(nodes)])
+    if how == "nodes":
+        return half
+    # By symmetry the (3·nodes, 9) just found, read along its rows, has the columns contracted.
+    columns = []
+    for b in range(nodes):
+        rows = half[3 * b : 3 * b + 3, :].T
+        blocks = [_at_node(rows, gradients[a, :]) for a in range(b, nodes)]
+        whole = ca.vertcat(*blocks)
+        columns += [whole[j:, j] for j in range(3)]
+    return ca.vertcat(*columns)
+
+
+def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
+    """Columns of (9, k), conjugate to F, times one node's shape gradient: (3, k)."""
+    columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
+    return ca.horzcat(*columns)

@@ -1,0 +1,121 @@
+"""One quadrature point in symbols."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from .elements import Element
+from .kernel import Contraction, Phase, node_gradients
+
+# A derivative of a scalar: by none, one or two of x, v and θ, θ last.
+By = tuple[str, ...]
+# For each output its contraction, and its piece in the symbols of a `Point`.
+Pieces = dict[str, tuple[Contraction, ca.SX]]
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Symbols of one quadrature point.
+
+    Attributes
+    ----------
+    nodes : int
+    fields : dict of str to SX
+        (3·nodes,) of x and, where they are needed, v and w.
+    geometry, theta : SX
+        See `expressions`.
+    gradients : dict of str to SX
+        Of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column (9): F, Ḟ and W.
+    stretches : tuple of SX
+        Where the element averages the dilatation, the logarithm m of the stretch that does so and,
+        with v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
+    """
+
+    nodes: int
+    fields: dict[str, ca.SX]
+    geometry: ca.SX
+    theta: ca.SX
+    gradients: dict[str, ca.SX]
+    stretches: tuple[ca.SX, ...]
+
+    @classmethod
+    def of(cls, element: Element, constants: int, *fields: str) -> Point:
+        """A point of an element, with θ of so many constants."""
+        stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
+        return cls(
+            element.nodes,
+            {name: ca.SX.sym(name, 3 * element.nodes) for name in fields},
+            ca.SX.sym("geometry", 3 * element.nodes + 1),
+            ca.SX.sym("theta", constants),
+            {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
+            tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
+        )
+
+    @property
+    def volume(self) -> ca.SX:
+        """The point's share of the element's."""
+        return self.geometry[3 * self.nodes]
+
+    @property
+    def felt(self) -> ca.SX:
+        """The deformation gradient that the material feels, (3, 3)."""
+        F = ca.reshape(self.gradients["x"], 3, 3)
+        return ca.exp(self.stretches[0]) * F if self.stretches else F
+
+    @property
+    def strain(self) -> ca.SX:
+        """What of an energy changes with x: F and m."""
+        return ca.vertcat(self.gradients["x"], *self.stretches[:1])
+
+    @property
+    def strain_rate(self) -> ca.SX:
+        """Its derivative along v."""
+        return ca.vertcat(self.gradients["v"], *self.stretches[1:2])
+
+    def along_w(self, scalar: ca.SX) -> ca.SX:
+        """Derivative of a scalar of x and v by x, along w."""
+        inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
+        return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))
+
+    def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
+        """A derivative of a scalar, by the fields' gradients for the fields."""
+        inputs = [self.theta if name == "theta" else self.gradients[name] for name in by]
+        if not inputs:
+            return scalar
+        if len(inputs) < 2:
+            return ca.jacobian(scalar, inputs[0]).T
+        found = ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
+        return mirrored(found) if contraction_of(by) == "pairs" else found
+
+    def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
+        """A phase of these pieces, which may depend on sums of earlier ones."""
+        inputs = {**self.fields, "geometry": self.geometry, "theta": self.theta}
+        if sums is not None:
+            inputs["sums"] = sums
+        shape_gradients = node_gradients(self.geometry, self.nodes)
+        gradients = [
+            ca.vec(ca.reshape(field, 3, self.nodes) @ shape_gradients)
+            for field in self.fields.values()
+        ]
+        outputs = ca.substitute(
+            [ca.densify(piece) for _, piece in pieces.values()],
+            [ca.vertcat(*self.gradients.values())],
+            [ca.vertcat(*gradients)],
+        )
+        function = ca.Function(
+            name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
+        )
+        return Phase(function, {key: how for key, (how, _) in pieces.items()})
+
+
+def mirrored(matrix: ca.SX) -> ca.SX:
+    """A matrix that is known to be symmetric, half of which need not be computed."""
+    return ca.tril2symm(ca.tril(ca.densify(matrix)))
+
+
+def contraction_of(by: By) -> Contraction:
+    """What becomes of the piece of a derivative: it has as many node indices as fields."""
+    hows: tuple[Contraction, ...] = ("none", "nodes", "pairs")
+    return hows[len(by) - by.count("theta")]

@@ -1,0 +1,249 @@
+"""Quadratic tetrahedra of one pressure: exact derivatives, and no locking near ν = 0.5."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import skfem
+from checks import assert_derivative, observed_order, relative_error
+from materials_small import ELASTIC, elastic, theta_for
+from problems_small import box, measured, nodes_where, point_markers, smooth_poses, times
+from scipy.sparse.linalg import spsolve
+from scipy.spatial.transform import Rotation
+from skfem.helpers import ddot, div, dot, eye, sym_grad
+from test_against_scikit_fem import Library
+
+from collocation_sysid.experiment import Experiment, Grasp
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.materials import MATERIALS
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.output.fields import ElementFields
+
+P0 = "tet10-p0"
+LENGTH_M = 0.03  # a large change of a position
+
+
+def of_a_user(F, lambda_pa, mu_pa):
+    """Hencky's volumetric energy and a quartic isochoric one: split like none of the table's."""
+    shear = ca.sumsqr(F) / ca.exp(2 / 3 * ca.log(ca.det(F))) - 3
+    return 0.5 * lambda_pa * ca.log(ca.det(F)) ** 2 + 0.5 * mu_pa * (shear + 0.3 * shear**2)
+
+
+@cache
+def small_body(material: str | Callable = "neo-hookean", evaluator="auto", element=P0) -> Body:
+    """Six elements, no two alike."""
+    mesh = box_mesh((0.10, 0.12, 0.09), (1, 1, 1))
+    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
+    mesh = TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
+    return Body(mesh, material, 30.0, element, evaluator=evaluator)
+
+
+def deformed(body: Body, rng: np.random.Generator, states: int = 1) -> np.ndarray:
+    return body.nodes_m + rng.uniform(-0.003, 0.003, (states, *body.nodes_m.shape))
+
+
+# Derivatives ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("material", ["neo-hookean", "gent", of_a_user])
+def test_first_derivatives_are_slopes(material, rng):
+    body = small_body(material)
+    theta = theta_for(body)
+    x, v = deformed(body, rng).ravel(), rng.standard_normal(body.nodes_m.size)
+    at = body.linearise(x, v, theta)
+    np.testing.assert_allclose(body.force(x, v, theta), at.force, rtol=1e-12, atol=1e-13)
+    K, f = body.stiffness(x, **elastic(body)), body.elastic_force(x, **elastic(body))
+    by_x, by_v = (body.pattern.matrix(m[0]) for m in (at.by_position, at.by_velocity))
+    for function, slope, point, scale in (
+        (lambda x: body.energy(x, **elastic(body)), -f.ravel(), x, LENGTH_M),
+        (lambda x: -body.elastic_force(x, **elastic(body)).ravel(), K, x, LENGTH_M),
+        (lambda x: body.force(x, v, theta)[0], by_x, x, LENGTH_M),
+        (lambda v: body.force(x, v, theta)[0], by_v, v, 1.0),
+        (lambda theta: body.force(x, v, theta)[0], at.by_theta[0], theta, theta),
+    ):
+        assert_derivative(function, lambda d, m=slope: m @ d, point, rng, scale=scale)
+
+
+@pytest.mark.parametrize("material", ["neo-hookean", "gent", of_a_user])
+def test_second_derivatives_are_slopes_of_the_first(material, rng):
+    body = small_body(material)
+    theta = theta_for(body)
+    x, (v, w) = deformed(body, rng).ravel(), rng.standard_normal((2, body.nodes_m.size))
+    curvature = body.curvature(x, v, w, theta)
+    xx, xv = (
+        body.pattern.matrix(matrix[0])
+        for matrix in (curvature.position_position, curvature.position_velocity)
+    )
+
+    def slopes(x, v, theta) -> np.ndarray:
+        """Slopes of wᵀf by x, v and θ."""
+        at = body.linearise(x, v, theta)
+        matrices = (body.pattern.matrix(m[0]) @ w for m in (at.by_position, at.by_velocity))
+        return np.concatenate([*matrices, w @ at.by_theta[0]])
+
+    x_theta, v_theta = curvature.position_theta[0], curvature.velocity_theta[0]
+    np.testing.assert_allclose(curvature.theta[0], slopes(x, v, theta)[-theta.size :], rtol=1e-11)
+    for function, matrix, point, scale in (
+        (lambda x: slopes(x, v, theta), [xx, xv, x_theta.T], x, LENGTH_M),
+        (lambda v: slopes(x, v, theta), [xv, 0 * xv, v_theta.T], v, 1.0),
+        (lambda t: slopes(x, v, t), [x_theta, v_theta, curvature.theta_theta[0]], theta, theta),
+    ):
+        whole = np.vstack([m.toarray() if sp.issparse(m) else m for m in matrix])
+        assert_derivative(
+            function, lambda d, m=whole: m @ d, point, rng, tolerance=1e-7, scale=scale
+        )
+
+
+@pytest.mark.parametrize("material", ["neo-hookean", "yeoh", of_a_user])
+def test_evaluators_agree(material, rng):
+    simd, casadi = (small_body(material, name) for name in ("simd", "casadi"))
+    assert simd.evaluator == "simd"
+    x, (v, w) = deformed(simd, rng, 2), rng.standard_normal((2, 2, simd.nodes_m.size))
+    assert simd.energy(x[0], **elastic(simd)) == pytest.approx(
+        casadi.energy(x[0], **elastic(casadi)), rel=1e-12
+    )
+    for method, fields in (("force", (x, v)), ("linearise", (x, v)), ("curvature", (x, v, w))):
+        found, expected = (
+            getattr(each, method)(*fields, theta_for(each)) for each in (simd, casadi)
+        )
+        for name in getattr(expected, "__dataclass_fields__", [None]):
+            pair = (getattr(each, name) if name else each for each in (found, expected))
+            assert relative_error(*pair) < 1e-12, name
+
+
+# The element ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("material", [name for name in MATERIALS if name != "linear"])
+def test_rigid_motion_causes_no_force(material, rng):
+    body = small_body(material)
+    turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
+    moved = body.nodes_m @ turn.T + [0.3, 0.2, -0.1]
+    scale = abs(body.elastic_force(deformed(body, rng), **elastic(body))).max()
+    assert abs(body.elastic_force(moved, **elastic(body))).max() < 1e-12 * scale
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_a_uniform_strain_is_felt_as_by_plain_elements(material, rng):
+    body, plain = small_body(material), small_body(material, element="tet10")
+    x = body.nodes_m @ (np.eye(3) + rng.uniform(-0.15, 0.15, (3, 3))).T
+    found, expected = (each.elastic_force(x, **elastic(each)) for each in (body, plain))
+    assert relative_error(found, expected) < 1e-12
+    found, expected = (each.energy(x, **elastic(each)) for each in (body, plain))
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+def test_only_rigid_motion_is_without_energy_even_for_a_single_element():
+    one = TetMesh([[0, 0, 0], [0.1, 0, 0], [0.02, 0.1, 0], [0.01, 0.03, 0.1]], [[0, 1, 2, 3]])
+    body = Body(one, density_kg_m3=30.0, element=P0)
+    spectrum = np.linalg.eigvalsh(body.stiffness(body.nodes_m, **ELASTIC).toarray())
+    assert abs(spectrum[:6]).max() < 1e-13 * spectrum[-1]
+    assert spectrum[6] > 1e-3 * spectrum[-1]
+
+
+def test_the_stiffness_matrix_has_the_pattern_of_plain_elements():
+    body, plain = small_body(), small_body(element="tet10")
+    np.testing.assert_array_equal(body.pattern.rows, plain.pattern.rows)
+    np.testing.assert_array_equal(body.pattern.columns, plain.pattern.columns)
+
+
+def kinematics(body: Body, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """F (E, q, 3, 3), J (E, q), the volumes V (E, q), and the mean dilatation (E, 1)."""
+    gradients = body.geometry[..., :-1].reshape(len(body.cells), 4, 10, 3)
+    F = np.einsum("eai,eqaj->eqij", x[body.cells], gradients)
+    J, V = np.linalg.det(F), body.geometry[..., -1]
+    return F, J, V, ((V * J).sum(1) / V.sum(1))[:, None]
+
+
+def test_the_energy_is_isochoric_at_points_and_volumetric_in_the_mean(rng):
+    """Mooney and Rivlin's, by its two terms."""
+    body = small_body("mooney-rivlin")
+    x = deformed(body, rng)[0]
+    F, J, V, mean = kinematics(body, x)
+    assert np.ptp(J / mean) > 0.1
+    C = np.swapaxes(F, -1, -2) @ F / J[..., None, None] ** (2 / 3)
+    first = np.trace(C, axis1=-2, axis2=-1)
+    second = (first**2 - np.trace(C @ C, axis1=-2, axis2=-1)) / 2
+    c = elastic(body)
+    isochoric = c["c10_pa"] * (first - 3) + c["c01_pa"] * (second - 3)
+    volumetric = c["kappa_pa"] / 2 * (mean - 1) ** 2
+    assert body.energy(x, **c) == pytest.approx((V * (isochoric + volumetric)).sum(), rel=1e-12)
+
+
+def test_the_fields_are_those_that_the_material_feels(rng):
+    body = small_body()
+    x = deformed(body, rng)[0]
+    _, _, V, mean = kinematics(body, x)
+    fields = ElementFields.of(body, theta_for(body)).at(x)
+    np.testing.assert_allclose(fields["det_f"][0], mean[:, 0], rtol=1e-12)
+    energy = (fields["energy_density_j_m3"][0] * V.sum(1)).sum()
+    assert energy == pytest.approx(body.energy(x, **elastic(body)), rel=1e-12)
+    assert (fields["von_mises_pa"] > 0).all()
+
+
+# Near incompressibility, at small strains -----------------------------------------------------
+
+YOUNG_PA = 1e4
+INCOMPRESSIBLE = 0.4999
+
+
+def lame(poisson: float) -> tuple[float, float]:
+    return YOUNG_PA * poisson / ((1 + poisson) * (1 - 2 * poisson)), YOUNG_PA / (2 + 2 * poisson)
+
+
+def stiffness(body: Body, poisson: float) -> sp.csc_array:
+    return body.stiffness(body.nodes_m, young_pa=YOUNG_PA, poisson=poisson)
+
+
+def deviator(u):
+    return sym_grad(u) - eye(div(u) / 3, 3)
+
+
+def mixed_stiffness(library: Library, poisson: float, pressure: skfem.Element) -> np.ndarray:
+    """Stiffness with the pressures condensed: ∫ 2μ dev ε:dev ε + p div u − p²/(2κ)."""
+    lambda_pa, mu_pa = lame(poisson)
+    pressures = library.basis.with_element(pressure)
+    shear = skfem.BilinearForm(lambda u, v, w: 2 * mu_pa * ddot(deviator(u), deviator(v)))
+    work = skfem.BilinearForm(lambda u, q, w: div(u) * q).assemble(library.basis, pressures)
+    volume = skfem.BilinearForm(lambda p, q, w: p * q).assemble(pressures).tocsc()
+    volumetric = (lambda_pa + 2 / 3 * mu_pa) * work.T @ spsolve(volume, work.tocsc())
+    whole = shear.assemble(library.basis) + volumetric
+    return whole.toarray()[np.ix_(library.dofs, library.dofs)]
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, INCOMPRESSIBLE])
+@pytest.mark.parametrize("material", ["neo-hookean", "linear"])
+def test_at_rest_it_is_the_mixed_element_of_constant_pressures(small_mesh, material, poisson):
+    body = Body(small_mesh, material, 30.0, P0)
+    library = Library(small_mesh, skfem.ElementTetP2(), intorder=2)
+    expected = mixed_stiffness(library, poisson, skfem.ElementTetP0())
+    assert relative_error(stiffness(body, poisson).toarray(), expected) < 1e-11
+
+
+def sag_m(K: np.ndarray | sp.csc_array, body: Body) -> float:
+    """How far the tip of a beam, clamped at x = 0, sinks under its weight."""
+    free = np.flatnonzero(np.repeat(body.nodes_m[:, 0] > 1e-9, 3))
+    load, u = np.zeros((2, body.nodes_m.size))
+    load[2::3] = -9.81 * body.node_mass
+    u[free] = spsolve(sp.csc_array(K)[free][:, free], load[free])
+    return -u[2::3][nodes_where(body, 0, body.nodes_m[:, 0].max())].mean()
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.49, INCOMPRESSIBLE])
+def test_a_beam_sags_as_with_taylor_and_hoods_element(poisson):
+    mesh = box_mesh((0.10, 0.02, 0.02), (6, 2, 2))
+    plain, averaging, linear = (Body(mesh, "linear", 30.0, name) for name in ("tet10", P0, "tet4"))
+    library = Library(mesh, skfem.ElementTetP2(), intorder=4)
+    expected = sag_m(mixed_stiffness(library, poisson, skfem.ElementTetP1()), plain)
+    found = [sag_m(stiffness(body, poisson), body) for body in (averaging, plain, linear)]
+    print(poisson, np.array(found) / expected)
+
+
+def solution(body: Body, poisson: float) -> tuple[np.ndarray, Callable]:
+    lambda_pa, mu_pa = lame(poisson)
