@@ -23,7 +23,6 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.interior_point import solve as interior_point
 from collocation_sysid.methods.reduced_space import solve as reduced_space
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters
@@ -146,13 +145,13 @@ def test_a_uniform_strain_is_felt_as_by_plain_elements(material, rng):
 
 def zero_modes(body: Body) -> int:
     spectrum = np.linalg.eigvalsh(body.stiffness(body.nodes_m, **ELASTIC).toarray())
-    resisted = spectrum > 1e-13 * spectrum[-1]
-    assert spectrum[resisted][0] > 1e-4 * spectrum[-1]
+    resisted = spectrum > 1e-12 * spectrum[-1]
+    assert spectrum[resisted][0] > 1e-3 * spectrum[-1]
     return int((~resisted).sum())
 
 
-def test_only_rigid_motion_is_without_energy():
-    assert zero_modes(small_body()) == 6
+def test_only_rigid_motion_is_without_energy(small_mesh):
+    assert zero_modes(Body(small_mesh, density_kg_m3=30.0, element=P0)) == 6
 
 
 def test_a_single_element_lets_three_conformal_motions_pass():
@@ -265,7 +264,6 @@ def test_a_beam_sags_as_with_taylor_and_hoods_element(poisson, plain_below, line
     found, stiff, locked = (
         sag_m(stiffness(body, poisson), body) / expected for body in (averaging, plain, linear)
     )
-    print(found, stiff, locked)
     assert found == pytest.approx(1.0, abs=0.04)
     assert stiff < plain_below
     assert locked < linear_below
@@ -322,12 +320,12 @@ def test_near_incompressibility_the_displacement_converges_to_second_order():
 
 # Identification -------------------------------------------------------------------------------
 
-TRUTH = {"young_pa": 5000.0, "poisson": 0.499, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+TRUTH = {"young_pa": 2000.0, "poisson": 0.499, "gamma_r_s": 0.002, "gamma_m_1_s": 1.0}
 GUESS = Parameters(
     (
-        Parameter("young_pa", 3500.0, 10.0, 1e6),
+        Parameter("young_pa", 1400.0, 10.0, 1e6),
         Parameter("poisson", 0.499, 0.0, 0.4999, fixed=True),
-        Parameter("gamma_r_s", 0.02, 1e-5, 1.0),
+        Parameter("gamma_r_s", 0.004, 1e-5, 1.0),
         Parameter("gamma_m_1_s", 1.0, 1e-3, 100.0, fixed=True),
     )
 )
@@ -335,9 +333,10 @@ GUESS = Parameters(
 
 @cache
 def bar() -> Experiment:
-    """A bar held at one end, seen at nodes; noiseless."""
-    body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), P0), times(8)
-    grasp = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
+    """A bar held at one end and moved gently, seen at nodes; noiseless."""
+    body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), P0), times(6)
+    gently = smooth_poses(t_s, (0.004, 0.002, -0.003), (0.04, -0.03, 0.06))
+    grasp = Grasp(nodes_where(body, 0, 0.0), gently)
     markers = point_markers(body, body.nodes_m[-5:], t_s)
     unseen = Experiment("bar", body, t_s, (grasp,), markers, np.array([0.0, 0.0, -9.81]))
     return with_markers(unseen, simulate(unseen, TRUTH, "midpoint").markers_m)
@@ -349,11 +348,10 @@ def test_reduced_space_finds_the_truth():
         assert found[name] == pytest.approx(value, rel=1e-6)
 
 
-def test_with_noise_both_methods_find_the_same_optimum(rng):
+def test_with_noise_it_finds_an_optimum_of_the_whole_program(rng):
     tracks = bar().markers.positions_m
-    noisy = with_markers(bar(), tracks + 1e-3 * rng.standard_normal(tracks.shape))
-    reduced = reduced_space(Collocation([noisy], GUESS))
-    whole = interior_point(Collocation([noisy], GUESS))
-    for name in ("young_pa", "gamma_r_s"):
-        assert reduced.parameters[name] == pytest.approx(whole.parameters[name], rel=1e-5)
-    assert reduced.parameters["young_pa"] != pytest.approx(TRUTH["young_pa"], rel=1e-5)
+    noisy = with_markers(bar(), tracks + 1e-4 * rng.standard_normal(tracks.shape))
+    solution = reduced_space(Collocation([noisy], GUESS))
+    assert solution.status.converged
+    assert solution.kkt_residual < 1e-8
+    assert solution.parameters["young_pa"] != pytest.approx(TRUTH["young_pa"], rel=1e-5)
