@@ -12,7 +12,6 @@ from .errors import SimulationError
 from .experiment import Experiment
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution
-from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
@@ -72,19 +71,14 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     """The experiment with its own unknowns: those of the fit, or fitted with θ as found."""
     collocation = solution.collocation
-    own = collocation.unpack_own(solution.z)
-    for segment, phi in zip(collocation.segments, own, strict=True):
-        if segment.experiment is experiment:
-            return segment, phi
-    alone = Collocation(
-        [replace(experiment, validation=False)],
-        Parameters.of(solution.parameters),
-        collocation.scheme,
-        collocation.substeps,
-        huber=collocation.huber,
+    for part in collocation.parts(solution.z):
+        if part.segment.experiment is experiment:
+            return part.segment, part.phi
+    alone = replace(
+        collocation,
+        experiments=[replace(experiment, validation=False)],
+        parameters=Parameters.of(solution.parameters),
     )
     (segment,) = alone.segments
-    if not alone.own:
-        return segment, np.zeros(0)
-    predicted = ReducedSpace()(alone)
-    return segment, alone.unpack_own(predicted.z)[0]
+    # All that is left to estimate is φ.
+    return segment, alone.parameters_of(ReducedSpace()(alone).z) if alone.nphi else np.zeros(0)

@@ -149,11 +149,9 @@ def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
 def _own_unknowns(finished: Run) -> list[Text]:
     """One line for each experiment that has unknowns of its own; offsets by their length."""
     collocation, lines = finished.solution.collocation, []
-    for segment, phi in zip(
-        collocation.segments, collocation.unpack_own(finished.solution.z), strict=True
-    ):
-        local, name = segment.local, segment.experiment.name
-        values, said = phi * local.scales, []
+    for part in collocation.parts(finished.solution.z):
+        segment, local, name = part.segment, part.segment.local, part.segment.experiment.name
+        values, said = part.phi * local.scales, []
         offsets = values[local.places("offset")].reshape(-1, 3)
         if len(offsets):
             lengths = np.linalg.norm(offsets, axis=1)

@@ -131,7 +131,7 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     q = solution.z[: collocation.nq]
     fit = linearised_fit(collocation, solution.z)
     found = [uncertainty_of(fit, collocation.parameters, q, *kind) for kind in KINDS]
-    wrong = collocation.unpack_own(solution.z)[0] - phi
+    wrong = collocation.parameters_of(solution.z)[collocation.nq :] - phi
     return Outcome(
         solution.status.converged,
         np.array([[*held(each), held_own(each, wrong)] for each in found]),

@@ -20,10 +20,10 @@ import numpy as np
 from get_srl_beam import FOLDER, ORIGIN_M, SIZE_M
 from numpy.typing import NDArray
 
-from collocation_sysid import Collocation, Problem, Solution, load_problem, solve
+from collocation_sysid import Problem, Solution, load_problem, solve
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.segment import Segment
+from collocation_sysid.nlp.collocation import Part
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import verdicts
@@ -99,9 +99,9 @@ def joint(source: Path) -> None:
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
     print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
     print("\nown unknowns, and their standard deviations")
-    for segment, phi in unknowns(solution):
-        local = segment.local
-        for name, value, scale in zip(local.names, phi, local.scales, strict=True):
+    for part in solution.collocation.parts(solution.z):
+        local = part.segment.local
+        for name, value, scale in zip(local.names, part.phi, local.scales, strict=True):
             deviation = uncertainty.local[name] * scale
             print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
@@ -164,16 +164,13 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
         replace(item, guess=solution.parameters[item.name], fixed=True)
         for item in problem.parameters.items
     )
-    collocation = Collocation(
-        [replace(experiment, validation=False)],
-        replace(problem.parameters, items=fixed),
-        solution.collocation.scheme,
-        solution.collocation.substeps,
+    collocation = replace(
+        solution.collocation,
+        experiments=[replace(experiment, validation=False)],
+        parameters=replace(problem.parameters, items=fixed),
     )
-    predicted = ReducedSpace()(collocation)
-    ((segment, phi),) = unknowns(predicted)
-    (x,) = predicted.positions_m
-    return rms_of(segment, x, phi), rms_of(segment, x, np.zeros_like(phi))
+    (part,) = collocation.parts(ReducedSpace()(collocation).z)
+    return rms_of(part), rms_of(replace(part, phi=np.zeros_like(part.phi)))
 
 
 # Tables ---------------------------------------------------------------------------------------
@@ -221,18 +218,12 @@ def guesses(solution: Solution) -> list[str]:
     return [f"parameters.{name}.guess={values[name]:.6g}" for name in values if name in free]
 
 
-def unknowns(solution: Solution) -> list[tuple[Segment, NDArray[np.float64]]]:
-    collocation = solution.collocation
-    return list(zip(collocation.segments, collocation.unpack_own(solution.z), strict=True))
-
-
 def rms_mm(solution: Solution) -> list[float]:
-    parts = zip(unknowns(solution), solution.positions_m, strict=True)
-    return [rms_of(segment, x, phi) for (segment, phi), x in parts]
+    return [rms_of(part) for part in solution.collocation.parts(solution.z)]
 
 
-def rms_of(segment: Segment, x: NDArray[np.float64], phi: NDArray[np.float64]) -> float:
-    squares = segment.observation.squared_distances_m2(x.reshape(len(x), -1), phi)
+def rms_of(part: Part) -> float:
+    squares = part.segment.observation.squared_distances_m2(part.x, part.phi)
     return 1e3 * float(np.sqrt(squares.mean()))
 
 

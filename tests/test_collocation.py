@@ -73,9 +73,10 @@ def some_point(collocation: Collocation, seed: int = 1) -> np.ndarray:
     for segment in collocation.segments:
         rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    q = collocation.parameters.guess_q
-    own = [0.5 * rng.normal(size=segment.local.size) for segment in collocation.segments]
-    return collocation.pack(q + 0.1 * rng.normal(size=q.shape), positions, own)
+    p, nq = collocation.guess_p, collocation.nq
+    p[nq:] = 0.5 * rng.normal(size=collocation.nphi)
+    p[:nq] += 0.1 * rng.normal(size=nq)
+    return collocation.pack(p, positions)
 
 
 def seen_with_gaps(experiment: Experiment) -> Experiment:
@@ -115,11 +116,11 @@ def assert_derivatives(collocation: Collocation, rng: np.random.Generator) -> No
         only_q = np.concatenate([np.ones(collocation.nq), np.zeros(len(z) - collocation.nq)])
         assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_q)
         assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_q)
-    if collocation.own:
-        only_own = np.concatenate([np.zeros(len(z) - collocation.own), np.ones(collocation.own)])
-        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_own)
+    if nphi := collocation.nphi:
+        only_phi = np.concatenate([np.zeros(len(z) - nphi), np.ones(nphi)])
+        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_phi)
         if any(len(segment.local.moving) for segment in collocation.segments):
-            assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_own)
+            assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_phi)
 
 
 # Derivatives

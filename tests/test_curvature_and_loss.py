@@ -24,8 +24,9 @@ def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) 
 
 
 def point_at(collocation: Collocation, p: np.ndarray) -> Point:
-    (segment,), (setting,) = collocation.segments, collocation.settings(p)
-    _, (phi,) = collocation.split(p)
+    (segment,) = collocation.segments
+    q, phi = np.split(p, [collocation.nq])
+    setting = segment.setting(q, phi)
     x = march(segment.corrected(phi), setting.dynamics, setting.theta)
     return Horizon(collocation, [segment.grid_rows]).evaluate(p, [x])
 
@@ -34,8 +35,8 @@ def point_at(collocation: Collocation, p: np.ndarray) -> Point:
 @pytest.mark.parametrize("experiment", [hung_cube(), bar_let_go(), cube_with_unknowns()])
 def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rng):
     collocation = with_noise(5e-3, experiment, huber=huber)
-    count = 4 + collocation.own
-    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.own)])
+    count = 4 + collocation.nphi
+    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.nphi)])
     p += 0.05 * rng.normal(size=count)
     direction = rng.normal(size=count)
     point = point_at(collocation, p)

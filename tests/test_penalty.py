@@ -80,7 +80,7 @@ def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
     answer = problem.grasped(disturbed(problem, rng))
     rows = problem.nlp.constraint_values(answer).reshape(-1, problem.nlp.segments[0].dofs)
     (segment,) = problem.nlp.segments
-    assert segment.dynamics.taken is not None
+    assert segment.dynamics.taken.any()
     np.testing.assert_allclose(rows[:, segment.held_dofs], 0, atol=1e-12)
     np.testing.assert_allclose(rows[segment.dynamics.taken], 0, atol=1e-12)
 

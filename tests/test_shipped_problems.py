@@ -16,7 +16,6 @@ from collocation_sysid import Problem, load_problem, run, solve, write_run
 from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.run import Run
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
@@ -128,12 +127,10 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
     if huber and offsets:
         return noisy_run().solution
     problem = noisy_run().problem
-    (experiment,), transcription = problem.experiments, problem.file.transcription
-    collocation = Collocation(
-        [experiment if offsets else replace(experiment, nuisance=Nuisance())],
-        problem.parameters,
-        transcription.scheme,
-        transcription.substeps,
+    (experiment,) = problem.experiments
+    collocation = replace(
+        noisy_run().solution.collocation,
+        experiments=[experiment if offsets else replace(experiment, nuisance=Nuisance())],
         huber=problem.file.solver.huber if huber else None,
     )
     return ReducedSpace()(collocation)
@@ -175,8 +172,8 @@ def test_neither_remedy_is_enough_for_the_noisy_cylinder(huber: bool, offsets: b
 
 def test_the_misplaced_marker_is_found_where_it_is_glued():
     solution = noisy_fit(huber=True, offsets=True)
-    (segment,) = solution.collocation.segments
-    (phi,) = solution.collocation.unpack_own(solution.z)
+    (part,) = solution.collocation.parts(solution.z)
+    segment = part.segment
     markers, body = segment.experiment.markers, segment.body
     k, local = markers.names.index(MISPLACED), segment.local
     glued = place_markers([GLUED_M], body.nodes_m, body)
@@ -184,7 +181,7 @@ def test_the_misplaced_marker_is_found_where_it_is_glued():
     around_m = shapes_m[:, glued.nodes[0]]
     # The marker turns with the body, its offset does not: the mean is what can be found.
     true_m = (glued.weights[0] @ around_m - markers.observe(shapes_m)[:, k]).mean(axis=0)
-    found_m = (phi * local.scales).reshape(-1, 3)
+    found_m = (part.phi * local.scales).reshape(-1, 3)
     deviations_m = np.array([attainable().local[name] for name in local.names]) * local.scales
     assert np.linalg.norm(true_m) > 0.005
     assert np.abs((found_m[k] - true_m) / deviations_m.reshape(-1, 3)[k]).max() < 3.0

@@ -45,7 +45,7 @@ def with_noise(experiment: Experiment, noise_m: float = 1e-3, **changes) -> Coll
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
     rng = np.random.default_rng(3)
-    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.own)])
+    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.nphi)])
     return p + 0.1 * rng.normal(size=len(p))
 
 

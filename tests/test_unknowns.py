@@ -152,8 +152,8 @@ def test_unknowns_are_found_beside_the_material(kind: str, method: str, rng):
     phi = rng.uniform(-1, 1, Local.of(cube).size)
     solution = METHODS[method]()(alone(seen_with(cube, phi)))
     assert solution.status.converged
-    (found,) = solution.collocation.unpack_own(solution.z)
-    np.testing.assert_allclose(found, phi, atol=1e-3)
+    (part,) = solution.collocation.parts(solution.z)
+    np.testing.assert_allclose(part.phi, phi, atol=1e-3)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
 
@@ -165,8 +165,8 @@ def test_a_prior_keeps_what_the_data_do_not_tell():
     tracks = measured(one).markers.positions_m + np.array([0.005, 0.0, 0.0])
     both = replace(with_markers(one, tracks), nuisance=unknown)
     solution = ReducedSpace()(alone(both))
-    (phi,) = solution.collocation.unpack_own(solution.z)
-    offset, shift = 0.002 * phi[0], 0.001 * phi[3]
+    (part,) = solution.collocation.parts(solution.z)
+    offset, shift = 0.002 * part.phi[0], 0.001 * part.phi[3]
     assert offset / shift == pytest.approx(4.0, rel=0.05)  # as their variances
     assert offset + shift == pytest.approx(0.005, rel=0.05)
 
@@ -196,7 +196,7 @@ def test_experiments_keep_their_unknowns_to_themselves(rng):
         for e in both
     ]
     solution = ReducedSpace()(Collocation(exact, GUESS))
-    found = np.concatenate(solution.collocation.unpack_own(solution.z))
+    found = solution.collocation.parameters_of(solution.z)[4:]
     np.testing.assert_allclose(found, [0.7, -0.4], atol=1e-3)
     assert solution.collocation.names[4:] == (
         "hung cube: time shift [s]",

@@ -117,7 +117,6 @@ def check_problem(problem: Problem) -> Findings:
     parameters, body = problem.parameters, problem.body
     theta = body.theta(parameters.guesses)
     z, start_notes = initial_variables(collocation)
-    positions = collocation.unpack(z)[1]
     short = build_collocation(shortened(problem, SAMPLES))
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
     jacobian, hessian = _nonzeros(problem)
@@ -127,7 +126,7 @@ def check_problem(problem: Problem) -> Findings:
     chosen = next((cost for cost in found_costs if cost.method == solver.method), None)
 
     quality, worst, shape = body.mesh.quality(), worst_elements(body.mesh), slenderness(body.mesh)
-    recordings = _recordings(problem, collocation, positions)
+    recordings = _recordings(problem, collocation, z)
     scheme = scheme_named(collocation.scheme)
     motions = tuple(
         motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(parameters.guesses))
@@ -188,13 +187,11 @@ def _guess(body: Body, theta: Array) -> dict[str, float]:
     return found | dict(zip(body.constants, theta.tolist(), strict=True))
 
 
-def _recordings(
-    problem: Problem, collocation: Collocation, positions: list[Array]
-) -> tuple[Recording, ...]:
-    simulated = {
-        segment.experiment.name: x[segment.observation.grid_rows].reshape(-1, segment.dofs // 3, 3)
-        for segment, x in zip(collocation.segments, positions, strict=True)
-    }
+def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[Recording, ...]:
+    simulated = {}
+    for part in collocation.parts(z):
+        at_samples = part.x[part.segment.observation.grid_rows]
+        simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
 
 

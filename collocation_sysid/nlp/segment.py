@@ -7,13 +7,16 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
+from ..fem.body import Body
 from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
 from .dynamics import Dynamics
@@ -24,75 +27,105 @@ from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
 from .setting import Setting
 
+T = TypeVar("T", bound=np.generic)
 
+
+@dataclass(frozen=True)
+class First:
+    """Where a segment begins: its x in z, its φ in p = (q, φ_1, φ_2, …), and its rows in g."""
+
+    x: int
+    phi: int
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
 class Segment:
     """The variables x_{t,i} and constraints of one experiment.
 
-    Parameters
+    Attributes
     ----------
     experiment : Experiment
-    scheme : str
-    substeps : int
     parameters : Parameters
         At their guess the constraints are scaled.
+    scheme, substeps, huber
+        See `Collocation`.
     explicit_grasps : bool
         Grasped nodes get rows of their own instead of bounds. Those that are held only for a
         while always do.
-    huber : float, optional
-        See `Observation`.
-
-    Attributes
-    ----------
-    constants : ThetaMap
-        The body's constants as functions of q.
-    local : Local
-        The experiment's own unknowns φ.
-    rows_per_time : int
-        Constraint rows of a grid time: free dofs, or all dofs with explicit grasps.
-    row_dofs : (rows_per_time,) the dof of each row
+    first : First
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        scheme: str,
-        substeps: int,
-        parameters: Parameters,
-        explicit_grasps: bool = False,
-        huber: float | None = None,
-    ) -> None:
-        self.experiment = experiment
-        self.nq = len(parameters.free)
-        self.body = experiment.body
-        self.constants = ThetaMap(parameters, self.body)
-        self.dynamics = Dynamics.of(experiment, scheme, substeps)
-        grid = self.dynamics.t_s
-        self.local = Local.of(experiment)
-        samples = np.arange(len(experiment.t_s)) * substeps
-        self.observation = Observation(
-            experiment.markers,
-            samples,
+    experiment: Experiment
+    parameters: Parameters
+    scheme: str
+    substeps: int
+    explicit_grasps: bool
+    huber: float | None
+    first: First
+
+    @property
+    def body(self) -> Body:
+        """What moves."""
+        return self.experiment.body
+
+    @cached_property
+    def constants(self) -> ThetaMap:
+        """The body's constants as functions of q."""
+        return ThetaMap(self.parameters, self.body)
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """The equations of motion under gravity as stated."""
+        return Dynamics.of(self.experiment, self.scheme, self.substeps)
+
+    @cached_property
+    def local(self) -> Local:
+        """The experiment's own unknowns φ."""
+        return Local.of(self.experiment)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """The loss."""
+        return Observation(
+            self.experiment.markers,
+            np.arange(len(self.experiment.t_s)) * self.substeps,
             self.local,
-            huber,
+            self.huber,
             from_rest=not self.dynamics.start_velocity_m_s.any(),
         )
-        self.explicit_grasps = explicit_grasps
-        self.dofs = self.body.pattern.size
-        self.free_dofs = dofs_of(experiment.free_nodes)
-        self.held_dofs = dofs_of(experiment.held_nodes)
-        grasped = experiment.grasped(grid)[1].reshape(len(grid), -1)
-        self.held_positions = grasped[:, self.held_dofs]
-        # Positions of dofs held for a while, at the rows (t, dof) of `Dynamics.taken`.
-        taken = self.dynamics.taken
-        self.taken_positions = grasped[taken] if taken is not None else np.zeros(0)
-        self.row_dofs = np.arange(self.dofs) if explicit_grasps else self.free_dofs
-        self.rows_per_time = len(self.row_dofs)
-        self.length_m = float(
-            np.linalg.norm(np.diff(self.body.nodes_m[self.body.mesh.edges], axis=1), axis=2).mean()
-        )
-        self.force_n = self.length_m * self._typical_stiffness(
-            self.constants.theta(parameters.guess_q)
-        )
+
+    # Sizes and places -------------------------------------------------------------------------
+
+    @property
+    def nq(self) -> int:
+        """Number of q."""
+        return len(self.parameters.free)
+
+    @property
+    def dofs(self) -> int:
+        """3n."""
+        return self.body.pattern.size
+
+    @cached_property
+    def free_dofs(self) -> Index:
+        """Dofs that are free at some time."""
+        return dofs_of(self.experiment.free_nodes)
+
+    @cached_property
+    def held_dofs(self) -> Index:
+        """Dofs that are held throughout."""
+        return dofs_of(self.experiment.held_nodes)
+
+    @cached_property
+    def row_dofs(self) -> Index:
+        """(rows_per_time,) the dof of each row of a grid time."""
+        return np.arange(self.dofs) if self.explicit_grasps else self.free_dofs
+
+    @property
+    def rows_per_time(self) -> int:
+        """Constraint rows of a grid time: free dofs, or all dofs with explicit grasps."""
+        return len(self.row_dofs)
 
     @property
     def grid_rows(self) -> int:
@@ -113,6 +146,49 @@ class Segment:
     def constraints(self) -> int:
         """Number of rows."""
         return self.constraint_times * self.rows_per_time
+
+    @property
+    def columns(self) -> slice:
+        """Its x in z."""
+        return slice(self.first.x, self.first.x + self.variables)
+
+    @property
+    def rows(self) -> slice:
+        """Its constraints in g."""
+        return slice(self.first.row, self.first.row + self.constraints)
+
+    @property
+    def places(self) -> Index:
+        """Its (q, φ) in p."""
+        return np.concatenate([np.arange(self.nq), self.first.phi + np.arange(self.local.size)])
+
+    @property
+    def after(self) -> First:
+        """Where the next segment begins."""
+        return First(self.columns.stop, self.first.phi + self.local.size, self.rows.stop)
+
+    # Grasps and scales ------------------------------------------------------------------------
+
+    @cached_property
+    def _grasp_positions(self) -> Array:
+        return self.experiment.grasped(self.dynamics.t_s)[1].reshape(self.grid_rows, -1)
+
+    @cached_property
+    def held_positions(self) -> Array:
+        """(N, held) where the grasps are."""
+        return self._grasp_positions[:, self.held_dofs]
+
+    @cached_property
+    def length_m(self) -> float:
+        """ℓ, the mean edge."""
+        edges = np.diff(self.body.nodes_m[self.body.mesh.edges], axis=1)
+        return float(np.linalg.norm(edges, axis=2).mean())
+
+    @cached_property
+    def force_n(self) -> float:
+        """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
+        theta = self.constants.theta(self.parameters.guess_q)
+        return self.length_m * self._typical_stiffness(theta)
 
     def start_positions(self) -> Array | None:
         """(3n,) the given x_0, or None when it is found as an equilibrium."""
@@ -164,8 +240,7 @@ class Segment:
         """Positions (N, 3n) with the held nodes where their grasps are."""
         x = x.copy()
         x[:, self.held_dofs] = self.held_positions
-        if self.dynamics.taken is not None:
-            x[self.dynamics.taken] = self.taken_positions
+        x[self.dynamics.taken] = self._grasp_positions[self.dynamics.taken]
         return x
 
     # Values ---------------------------------------------------------------------------------
@@ -179,9 +254,19 @@ class Segment:
         if self.explicit_grasps:
             rows[:, self.held_dofs] = (x[:, self.held_dofs] - self.held_positions) / self.length_m
         taken = self.dynamics.taken
-        if taken is not None:
-            rows[taken] = (x[taken] - self.taken_positions) / self.length_m
-        return rows[self.dynamics.first_row :, self.row_dofs].ravel()
+        rows[taken] = (x[taken] - self._grasp_positions[taken]) / self.length_m
+        return self.of_rows(rows)
+
+    def of_rows(self, values: NDArray[T]) -> NDArray[T]:
+        """(constraints,) what the rows have of (N, 3n)."""
+        return values[self.dynamics.first_row :, self.row_dofs].ravel()
+
+    @cached_property
+    def grasp_rows(self) -> NDArray[np.bool_]:
+        """(constraints,) rows that hold a node instead of moving it."""
+        grasped = self.dynamics.taken.copy()
+        grasped[:, self.held_dofs] = True
+        return self.of_rows(grasped)
 
     def residual_n(self, x: Array, setting: Setting) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""

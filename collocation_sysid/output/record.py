@@ -271,12 +271,10 @@ def _unknowns(finished: Run) -> dict[str, dict[str, Any]]:
     deviations = finished.uncertainty.local if finished.uncertainty is not None else {}
     collocation = finished.solution.collocation
     found = {}
-    for segment, phi in zip(
-        collocation.segments, collocation.unpack_own(finished.solution.z), strict=True
-    ):
-        local = segment.local
-        for name, value, scale in zip(local.names, phi, local.scales, strict=True):
-            found.setdefault(segment.experiment.name, {})[name.partition(": ")[2]] = {
+    for part in collocation.parts(finished.solution.z):
+        local = part.segment.local
+        for name, value, scale in zip(local.names, part.phi, local.scales, strict=True):
+            found.setdefault(part.segment.experiment.name, {})[name.partition(": ")[2]] = {
                 "value": float(value * scale),
                 "prior": float(scale),
                 "std_error": deviations[name] * scale if name in deviations else None,

@@ -51,7 +51,5 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 
 
 def _by_experiment(collocation: Collocation, z: Array) -> Iterator[tuple[Segment, Iterator[Array]]]:
-    _, positions = collocation.unpack(z)
-    settings = collocation.settings(collocation.parameters_of(z))
-    for segment, x, setting in zip(collocation.segments, positions, settings, strict=True):
-        yield segment, BlockSolver(segment).sensitivities(x, setting)
+    for part in collocation.parts(z):
+        yield part.segment, BlockSolver(part.segment).sensitivities(part.x, part.setting)

@@ -1056,7 +1056,7 @@ for name, experiment in (("as told", wrong), ("offset estimated", aware)):
     offsets[name] = np.log(list(found.parameters.values())), np.sqrt(np.diag(bars.covariance))
     print(f"{name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)
-first_unknown = 0.005 * found.collocation.unpack_own(found.z)[0][3 * tip]
+first_unknown = 0.005 * found.collocation.parts(found.z)[0].phi[3 * tip]
 print(f"estimated offset of tip_1 along x: {1e3 * first_unknown:.2f} mm (truth 4)")
 assert abs(first_unknown - 0.004) < 0.0005
 
