@@ -98,11 +98,11 @@ def joint(source: Path) -> None:
     for name, estimate in uncertainty.estimates.items():
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
     print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
-    print("\nown unknowns, and their standard deviations")
+    print("\nnuisance parameters, and their standard deviations")
     for part in solution.collocation.parts(solution.z):
-        local = part.segment.local
-        for name, value, scale in zip(local.names, part.phi, local.scales, strict=True):
-            deviation = uncertainty.local[name] * scale
+        nuisance = part.segment.nuisance
+        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
+            deviation = uncertainty.nuisance[name] * scale
             print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
     said = dict.fromkeys((*solution.notes, *uncertainty.notes, *verdicts(uncertainty)))
@@ -131,7 +131,7 @@ def refinement(source: Path) -> None:
 def validation(source: Path) -> None:
     """Each trial predicted with the material of the other two."""
     print(f"{'predicted':12}{'E [kPa]':>9}{'γ_r [ms]':>10}{'γ_m [1/s]':>11}", end="")
-    print(f"{'RMS [mm] with own unknowns':>30}{'without':>10}{'fitted':>9}")
+    print(f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'fitted':>9}")
     together = shipped(source)
     all_three = dict(zip(TRIALS, rms_mm(together), strict=True))
     for trial in TRIALS:
@@ -158,7 +158,7 @@ def poisson(source: Path) -> None:
 
 
 def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
-    """RMS distance of a trial at a solution's material: its own unknowns fitted, and all zero."""
+    """RMS distance of a trial at a solution's material: its nuisance fitted, and all zero."""
     experiment = next(e for e in problem.experiments if e.name == trial)
     fixed = tuple(
         replace(item, guess=solution.parameters[item.name], fixed=True)

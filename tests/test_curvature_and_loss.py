@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from checks import directional_derivative
-from problems_small import GUESS, TRUTH, bar_let_go, cube_with_unknowns, hung_cube, noisy
+from problems_small import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
@@ -32,7 +32,7 @@ def point_at(collocation: Collocation, p: np.ndarray) -> Point:
 
 
 @pytest.mark.parametrize("huber", [None, 4.0])
-@pytest.mark.parametrize("experiment", [hung_cube(), bar_let_go(), cube_with_unknowns()])
+@pytest.mark.parametrize("experiment", [hung_cube(), bar_let_go(), cube_with_nuisance()])
 def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rng):
     collocation = with_noise(5e-3, experiment, huber=huber)
     count = 4 + collocation.nphi
@@ -55,8 +55,8 @@ def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rn
 
 
 @pytest.mark.parametrize("huber", [None, 2.0])
-@pytest.mark.parametrize("experiment", [bar_let_go(), cube_with_unknowns()])
-def test_both_methods_find_the_same_optimum_of_all_unknowns(experiment, huber):
+@pytest.mark.parametrize("experiment", [bar_let_go(), cube_with_nuisance()])
+def test_both_methods_find_the_same_optimum_of_all_parameters(experiment, huber):
     collocation = with_noise(1e-3, experiment, huber=huber)
     reduced = ReducedSpace(tolerance=1e-9)(collocation)
     interior = InteriorPoint()(collocation)

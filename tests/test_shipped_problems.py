@@ -175,14 +175,16 @@ def test_the_misplaced_marker_is_found_where_it_is_glued():
     (part,) = solution.collocation.parts(solution.z)
     segment = part.segment
     markers, body = segment.experiment.markers, segment.body
-    k, local = markers.names.index(MISPLACED), segment.local
+    k, nuisance = markers.names.index(MISPLACED), segment.nuisance
     glued = place_markers([GLUED_M], body.nodes_m, body)
     shapes_m = solution.positions_m[0][segment.observation.grid_rows][markers.present[:, k]]
     around_m = shapes_m[:, glued.nodes[0]]
     # The marker turns with the body, its offset does not: the mean is what can be found.
     true_m = (glued.weights[0] @ around_m - markers.observe(shapes_m)[:, k]).mean(axis=0)
-    found_m = (part.phi * local.scales).reshape(-1, 3)
-    deviations_m = np.array([attainable().local[name] for name in local.names]) * local.scales
+    found_m = (part.phi * nuisance.scales).reshape(-1, 3)
+    deviations_m = (
+        np.array([attainable().nuisance[name] for name in nuisance.names]) * nuisance.scales
+    )
     assert np.linalg.norm(true_m) > 0.005
     assert np.abs((found_m[k] - true_m) / deviations_m.reshape(-1, 3)[k]).max() < 3.0
     others_m = np.linalg.norm(np.delete(found_m, k, axis=0), axis=1)

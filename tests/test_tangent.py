@@ -48,7 +48,7 @@ def disturbed(
 
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
-    """All parameters p: the guess, and experiments' own unknowns that are not zero."""
+    """All parameters p: the guess, and nuisance parameters that are not zero."""
     phi = 0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)
     return np.concatenate([collocation.parameters.guess_q, phi])
 

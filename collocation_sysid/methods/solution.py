@@ -148,7 +148,7 @@ class Solution:
 
     @cached_property
     def readings_m(self) -> list[Array]:
-        """Fitted markers (T, M, 3) of each experiment, with its own unknowns."""
+        """Fitted markers (T, M, 3) of each experiment, with its φ."""
         parts = self.collocation.parts(self.z)
         return [part.segment.observation.predicted(part.x, part.phi) for part in parts]
 

@@ -9,7 +9,7 @@ Variables z, in this order:
 q                  of each estimated parameter, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
-φ_e                the own unknowns of experiment e, see `nlp.local`; experiment by experiment
+φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by experiment
 =================  =========================================================================
 
 Constraints g, in this order:
@@ -65,7 +65,7 @@ class Part:
     ----------
     segment : Segment
     q : (nq,) shared parameters
-    phi : (k,) its own φ
+    phi : (k,) its nuisance parameters
     x : (N, 3n) positions [m], or its first rows
     """
 
@@ -157,7 +157,7 @@ class Collocation:
 
     @property
     def nphi(self) -> int:
-        """Number of the experiments' own unknowns φ, all together."""
+        """Number of the nuisance parameters φ, all together."""
         return self.segments[-1].after.phi - self.nq
 
     @property
@@ -210,9 +210,9 @@ class Collocation:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each entry of p is: the parameters' names, then the experiments' own unknowns."""
-        own = [name for segment in self.segments for name in segment.local.names]
-        return (*(item.name for item in self.parameters.free), *own)
+        """What each entry of p is: the parameters' names, then the nuisance parameters."""
+        nuisance = [name for segment in self.segments for name in segment.nuisance.names]
+        return (*(item.name for item in self.parameters.free), *nuisance)
 
     def prior(self, p: Array) -> tuple[Array, Array]:
         """Residuals of the priors at p, and their slopes; φ counts in its deviations."""
@@ -226,18 +226,18 @@ class Collocation:
     def bounds_p(self) -> tuple[Array, Array]:
         """Lower and upper bounds of p."""
         lower, upper = self.parameters.bounds_q
-        limits = np.concatenate([segment.local.limits for segment in self.segments])
+        limits = np.concatenate([segment.nuisance.limits for segment in self.segments])
         return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
 
     @property
     def guess_p(self) -> Array:
-        """The guess of p; own unknowns are zero."""
+        """The guess of p; φ is zero."""
         return np.concatenate([self.parameters.guess_q, np.zeros(self.nphi)])
 
     @property
     def reach_p(self) -> Array:
         """What a trust region of one allows each entry of p."""
-        return np.concatenate([np.ones(self.nq), *(s.local.reach for s in self.segments)])
+        return np.concatenate([np.ones(self.nq), *(s.nuisance.reach for s in self.segments)])
 
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z; equal for what is given."""
@@ -282,7 +282,7 @@ class Collocation:
             indices.append(segment.first.row + segment.jacobian.indices)
             used += segment.jacobian.nnz
         for segment in self.segments:
-            moves = np.isin(np.arange(segment.local.size), segment.local.moving)
+            moves = np.isin(np.arange(segment.nuisance.size), segment.nuisance.moving)
             indptr.append(used + np.cumsum(moves * segment.constraints))
             rows = segment.first.row + np.arange(segment.constraints)
             indices.append(np.tile(rows, int(moves.sum())))
@@ -358,7 +358,7 @@ class Collocation:
         q = z[: self.nq]
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
         used = self.nq * (self.nq + 1) // 2
-        own = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
+        phi = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
         by_q = np.zeros((self.nq, self.nq))
         weight = loss_weight * self.loss_scale
         for part in self.parts(z):
@@ -369,8 +369,8 @@ class Collocation:
             of_rows = multipliers[segment.rows]
             by_q += segment.hessian_values(part.x, part.phi, part.setting, of_rows, weight, here)
             if of_phi:
-                values[used : used + of_x], values[own : own + of_phi] = here[:of_x], here[of_x:]
-            used, own = used + of_x, own + of_phi
+                values[used : used + of_x], values[phi : phi + of_phi] = here[:of_x], here[of_x:]
+            used, phi = used + of_x, phi + of_phi
         _, slopes = self.parameters.prior(q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)

@@ -21,7 +21,7 @@ from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
 from .dynamics import Dynamics
 from .hessian_layout import HessianLayout
-from .local import Local
+from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
@@ -80,9 +80,9 @@ class Segment:
         return Dynamics.of(self.experiment, self.scheme, self.substeps)
 
     @cached_property
-    def local(self) -> Local:
-        """The experiment's own unknowns φ."""
-        return Local.of(self.experiment)
+    def nuisance(self) -> NuisanceMap:
+        """The experiment's φ."""
+        return NuisanceMap.of(self.experiment)
 
     @cached_property
     def observation(self) -> Observation:
@@ -90,7 +90,7 @@ class Segment:
         return Observation(
             self.experiment.markers,
             np.arange(len(self.experiment.t_s)) * self.substeps,
-            self.local,
+            self.nuisance,
             self.huber,
             from_rest=not self.dynamics.start_velocity_m_s.any(),
         )
@@ -160,12 +160,12 @@ class Segment:
     @property
     def places(self) -> Index:
         """Its (q, φ) in p."""
-        return np.concatenate([np.arange(self.nq), self.first.phi + np.arange(self.local.size)])
+        return np.concatenate([np.arange(self.nq), self.first.phi + np.arange(self.nuisance.size)])
 
     @property
     def after(self) -> First:
         """Where the next segment begins."""
-        return First(self.columns.stop, self.first.phi + self.local.size, self.rows.stop)
+        return First(self.columns.stop, self.first.phi + self.nuisance.size, self.rows.stop)
 
     # Grasps and scales ------------------------------------------------------------------------
 
@@ -215,26 +215,26 @@ class Segment:
     @cached_property
     def moving(self) -> Index:
         """Positions in (q, φ) of the parameters that change the motion."""
-        return np.concatenate([np.arange(self.nq), self.nq + self.local.moving])
+        return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.moving])
 
     def setting(self, q: Array, phi: Array) -> Setting:
         """The physical parameters at (q, φ)."""
         theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
         gravity_phi_phi = np.zeros((3, 0, 0))
-        moving = self.local.moving
+        moving = self.nuisance.moving
         if len(moving):
-            gravity, first, second = self.local.gravity(phi)
-            dynamics = dynamics.under_gravity(gravity - self.local.gravity_m_s2)
+            gravity, first, second = self.nuisance.gravity(phi)
+            dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
         return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi)
 
     def corrected(self, phi: Array) -> Experiment:
         """The experiment in the body's frame: gravity turned by φ."""
-        if not len(self.local.moving):
+        if not len(self.nuisance.moving):
             return self.experiment
-        return replace(self.experiment, gravity_m_s2=self.local.gravity(phi)[0])
+        return replace(self.experiment, gravity_m_s2=self.nuisance.gravity(phi)[0])
 
     def grasped(self, x: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
@@ -454,12 +454,12 @@ class Segment:
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
         pull = (weights * dynamics.weighed_kg[first:]).sum(axis=0).reshape(-1, 3).sum(axis=0)
-        by_phi = np.zeros((self.local.size, self.local.size))
-        by_phi[np.ix_(self.local.moving, self.local.moving)] = np.einsum(
+        by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
+        by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
         )
-        by_phi += 2 * loss_weight * np.eye(self.local.size)  # the prior
-        values[layout.phi] += by_phi[np.triu_indices(self.local.size)]
+        by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
+        values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
         theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
         by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
         return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
@@ -481,7 +481,7 @@ class Segment:
             self.nq,
             rows,
             columns,
-            self.local.size,
+            self.nuisance.size,
             self.length_m,
         )
 

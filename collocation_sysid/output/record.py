@@ -148,7 +148,7 @@ def result(finished: Run) -> dict[str, Any]:
         "title": problem.file.title,
         "parameters": _parameters(finished),
         "derived": _derived(finished),
-        "unknowns": _unknowns(finished),
+        "nuisance": _nuisance(finished),
         "uncertainty": _uncertainty(finished),
         "fit": _fit(solution),
         "residuals": [
@@ -168,7 +168,7 @@ def result(finished: Run) -> dict[str, Any]:
                     "rms_m": r.rms_m,
                     "max_m": r.max_m,
                     "fitted": name in fitted,
-                    "unknowns": r.unknowns,
+                    "nuisance": r.nuisance,
                 }
                 if isinstance(r, Rollout)
                 else {"failed": r, "fitted": name in fitted}
@@ -266,14 +266,14 @@ def _error_bar(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _unknowns(finished: Run) -> dict[str, dict[str, Any]]:
-    """The experiments' own unknowns in their units, with the deviation of their prior."""
-    deviations = finished.uncertainty.local if finished.uncertainty is not None else {}
+def _nuisance(finished: Run) -> dict[str, dict[str, Any]]:
+    """The nuisance parameters in their units, with the deviation of their prior."""
+    deviations = finished.uncertainty.nuisance if finished.uncertainty is not None else {}
     collocation = finished.solution.collocation
     found = {}
     for part in collocation.parts(finished.solution.z):
-        local = part.segment.local
-        for name, value, scale in zip(local.names, part.phi, local.scales, strict=True):
+        nuisance = part.segment.nuisance
+        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
             found.setdefault(part.segment.experiment.name, {})[name.partition(": ")[2]] = {
                 "value": float(value * scale),
                 "prior": float(scale),

@@ -1,7 +1,7 @@
 """The fit near its answer: residuals of all samples and their slopes along the motion equations.
 
 Everything the statistics need to know of a fit. Estimated are the shared parameters, q, and
-possibly local ones of single experiments, such as the offset of a marker on the body.
+possibly nuisance parameters of single experiments, such as the offset of a marker on the body.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class LinearisedFit:
     ----------
     blocks : tuple of FitBlock
         One per fitted experiment.
-    names : (p,) the shared parameters first, which are q; then local ones, with their unit in
+    names : (p,) the shared parameters first, which are q; then φ, with their unit in
         brackets: ``"gravity/offset Tip1 x [m]"``
     shared : int
         Number of shared parameters.

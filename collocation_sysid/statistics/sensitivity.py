@@ -1,7 +1,7 @@
 """How the trajectory follows the parameters: Z = dx/dp with the equations of motion kept.
 
 From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.tangent`; p are the
-shared parameters q and those of an experiment's own that move its body, see `Segment.moving`.
+shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
 """
 
 from __future__ import annotations

@@ -1374,7 +1374,7 @@ for i, name in enumerate(block.marker_names):
 # %% jupyter={"source_hidden": true}
 first, last = MY_PROBLEM.index("[experiment.markers.ref"), MY_PROBLEM.index("[transcription]")
 no_ruler = MY_PROBLEM[:first] + MY_PROBLEM[last:]
-unknown = "[experiment.estimate]\nmarker_offsets = { prior_m = 0.005 }\n\n"
+unknown = "[experiment.nuisance]\nmarker_offsets = { prior_m = 0.005 }\n\n"
 with_offsets = MY_PROBLEM[:first] + unknown + MY_PROBLEM[last:]
 for name, text in (("places from the first frame", no_ruler), ("offsets too", with_offsets)):
     (mine / "problem.toml").write_text(text)
