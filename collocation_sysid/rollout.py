@@ -12,7 +12,6 @@ from .errors import SimulationError
 from .experiment import Experiment
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution
-from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
@@ -27,15 +26,15 @@ class Rollout:
     ----------
     rms_m, max_m : distance of the markers from the measurements; the tip error is in `max_m`
     trajectory : Trajectory
-        Its markers are read with the experiment's own unknowns.
-    unknowns : mapping of name to value
-        Own unknowns of an experiment for validation, fitted with the material as found.
+        Its markers are read with the experiment's nuisance parameters.
+    nuisance : mapping of name to value
+        Nuisance parameters of an experiment for validation, fitted with the material as found.
     """
 
     rms_m: float
     max_m: float
     trajectory: Trajectory
-    unknowns: Mapping[str, float]
+    nuisance: Mapping[str, float]
 
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
@@ -58,34 +57,29 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     readings = segment.observation.of_samples(trajectory.positions_m, phi)
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]
-    local = segment.local
+    nuisance = segment.nuisance
     return Rollout(
         float(np.sqrt(np.mean(present**2))),
         float(present.max()),
         replace(trajectory, markers_m=readings),
-        dict(zip(local.names, (phi * local.scales).tolist(), strict=True))
+        dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True))
         if experiment.validation
         else {},
     )
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
-    """The experiment with its own unknowns: those of the fit, or fitted with θ as found."""
+    """The experiment with its φ: those of the fit, or fitted with θ as found."""
     collocation = solution.collocation
-    own = collocation.unpack_own(solution.z)
-    for segment, phi in zip(collocation.segments, own, strict=True):
-        if segment.experiment is experiment:
-            return segment, phi
+    for part in collocation.parts(solution.z):
+        if part.segment.experiment is experiment:
+            return part.segment, part.phi
     found, body = solution.parameters, experiment.body
-    alone = Collocation(
-        [replace(experiment, validation=False)],
-        Parameters.of({name: found[name] for name in body.used_names(list(found))}),
-        collocation.scheme,
-        collocation.substeps,
-        huber=collocation.huber,
+    alone = replace(
+        collocation,
+        experiments=[replace(experiment, validation=False)],
+        parameters=Parameters.of({name: found[name] for name in body.used_names(list(found))}),
     )
     (segment,) = alone.segments
-    if not alone.own:
-        return segment, np.zeros(0)
-    predicted = ReducedSpace()(alone)
-    return segment, alone.unpack_own(predicted.z)[0]
+    # All that is left to estimate is φ.
+    return segment, alone.parameters_of(ReducedSpace()(alone).z) if alone.nphi else np.zeros(0)

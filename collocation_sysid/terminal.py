@@ -114,7 +114,7 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [parameter_table(finished), *_verdict(finished), *_own_unknowns(finished)]
+    parts += [parameter_table(finished), *_verdict(finished), *_nuisance(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
     parts.append(Text(f"written to {folder}"))
@@ -156,30 +156,28 @@ def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
     return [f"{symbol} {unit}".strip(), f"{estimate.value:.5g}", spread, interval]
 
 
-def _own_unknowns(finished: Run) -> list[Text]:
-    """One line for each experiment that has unknowns of its own; offsets by their length."""
+def _nuisance(finished: Run) -> list[Text]:
+    """One line for each experiment that has nuisance parameters; offsets by their length."""
     collocation, lines = finished.solution.collocation, []
-    for segment, phi in zip(
-        collocation.segments, collocation.unpack_own(finished.solution.z), strict=True
-    ):
-        local, name = segment.local, segment.experiment.name
-        values, said = phi * local.scales, []
-        offsets = values[local.places("offset")].reshape(-1, 3)
+    for part in collocation.parts(finished.solution.z):
+        segment, nuisance, name = part.segment, part.segment.nuisance, part.segment.experiment.name
+        values, said = part.phi * nuisance.scales, []
+        offsets = values[nuisance.places("offset")].reshape(-1, 3)
         if len(offsets):
             lengths = np.linalg.norm(offsets, axis=1)
             worst = segment.experiment.markers.names[int(lengths.argmax())]
             said.append(
                 f"markers sit off their places by up to {1e3 * lengths.max():.2g} mm ({worst})"
             )
-        said += [f"{1e3 * values[k]:.2g} ms time shift" for k in local.places("time")]
+        said += [f"{1e3 * values[k]:.2g} ms time shift" for k in nuisance.places("time")]
         for kind, what in (("turn", "turn of the pose"), ("tilt", "tilt of gravity")):
-            if len(places := local.places(kind)):
+            if len(places := nuisance.places(kind)):
                 degrees = np.degrees(np.linalg.norm(values[places]))
                 said.append(f"{degrees:.2g}° {what}")
-        if len(places := local.places("shift")):
+        if len(places := nuisance.places("shift")):
             said.append(f"{1e3 * np.linalg.norm(values[places]):.2g} mm shift of the pose")
         if said:
-            lines.append(Text(f"unknowns of '{name}': {', '.join(said)}"))
+            lines.append(Text(f"nuisance parameters of '{name}': {', '.join(said)}"))
     return lines
 
 

@@ -1,14 +1,14 @@
 """How often the 95 % intervals of a whole identification hold the truth: many noisy twins.
 
 A cylinder hangs from a swung hand; its tracks come from the scheme that also fits them, so that
-nothing but noise is wrong. Every twin gets noise of its own, and where the recording's own
-unknowns are estimated (offsets of the markers, a shift of their clock) values drawn from the
+nothing but noise is wrong. Every twin gets noise of its own, and where nuisance
+parameters are estimated (offsets of the markers, a shift of their clock) values drawn from the
 priors. It is solved from the truth in the reduced space, and counted is how often an interval
-holds the truth: of the four parameters, of Young's modulus and Poisson's ratio, and of the own
-unknowns pooled. A share beyond 91–98 % is marked with a star. Noise is white, or autoregressive
-with a coefficient of 0.85 and the same deviation; error bars for independent errors must fail
-then. The second table has the errors of the logarithms over their standard deviations, mean ±
-standard deviation: 0 ± 1 if all is well.
+holds the truth: of the four parameters, of Young's modulus and Poisson's ratio, and of the
+nuisance parameters pooled. A share beyond 91–98 % is marked with a star. Noise is white, or
+autoregressive with a coefficient of 0.85 and the same deviation; error bars for independent errors
+must fail then. The second table has the errors of the logarithms over their standard deviations,
+mean ± standard deviation: 0 ± 1 if all is well.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ class Case:
 OWN = Nuisance(marker_offset_m=OFFSET_M, time_shift_s=SHIFT_S)
 CASES = (
     Case("white", 0.0, Nuisance()),
-    Case("white, own unknowns", 0.0, OWN),
+    Case("white, nuisance parameters", 0.0, OWN),
     Case(f"AR(1) {PHI}", PHI, Nuisance()),
-    Case(f"AR(1) {PHI}, own unknowns", PHI, OWN),
+    Case(f"AR(1) {PHI}, nuisance parameters", PHI, OWN),
 )
 
 
@@ -131,7 +131,7 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     q = solution.z[: collocation.nq]
     fit = linearised_fit(collocation, solution.z)
     found = [uncertainty_of(fit, collocation.parameters, q, *kind) for kind in KINDS]
-    wrong = collocation.unpack_own(solution.z)[0] - phi
+    wrong = collocation.parameters_of(solution.z)[collocation.nq :] - phi
     return Outcome(
         solution.status.converged,
         np.array([[*held(each), held_own(each, wrong)] for each in found]),
@@ -168,10 +168,10 @@ def reference(sigma_m: float) -> tuple[Experiment, Array]:
 def twin(
     experiment: Experiment, x: Array, case: Case, sigma_m: float, rng: np.random.Generator
 ) -> tuple[Collocation, Array]:
-    """The identification of one twin, from the truth, and its own unknowns φ."""
+    """The identification of one twin, from the truth, and its nuisance parameters φ."""
     experiment = replace(experiment, nuisance=case.nuisance)
     (segment,) = collocation_of(experiment).segments
-    phi = rng.standard_normal(segment.local.size)
+    phi = rng.standard_normal(segment.nuisance.size)
     tracks = segment.observation.predicted(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
     return collocation_of(with_markers(experiment, tracks + noise)), phi
@@ -203,10 +203,10 @@ def held(uncertainty: Uncertainty) -> list[float]:
 
 
 def held_own(uncertainty: Uncertainty, wrong: Array) -> float:
-    """Share of the own unknowns, off by `wrong`, that are within their intervals."""
+    """Share of the nuisance parameters, off by `wrong`, that are within their intervals."""
     if not len(wrong):
         return np.nan
-    half = norm.ppf(0.975) * np.array(list(uncertainty.local.values()))
+    half = norm.ppf(0.975) * np.array(list(uncertainty.nuisance.values()))
     return float(np.mean(np.abs(wrong) <= half))
 
 

@@ -124,7 +124,7 @@ def predicted(sigma_m: float) -> tuple[float, ...]:
     truth = tuple(TRUTH.values())
     collocation = noisy(sigma_m, None, truth)
     _, x = reference(sigma_m)
-    z = collocation.pack(np.log(truth), [x], [np.zeros(0)])
+    z = collocation.pack(np.log(truth), [x])
     variances = covariance(collocation, z, errors="independent").covariance.diagonal()
     return tuple(np.sqrt(variances).tolist())
 

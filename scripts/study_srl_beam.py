@@ -20,10 +20,10 @@ import numpy as np
 from get_srl_beam import FOLDER, ORIGIN_M, SIZE_M
 from numpy.typing import NDArray
 
-from collocation_sysid import Collocation, Problem, Solution, solve
+from collocation_sysid import Problem, Solution, solve
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.segment import Segment
+from collocation_sysid.nlp.collocation import Part
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import verdicts
@@ -98,11 +98,11 @@ def joint(source: Path) -> None:
     for name, estimate in uncertainty.estimates.items():
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
     print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
-    print("\nown unknowns, and their standard deviations")
-    for segment, phi in unknowns(solution):
-        local = segment.local
-        for name, value, scale in zip(local.names, phi, local.scales, strict=True):
-            deviation = uncertainty.local[name] * scale
+    print("\nnuisance parameters, and their standard deviations")
+    for part in solution.collocation.parts(solution.z):
+        nuisance = part.segment.nuisance
+        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
+            deviation = uncertainty.nuisance[name] * scale
             print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
     said = dict.fromkeys((*solution.notes, *uncertainty.notes, *verdicts(uncertainty)))
@@ -131,7 +131,7 @@ def refinement(source: Path) -> None:
 def validation(source: Path) -> None:
     """Each trial predicted with the material of the other two."""
     print(f"{'predicted':12}{'E [kPa]':>9}{'γ_r [ms]':>10}{'γ_m [1/s]':>11}", end="")
-    print(f"{'RMS [mm] with own unknowns':>30}{'without':>10}{'fitted':>9}")
+    print(f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'fitted':>9}")
     together = shipped(source)
     all_three = dict(zip(TRIALS, rms_mm(together), strict=True))
     for trial in TRIALS:
@@ -158,22 +158,19 @@ def poisson(source: Path) -> None:
 
 
 def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
-    """RMS distance of a trial at a solution's material: its own unknowns fitted, and all zero."""
+    """RMS distance of a trial at a solution's material: its nuisance fitted, and all zero."""
     experiment = next(e for e in problem.experiments if e.name == trial)
     fixed = tuple(
         replace(item, guess=solution.parameters[item.name], fixed=True)
         for item in problem.parameters.items
     )
-    collocation = Collocation(
-        [replace(experiment, validation=False)],
-        replace(problem.parameters, items=fixed),
-        solution.collocation.scheme,
-        solution.collocation.substeps,
+    collocation = replace(
+        solution.collocation,
+        experiments=[replace(experiment, validation=False)],
+        parameters=replace(problem.parameters, items=fixed),
     )
-    predicted = ReducedSpace()(collocation)
-    ((segment, phi),) = unknowns(predicted)
-    (x,) = predicted.positions_m
-    return rms_of(segment, x, phi), rms_of(segment, x, np.zeros_like(phi))
+    (part,) = collocation.parts(ReducedSpace()(collocation).z)
+    return rms_of(part), rms_of(replace(part, phi=np.zeros_like(part.phi)))
 
 
 # Tables ---------------------------------------------------------------------------------------
@@ -221,18 +218,12 @@ def guesses(solution: Solution) -> list[str]:
     return [f"parameters.{name}.guess={values[name]:.6g}" for name in values if name in free]
 
 
-def unknowns(solution: Solution) -> list[tuple[Segment, NDArray[np.float64]]]:
-    collocation = solution.collocation
-    return list(zip(collocation.segments, collocation.unpack_own(solution.z), strict=True))
-
-
 def rms_mm(solution: Solution) -> list[float]:
-    parts = zip(unknowns(solution), solution.positions_m, strict=True)
-    return [rms_of(segment, x, phi) for (segment, phi), x in parts]
+    return [rms_of(part) for part in solution.collocation.parts(solution.z)]
 
 
-def rms_of(segment: Segment, x: NDArray[np.float64], phi: NDArray[np.float64]) -> float:
-    squares = segment.observation.squared_distances_m2(x.reshape(len(x), -1), phi)
+def rms_of(part: Part) -> float:
+    squares = part.segment.observation.squared_distances_m2(part.x, part.phi)
     return 1e3 * float(np.sqrt(squares.mean()))
 
 

@@ -73,7 +73,7 @@ def problem(
 ) -> Problem:
     """Two damped modes, seen by markers that they move differently.
 
-    Local parameters are a time shift and, with `offsets`, the place of every marker.
+    NuisanceMap parameters are a time shift and, with `offsets`, the place of every marker.
     """
     rng = np.random.default_rng(0)
     slopes, names, priors, present = [], list(item.name for item in PARAMETERS.items), [0.0] * 4, []

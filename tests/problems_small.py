@@ -150,16 +150,16 @@ def bar_let_go(steps: int = 10) -> Experiment:
     )
 
 
-def cube_with_unknowns(steps: int = 10) -> Experiment:
+def cube_with_nuisance(steps: int = 10) -> Experiment:
     """The hung cube with everything estimated that an experiment may not know of itself."""
-    unknown = Nuisance(
+    nuisance = Nuisance(
         marker_offset_m=0.002,
         time_shift_s=0.003,
         pose_turn_rad=0.02,
         pose_shift_m=0.002,
         gravity_rad=0.03,
     )
-    return replace(hung_cube(steps), name="cube with unknowns", nuisance=unknown)
+    return replace(hung_cube(steps), name="cube with nuisance", nuisance=nuisance)
 
 
 SMALL_EXPERIMENTS = {
@@ -169,7 +169,7 @@ SMALL_EXPERIMENTS = {
     "cube-with-gaps": cube_with_gaps,
     "quadratic-bar": quadratic_bar,
     "bar-let-go": bar_let_go,
-    "cube-with-unknowns": cube_with_unknowns,
+    "cube-with-nuisance": cube_with_nuisance,
 }
 
 

@@ -14,7 +14,7 @@ from problems_small import (
     bar_in_two_hands,
     bar_let_go,
     cube_with_gaps,
-    cube_with_unknowns,
+    cube_with_nuisance,
     hung_cube,
     measured,
 )
@@ -73,9 +73,10 @@ def some_point(collocation: Collocation, seed: int = 1) -> np.ndarray:
     for segment in collocation.segments:
         rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    q = collocation.parameters.guess_q
-    own = [0.5 * rng.normal(size=segment.local.size) for segment in collocation.segments]
-    return collocation.pack(q + 0.1 * rng.normal(size=q.shape), positions, own)
+    p, nq = collocation.guess_p, collocation.nq
+    p[nq:] = 0.5 * rng.normal(size=collocation.nphi)
+    p[:nq] += 0.1 * rng.normal(size=nq)
+    return collocation.pack(p, positions)
 
 
 def seen_with_gaps(experiment: Experiment) -> Experiment:
@@ -115,11 +116,11 @@ def assert_derivatives(collocation: Collocation, rng: np.random.Generator) -> No
         only_q = np.concatenate([np.ones(collocation.nq), np.zeros(len(z) - collocation.nq)])
         assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_q)
         assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_q)
-    if collocation.own:
-        only_own = np.concatenate([np.zeros(len(z) - collocation.own), np.ones(collocation.own)])
-        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_own)
-        if any(len(segment.local.moving) for segment in collocation.segments):
-            assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_own)
+    if nphi := collocation.nphi:
+        only_phi = np.concatenate([np.zeros(len(z) - nphi), np.ones(nphi)])
+        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_phi)
+        if any(len(segment.nuisance.moving) for segment in collocation.segments):
+            assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_phi)
 
 
 # Derivatives
@@ -153,13 +154,13 @@ def test_derivatives_where_a_hand_lets_go_and_a_mass_joins(scheme: str, explicit
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-def test_derivatives_by_the_experiments_own_unknowns(substeps: int, rng):
-    experiments = [seen_with_gaps(cube_with_unknowns(6)), swung(), cube_with_unknowns(3)]
+def test_derivatives_by_the_experiments_nuisance_parameters(substeps: int, rng):
+    experiments = [seen_with_gaps(cube_with_nuisance(6)), swung(), cube_with_nuisance(3)]
     assert_derivatives(Collocation(experiments, GUESS, "midpoint", substeps), rng)
 
 
 @pytest.mark.parametrize(
-    "unknown",
+    "nuisance",
     [
         Nuisance(marker_offset_m=0.002),
         Nuisance(time_shift_s=0.002),
@@ -169,13 +170,13 @@ def test_derivatives_by_the_experiments_own_unknowns(substeps: int, rng):
     ids=["offset", "time", "turn", "tilt"],
 )
 @pytest.mark.parametrize("parameters", [GUESS, ALL_FIXED])
-def test_derivatives_by_one_kind_of_unknown(unknown: Nuisance, parameters: Parameters, rng):
-    assert_derivatives(Collocation([replace(swung(), nuisance=unknown)], parameters), rng)
+def test_derivatives_by_one_kind_of_nuisance(nuisance: Nuisance, parameters: Parameters, rng):
+    assert_derivatives(Collocation([replace(swung(), nuisance=nuisance)], parameters), rng)
 
 
 @pytest.mark.parametrize("huber", [1e-3, 3.0, 1e3])
 def test_derivatives_of_hubers_loss(huber: float, rng):
-    assert_derivatives(Collocation([swung(), cube_with_unknowns(3)], GUESS, huber=huber), rng)
+    assert_derivatives(Collocation([swung(), cube_with_nuisance(3)], GUESS, huber=huber), rng)
 
 
 def test_derivatives_of_a_body_nobody_holds(rng):

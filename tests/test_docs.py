@@ -83,7 +83,7 @@ def test_toml_blocks_are_valid_in_a_problem_file(page: Path):
 
 @pytest.mark.parametrize(
     ("table", "key"),
-    [("object", "mes"), ("experiment.estimate", "gravit"), ("solver.penalty", "ro")],
+    [("object", "mes"), ("experiment.nuisance", "gravit"), ("solver.penalty", "ro")],
 )
 def test_a_misspelt_key_of_a_block_is_found(table: str, key: str):
     with pytest.raises(ValidationError, match=rf"\b{key}\b"):

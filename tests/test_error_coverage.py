@@ -126,7 +126,7 @@ def test_processes_of_the_errors_are_found():
     np.testing.assert_allclose(white.among_channels, np.eye(6), atol=0.3)
 
 
-# Local parameters
+# NuisanceMap parameters
 
 
 def sample(seed: int = 0, phi: float = 0.0, **options) -> tuple[LinearisedFit, np.ndarray]:
@@ -160,9 +160,9 @@ def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_par
 def test_local_parameters_have_standard_deviations():
     fit, wrong = sample()
     found = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
-    assert tuple(found.local) == fit.names[4:]
+    assert tuple(found.nuisance) == fit.names[4:]
     expected = np.sqrt(np.diag(np.linalg.inv(information(fit))))[4:]
-    np.testing.assert_allclose(list(found.local.values()), expected, rtol=1e-6)
+    np.testing.assert_allclose(list(found.nuisance.values()), expected, rtol=1e-6)
 
 
 def test_a_local_parameter_at_its_bound_counts_as_fixed():
@@ -172,7 +172,7 @@ def test_a_local_parameter_at_its_bound_counts_as_fixed():
     kept = np.delete(np.delete(information(fit), 4, 0), 4, 1)
     expected = np.linalg.inv(kept)[:4, :4]
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-6)
-    assert np.isnan(found.local[fit.names[4]])
+    assert np.isnan(found.nuisance[fit.names[4]])
     free = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
     assert found.degrees_of_freedom > free.degrees_of_freedom
 

@@ -398,7 +398,7 @@ force_n = [0.0, 0.1, 0.0]
 nodes = { indices = [0] }
 file = "push.csv"
 
-[experiment.estimate]
+[experiment.nuisance]
 marker_offsets = { prior_m = 0.003 }
 time_shift = { prior_s = 0.01 }
 pose = { prior_rad = 0.02 }
@@ -408,7 +408,7 @@ gravity = { prior_rad = 0.03 }
 
 @pytest.fixture
 def loaded(tiny: Path) -> Path:
-    """The tiny problem with loads and unknowns."""
+    """The tiny problem with loads and nuisance parameters."""
     file = tiny / "problem.toml"
     file.write_text(file.read_text() + LOADS)
     (tiny / "push.csv").write_text("t_s,fx_n,fy_n,fz_n\n0.0,0,0,0\n0.05,0,0,0.2\n")
@@ -426,7 +426,7 @@ def test_masses_and_forces_are_read(loaded):
     np.testing.assert_allclose(total, [0.0, 0.1, 0.1], atol=1e-12)
 
 
-def test_unknowns_are_read(loaded):
+def test_nuisance_is_read(loaded):
     unknown = experiment_of(loaded).nuisance
     assert (unknown.marker_offset_m, unknown.time_shift_s) == (0.003, 0.01)
     assert (unknown.pose_turn_rad, unknown.pose_shift_m, unknown.gravity_rad) == (0.02, None, 0.03)
@@ -453,11 +453,11 @@ def test_every_takes_only_some_samples(tiny):
         (("[0.0, 0.1, 0.0]", "[0.0, 0.1]"), r"force.0.force_n"),
         (('file = "push.csv"', 'file = "pull.csv"'), r"force.1.file: .*pull.csv does not exist"),
         (('file = "push.csv"', ""), r"force.1: .*exactly one of force_n, file"),
-        (("{ prior_rad = 0.02 }", "{}"), r"estimate.pose: .*expected one or both"),
-        (("prior_s = 0.01", "prior_ms = 10"), r"estimate.time_shift.prior_ms"),
+        (("{ prior_rad = 0.02 }", "{}"), r"nuisance.pose: .*expected one or both"),
+        (("prior_s = 0.01", "prior_ms = 10"), r"nuisance.time_shift.prior_ms"),
     ],
 )
-def test_loads_and_unknowns_that_are_wrong_name_their_key(loaded, change, message: str):
+def test_loads_and_nuisance_that_are_wrong_name_their_key(loaded, change, message: str):
     replace_text(*change)(loaded)
     with pytest.raises(InputError, match=message):
         load(loaded)

@@ -1,4 +1,4 @@
-"""What a run finds beyond the parameters: unknowns, error bars and verdicts, up to its files."""
+"""What a run finds beyond the material: nuisance, error bars and verdicts, up to its files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from collocation_sysid.rollout import Rollout
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.profiling import profile_of
 
-UNKNOWN = "\n[experiment.estimate]\nmarker_offsets = { prior_m = 0.003 }\n"
+NUISANCE = "\n[experiment.nuisance]\nmarker_offsets = { prior_m = 0.003 }\n"
 REDUCED = settings("solver.method=reduced-space")
 OFFSET_M = np.array([0.002, -0.001, 0.0015])
 
@@ -39,16 +39,16 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fitted and a validation experiment, both with noise and a marker off its place."""
     folder = tmp_path_factory.mktemp("two")
     file = write_problem(folder, {"swing": 25, "turn": 15}, validation="turn")
-    file.write_text(_with_unknowns(file.read_text()))
+    file.write_text(_with_nuisance(file.read_text()))
     for k, name in enumerate(("swing", "turn")):
         spoil(folder, name, 2e-4, seed=k)
     return folder
 
 
-def _with_unknowns(text: str) -> str:
+def _with_nuisance(text: str) -> str:
     """Offsets are estimated in both experiments."""
     head, *experiments = text.split("\n[[experiment]]\n")
-    return "\n[[experiment]]\n".join([head, *(part + UNKNOWN for part in experiments)])
+    return "\n[[experiment]]\n".join([head, *(part + NUISANCE for part in experiments)])
 
 
 @pytest.fixture(scope="module")
@@ -60,20 +60,20 @@ def finished(two: Path):
     return run(Problem.read(two / "problem.toml", overrides))
 
 
-def test_unknowns_are_reported_with_unit_prior_and_error(finished):
-    unknowns = result(finished)["unknowns"]["swing"]
-    first = [unknowns[f"offset of low, {axis} [m]"] for axis in "xyz"]
+def test_nuisance_is_reported_with_unit_prior_and_error(finished):
+    nuisance = result(finished)["nuisance"]["swing"]
+    first = [nuisance[f"offset of low, {axis} [m]"] for axis in "xyz"]
     for found, truth in zip(first, OFFSET_M, strict=True):
         assert found["prior"] == 0.003
         assert 0 < found["std_error"] < 2e-4
         assert abs(found["value"] - truth) < 4 * found["std_error"]
 
 
-def test_a_validation_experiment_gets_its_unknowns_with_the_material_as_found(finished):
+def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(finished):
     rollout = finished.rollouts["turn"]
     assert isinstance(rollout, Rollout)
     assert rollout.rms_m < 5e-4  # the offset alone is 2.7 mm of one in three markers
-    found = [rollout.unknowns[f"turn: offset of low, {axis} [m]"] for axis in "xyz"]
+    found = [rollout.nuisance[f"turn: offset of low, {axis} [m]"] for axis in "xyz"]
     np.testing.assert_allclose(found, OFFSET_M, atol=3e-4)
 
 
@@ -130,19 +130,19 @@ def test_a_profile_counts_the_prior_of_its_parameter(finished):
     )
 
 
-def test_the_terminal_shows_unknowns_verdicts_and_residuals(two, tmp_path, monkeypatch):
+def test_the_terminal_shows_nuisance_verdicts_and_residuals(two, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "400")
     sigma = settings(*(f"experiment.{n}.markers.sigma_m=2e-4" for n in ("swing", "turn")))
     outcome = run_command(
         "solve", two / "problem.toml", *REDUCED, *sigma, "--out", tmp_path / "run"
     )
     assert outcome.code == 0
-    assert "unknowns of 'swing': markers sit off their places by up to" in outcome.out
+    assert "nuisance parameters of 'swing': markers sit off their places by up to" in outcome.out
     assert "mm (low)" in outcome.out
     assert "the data fix" in outcome.out
     assert "residuals: swing/" in outcome.out
     stored = json.loads((tmp_path / "run" / "result.json").read_text())
-    assert stored["rollout"]["experiments"]["turn"]["unknowns"]
+    assert stored["rollout"]["experiments"]["turn"]["nuisance"]
 
 
 def test_noise_may_be_estimated_and_profiles_asked_for(two, tmp_path):

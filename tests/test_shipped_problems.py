@@ -16,7 +16,6 @@ from collocation_sysid import Problem, run, solve
 from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.run import Run
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
@@ -129,11 +128,9 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
         return noisy_run().solution
     problem = noisy_run().problem
     (experiment,) = problem.experiments
-    collocation = Collocation(
-        [experiment if offsets else replace(experiment, nuisance=Nuisance())],
-        problem.parameters,
-        problem.scheme,
-        problem.substeps,
+    collocation = replace(
+        noisy_run().solution.collocation,
+        experiments=[experiment if offsets else replace(experiment, nuisance=Nuisance())],
         huber=problem.huber if huber else None,
     )
     return ReducedSpace()(collocation)
@@ -175,17 +172,19 @@ def test_neither_remedy_is_enough_for_the_noisy_cylinder(huber: bool, offsets: b
 
 def test_the_misplaced_marker_is_found_where_it_is_glued():
     solution = noisy_fit(huber=True, offsets=True)
-    (segment,) = solution.collocation.segments
-    (phi,) = solution.collocation.unpack_own(solution.z)
+    (part,) = solution.collocation.parts(solution.z)
+    segment = part.segment
     markers, body = segment.experiment.markers, segment.body
-    k, local = markers.names.index(MISPLACED), segment.local
+    k, nuisance = markers.names.index(MISPLACED), segment.nuisance
     glued = place_markers([GLUED_M], body.nodes_m, body)
     shapes_m = solution.positions_m[0][segment.observation.grid_rows][markers.present[:, k]]
     around_m = shapes_m[:, glued.nodes[0]]
     # The marker turns with the body, its offset does not: the mean is what can be found.
     true_m = (glued.weights[0] @ around_m - markers.observe(shapes_m)[:, k]).mean(axis=0)
-    found_m = (phi * local.scales).reshape(-1, 3)
-    deviations_m = np.array([attainable().local[name] for name in local.names]) * local.scales
+    found_m = (part.phi * nuisance.scales).reshape(-1, 3)
+    deviations_m = (
+        np.array([attainable().nuisance[name] for name in nuisance.names]) * nuisance.scales
+    )
     assert np.linalg.norm(true_m) > 0.005
     assert np.abs((found_m[k] - true_m) / deviations_m.reshape(-1, 3)[k]).max() < 3.0
     others_m = np.linalg.norm(np.delete(found_m, k, axis=0), axis=1)

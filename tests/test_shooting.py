@@ -17,7 +17,7 @@ from problems_small import (
     as_theta,
     bar_in_two_hands,
     bar_let_go,
-    cube_with_unknowns,
+    cube_with_nuisance,
     hung_cube,
     measured,
     noisy,
@@ -45,7 +45,7 @@ def with_noise(experiment: Experiment, noise_m: float = 1e-3, **changes) -> Coll
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
     rng = np.random.default_rng(3)
-    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.own)])
+    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.nphi)])
     return p + 0.1 * rng.normal(size=len(p))
 
 
@@ -64,7 +64,7 @@ def cube() -> Collocation:
 
 
 @pytest.mark.parametrize("huber", [None, 2.0])
-@pytest.mark.parametrize("make", [hung_cube, bar_let_go, quadratic_bar, cube_with_unknowns])
+@pytest.mark.parametrize("make", [hung_cube, bar_let_go, quadratic_bar, cube_with_nuisance])
 def test_both_gradients_are_those_of_differences(make, huber, rng):
     collocation = with_noise(make(), huber=huber)
     p = some_parameters(collocation)
@@ -119,7 +119,7 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(make, gradient):
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-def test_hubers_loss_and_own_unknowns_have_the_same_optimum(gradient):
+def test_hubers_loss_and_nuisance_parameters_have_the_same_optimum(gradient):
     collocation = with_noise(bar_let_go(), 2e-3, huber=2.0)
     solution, reference = Shooting(gradient)(collocation), ReducedSpace()(collocation)
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from problems_small import (
@@ -42,31 +44,23 @@ def disturbed(
         change = segment.dynamics.without_taken(change)
         x[segment.dynamics.first_row :] += size_m * change[segment.dynamics.first_row :]
         positions.append(x)
-    return collocation.pack(*_around(collocation, positions)), positions
+    return collocation.pack(some_parameters(collocation), positions), positions
 
 
-def _around(collocation: Collocation, positions: list[np.ndarray]) -> tuple:
-    q, own = collocation.split(unknowns(collocation))
-    return q, positions, own
-
-
-def unknowns(collocation: Collocation) -> np.ndarray:
-    """All parameters p: the guess, and experiments' own unknowns that are not zero."""
-    own = 0.3 * np.random.default_rng(1).standard_normal(collocation.own)
-    return np.concatenate([collocation.parameters.guess_q, own])
+def some_parameters(collocation: Collocation) -> np.ndarray:
+    """All parameters p: the guess, and nuisance parameters that are not zero."""
+    phi = 0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)
+    return np.concatenate([collocation.parameters.guess_q, phi])
 
 
 def only_setting(collocation: Collocation) -> Setting:
-    (setting,) = collocation.settings(unknowns(collocation))
-    return setting
+    (segment,) = collocation.segments
+    return segment.setting(*np.split(some_parameters(collocation), [collocation.nq]))
 
 
 def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tangent]:
-    settings = collocation.settings(unknowns(collocation))
-    return [
-        BlockSolver(segment).forward(x, setting)
-        for segment, x, setting in zip(collocation.segments, positions, settings, strict=True)
-    ]
+    parts = collocation.parts_at(some_parameters(collocation), positions)
+    return [BlockSolver(part.segment).forward(part.x, part.setting) for part in parts]
 
 
 @pytest.fixture(
@@ -83,7 +77,8 @@ def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Col
     z, positions = disturbed(collocation)
     step = [tangent.step for tangent in forward(collocation, positions)]
     values = collocation.constraint_values(z)
-    change = collocation.jacobian(z) @ collocation.pack(np.zeros(collocation.nq), step)
+    still = np.zeros_like(collocation.guess_p)
+    change = collocation.jacobian(z) @ collocation.pack(still, step)
     assert np.abs(values).max() > 1e-4
     np.testing.assert_allclose(change, -values, atol=1e-9 * np.abs(values).max())
 
@@ -94,23 +89,21 @@ def test_sensitivities_keep_the_linearised_constraints(collocation: Collocation)
     (found,) = forward(collocation, positions)
     (moving,) = (segment.moving for segment in collocation.segments)
     for k, place in enumerate(moving):
-        q, own = collocation.split(np.eye(collocation.nq + collocation.own)[place])
-        change = jacobian @ collocation.pack(q, [found.by_p[:, :, k]], own)
-        forced = jacobian @ collocation.pack(q, [np.zeros_like(found.step)], own)
+        p = np.eye(collocation.nq + collocation.nphi)[place]
+        change = jacobian @ collocation.pack(p, [found.by_p[:, :, k]])
+        forced = jacobian @ collocation.pack(p, [np.zeros_like(found.step)])
         assert np.abs(change).max() < 1e-9 * np.abs(forced).max()
 
 
 def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation: Collocation):
-    measurable = [measured(s.experiment) for s in collocation.segments]
-    scheme, explicit = collocation.scheme, collocation.segments[0].explicit_grasps
-    collocation = Collocation(measurable, GUESS, scheme, collocation.substeps, explicit)
+    collocation = replace(collocation, experiments=[*map(measured, collocation.experiments)])
     z, _ = disturbed(collocation)
     multipliers = constraint_multipliers(collocation, z)
     gradient = collocation.gradient(z)
     slope = gradient + collocation.jacobian(z).T @ multipliers
     lower, upper = collocation.bounds()
     first = collocation.nq
-    free = first + np.flatnonzero((lower < upper)[first : len(z) - collocation.own])
+    free = first + np.flatnonzero((lower < upper)[first : len(z) - collocation.nphi])
     assert np.abs(gradient[free]).max() > 0
     assert np.abs(slope[free]).max() < 1e-9 * np.abs(gradient[free]).max()
 

@@ -40,8 +40,8 @@ def positions(collocation: Collocation, q):
 def simulated(experiments, parameters=AT_TRUTH, **options) -> tuple[Collocation, np.ndarray]:
     """A problem, and variables that satisfy its equations of motion at the guess."""
     collocation = Collocation(experiments, parameters, **options)
-    q = parameters.guess_q
-    return collocation, collocation.pack(q, positions(collocation, q))
+    x = positions(collocation, parameters.guess_q)
+    return collocation, collocation.pack(collocation.guess_p, x)
 
 
 def with_sigma(experiment: Experiment, sigma_m: float) -> Experiment:
@@ -91,22 +91,19 @@ def test_sensitivities_fit_every_layout_and_several_experiments(options):
 
 def assert_constraints_are_kept(collocation, z):
     found = sensitivities(collocation, z)
-    moving = [
-        places[s.moving] for s, places in zip(collocation.segments, collocation.places, strict=True)
-    ]
+    moving = [segment.places[segment.moving] for segment in collocation.segments]
     assert [b.shape for b in found] == [
         (s.grid_rows, s.dofs, len(m)) for s, m in zip(collocation.segments, moving, strict=True)
     ]
     jacobian = collocation.jacobian(z)
     for k in sorted(set(np.concatenate(moving))):
-        p = np.eye(collocation.nq + collocation.own)[k]
-        q, own = collocation.split(p)
+        p = np.eye(collocation.nq + collocation.nphi)[k]
         by_p = [
             b[..., list(m).index(k)] if k in m else 0 * b[..., 0]
             for b, m in zip(found, moving, strict=True)
         ]
-        direct = jacobian @ collocation.pack(q, [0 * b for b in by_p], own)
-        change = jacobian @ collocation.pack(q, by_p, own)
+        direct = jacobian @ collocation.pack(p, [0 * b for b in by_p])
+        change = jacobian @ collocation.pack(p, by_p)
         assert np.abs(change).max() <= 1e-9 * np.abs(direct).max()
 
 

@@ -101,7 +101,6 @@ def check_problem(problem: Problem) -> Findings:
     collocation = problem.collocation()
     guesses = problem.parameters.guesses
     z, start_notes = initial_variables(collocation)
-    positions = collocation.unpack(z)[1]
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
     jacobian, hessian = _nonzeros(problem)
@@ -110,7 +109,7 @@ def check_problem(problem: Problem) -> Findings:
     chosen = next((cost for cost in found_costs if cost.method == method), None)
 
     bodies = _bodies(problem)
-    recordings = _recordings(problem, collocation, positions)
+    recordings = _recordings(problem, collocation, z)
     scheme = as_scheme(collocation.scheme)
     motions = tuple(
         motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
@@ -179,13 +178,11 @@ def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
     ]
 
 
-def _recordings(
-    problem: Problem, collocation: Collocation, positions: list[Array]
-) -> tuple[Recording, ...]:
-    simulated = {
-        segment.experiment.name: x[segment.observation.grid_rows].reshape(-1, segment.dofs // 3, 3)
-        for segment, x in zip(collocation.segments, positions, strict=True)
-    }
+def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[Recording, ...]:
+    simulated = {}
+    for part in collocation.parts(z):
+        at_samples = part.x[part.segment.observation.grid_rows]
+        simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
 
 

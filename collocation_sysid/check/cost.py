@@ -100,18 +100,16 @@ def cost_warnings(chosen: Cost, others: Sequence[Cost]) -> list[str]:
 
 def _sweeps_s(collocation: Collocation, z: Array, factorisation: Choice) -> float | None:
     """Seconds of all sweeps, from one over the first rows of each experiment."""
-    _, positions = collocation.unpack(z)
-    settings = collocation.settings(collocation.parameters_of(z))
     total = 0.0
-    for segment, x, setting in zip(collocation.segments, positions, settings, strict=True):
-        rows = min(ROWS, segment.grid_rows)
-        solver = BlockSolver(segment, rows, factorisation=factorisation)
+    for part in collocation.parts(z):
+        rows, setting = min(ROWS, len(part.x)), part.setting
+        solver = BlockSolver(part.segment, rows, factorisation=factorisation)
         began = time.perf_counter()
         try:
-            solver.forward(x[:rows], setting)
+            solver.forward(part.x[:rows], setting)
         except SimulationError:
             return None
-        total += segment.grid_rows / rows * (time.perf_counter() - began)
+        total += len(part.x) / rows * (time.perf_counter() - began)
     return SWEEPS * total
 
 

@@ -9,9 +9,9 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Standard deviations of an experiment's own unknowns; None where they are not estimated.
+    """Standard deviations of an experiment's nuisance parameters; None where not estimated.
 
-    Every unknown has a normal prior around zero with its deviation.
+    Every one has a normal prior around zero with its deviation.
 
     Attributes
     ----------

@@ -94,7 +94,7 @@ class Continuation(Options):
         """
         climb = _Climb(self.method, Recorder(self.name, collocation, watch))
         if start is not None:
-            climb.known = collocation.parameters_of(start), collocation.unpack(start)[1]
+            climb.known = collocation.unpack(start)
         for share in self.shares:
             if not climb.solve(share):
                 break
@@ -112,15 +112,9 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
 def first_part(collocation: Collocation, share: float) -> Collocation:
     """The problem on a share of every experiment's samples."""
-    experiments = [segment.experiment for segment in collocation.segments]
-    return Collocation(
-        [first_samples(e, part_of(len(e.t_s), share)) for e in experiments],
-        collocation.parameters,
-        collocation.scheme,
-        collocation.substeps,
-        collocation.segments[0].explicit_grasps,
-        collocation.huber,
-    )
+    fitted = [segment.experiment for segment in collocation.segments]
+    shorter = [first_samples(e, part_of(len(e.t_s), share)) for e in fitted]
+    return replace(collocation, experiments=shorter)
 
 
 class _Climb:
@@ -162,7 +156,7 @@ class _Climb:
 
     def _learn(self, found: Solution, share: float) -> None:
         self.last, part = found, found.collocation
-        self.known = part.parameters_of(found.z), part.unpack(found.z)[1]
+        self.known = part.unpack(found.z)
         self.iterations += found.iterations
         self.evaluations += found.evaluations
         watch, spent = self.recorder.stopwatch, found.timing
@@ -178,6 +172,6 @@ class _Climb:
 
 def _continued(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
     """Variables z from the first rows of positions: simulated on, or carried by the grasp."""
-    parts = zip(positions, collocation.segments, strict=True)
-    known, _ = marched(collocation, p, [x[: segment.grid_rows] for x, segment in parts])
+    parts = collocation.parts_at(p, positions)
+    known, _ = marched(collocation, p, [part.x[: part.segment.grid_rows] for part in parts])
     return completed(collocation, p, known)

@@ -25,8 +25,7 @@ def exact_curvature(
         Where a timestep's equations are singular.
     """
     projected = [x + tangent.step for x, tangent in zip(point.x, point.tangents, strict=True)]
-    q, own = collocation.split(point.p)
-    z = collocation.pack(q, projected, own)
+    z = collocation.pack(point.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)
     directions = np.column_stack([_direction(collocation, point, k) for k in range(len(point.p))])
     hessian = collocation.hessian(z, 1.0, multipliers)
@@ -41,5 +40,4 @@ def _direction(collocation: Collocation, point: Point, k: int) -> Array:
         tangent.by_p @ unit[moving]
         for tangent, moving in zip(point.tangents, point.moving, strict=True)
     ]
-    q, own = collocation.split(unit)
-    return collocation.pack(q, moved, own)
+    return collocation.pack(unit, moved)

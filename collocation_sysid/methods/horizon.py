@@ -29,7 +29,7 @@ class Point:
 
     Attributes
     ----------
-    p : (np,) all parameters, see `Collocation.places`
+    p : (np,) all parameters, see `Collocation.pack`
     x : list of (rows, 3n), one per experiment
     tangents : list of Tangent
     residual : (M,) r + S_p, markers after the feasibility step, and residuals of the priors
@@ -113,21 +113,21 @@ class Horizon:
             Where it is singular or not finite.
         """
         collocation = self.collocation
-        nq, (q, own) = collocation.nq, collocation.split(p)
+        nq = collocation.nq
         tangents, residuals, slopes = [], [], []
-        parts = zip(self.solvers, collocation.settings(p), x, own, collocation.places, strict=True)
-        for k, (solver, setting, x_k, phi, places) in enumerate(parts):
-            tangent = solver.forward(x_k, setting, known.tangents[k] if known else None)
-            observation = solver.segment.observation
+        for k, part in enumerate(collocation.parts_at(p, x)):
+            before = known.tangents[k] if known else None
+            tangent = self.solvers[k].forward(part.x, part.setting, before)
+            segment, observation = part.segment, part.segment.observation
             residual, here = observation.linearised(
-                x_k + tangent.step,
-                phi,
+                part.x + tangent.step,
+                part.phi,
                 observation.at_samples(tangent.by_p),
-                solver.segment.moving,
+                segment.moving,
                 nq,
             )
             slope = np.zeros((residual.size, len(p)))
-            slope[:, places] = here.reshape(residual.size, len(places))
+            slope[:, segment.places] = here.reshape(residual.size, -1)
             residual = residual.ravel()
             if collocation.huber is not None:
                 residual, slope = huberised(residual, slope, collocation.huber)
@@ -135,7 +135,7 @@ class Horizon:
             residuals.append(residual)
             slopes.append(slope)
         if self.prior is not None:
-            residuals.append((q - collocation.parameters.guess_q) / self.prior)
+            residuals.append((p[:nq] - collocation.parameters.guess_q) / self.prior)
             slopes.append(np.eye(nq, len(p)) / self.prior)
         prior, prior_slopes = collocation.prior(p)
         return Point(
@@ -144,10 +144,7 @@ class Horizon:
             tangents,
             np.concatenate([*residuals, prior]),
             np.concatenate([*slopes, np.diag(prior_slopes)]),
-            [
-                places[segment.moving]
-                for segment, places in zip(collocation.segments, collocation.places, strict=True)
-            ],
+            [segment.places[segment.moving] for segment in collocation.segments],
         )
 
     def extend(

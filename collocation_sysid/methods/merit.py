@@ -8,7 +8,7 @@ too, tied by rows of their own; variables whose bounds are equal, such as a give
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -40,8 +40,9 @@ class Unconstrained:
         self.given = collocation
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
-            explicit = all(segment.explicit_grasps for segment in collocation.segments)
-            self.nlp = collocation if explicit else _with_explicit_grasps(collocation)
+            self.nlp = collocation
+            if not collocation.explicit_grasps:
+                self.nlp = replace(collocation, explicit_grasps=True)
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraints, self.nlp.variables)
             self._entries = np.zeros(len(indices))
@@ -51,7 +52,7 @@ class Unconstrained:
         self.free = self.lower != self.upper
         of_p = np.zeros(self.nlp.variables, dtype=bool)
         of_p[: self.nlp.nq] = True
-        of_p[self.nlp.variables - self.nlp.own :] = True
+        of_p[self.nlp.variables - self.nlp.nphi :] = True
         self.bounded: Index = np.flatnonzero(of_p & self.free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
@@ -72,11 +73,13 @@ class Unconstrained:
         if not np.isfinite(z).all():
             return False
         with self.stopwatch.evaluating():
-            for segment, x in zip(self.nlp.segments, self.nlp.unpack(z)[1], strict=True):
-                states, _ = segment.dynamics.evaluation_states(x)
-                if not segment.body.volume_ratios(states).min() > 0:
-                    return False
-        return True
+            return all(
+                part.segment.body.volume_ratios(
+                    part.segment.dynamics.evaluation_states(part.x)[0]
+                ).min()
+                > 0
+                for part in self.nlp.parts(z)
+            )
 
     def projected(self, z: Array, slope: Array) -> Array:
         """A gradient without what is given, or pushes against a bound."""
@@ -89,9 +92,8 @@ class Unconstrained:
 
     def grasped(self, z: Array) -> Array:
         """The point with all held nodes exactly where their grasps are."""
-        q, positions = self.nlp.unpack(z)
-        moved = [s.grasped(x) for s, x in zip(self.nlp.segments, positions, strict=True)]
-        there = self.nlp.pack(q, moved, self.nlp.unpack_own(z))
+        moved = [part.segment.grasped(part.x) for part in self.nlp.parts(z)]
+        there = self.nlp.pack(self.nlp.parameters_of(z), moved)
         there[~self.free] = z[~self.free]
         return there if self.is_upright(there) else z
 
@@ -99,24 +101,12 @@ class Unconstrained:
         """Multipliers of the given collocation's rows from those of all rows."""
         if self.nlp is self.given:
             return explicit
-        parts, start = [], 0
-        for segment, given in zip(self.nlp.segments, self.given.segments, strict=True):
-            stop = start + segment.constraints
-            rows = explicit[start:stop].reshape(segment.constraint_times, segment.dofs)
-            parts.append(rows[:, given.row_dofs].ravel())
-            start = stop
-        return np.concatenate(parts)
-
-
-def _with_explicit_grasps(collocation: Collocation) -> Collocation:
-    return Collocation(
-        [segment.experiment for segment in collocation.segments],
-        collocation.parameters,
-        collocation.scheme,
-        collocation.substeps,
-        explicit_grasps=True,
-        huber=collocation.huber,
-    )
+        return np.concatenate(
+            [
+                explicit[s.rows].reshape(-1, s.dofs)[:, s.free_dofs].ravel()
+                for s in self.nlp.segments
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,18 +22,15 @@ def constraint_multipliers(
     SimulationError
         Where a timestep's equations are singular.
     """
-    q, positions = collocation.unpack(z)
-    parts = []
-    own = collocation.unpack_own(z)
-    for segment, x, phi in zip(collocation.segments, positions, own, strict=True):
-        gradient = collocation.loss_scale * segment.observation.gradient(x, phi)[0]
-        y = BlockSolver(segment, stopwatch=stopwatch).backward(
-            x, segment.constants.theta(q), gradient
-        )
-        y *= segment.force_n
-        parts.append(y[segment.dynamics.first_row :, segment.row_dofs].ravel())
-    multipliers = np.concatenate(parts)
-    if any(s.explicit_grasps or s.dynamics.taken is not None for s in collocation.segments):
+    found = []
+    for part in collocation.parts(z):
+        segment = part.segment
+        gradient = collocation.loss_scale * segment.observation.gradient(part.x, part.phi)[0]
+        solver = BlockSolver(segment, stopwatch=stopwatch)
+        y = segment.force_n * solver.backward(part.x, part.setting.theta, gradient)
+        found.append(segment.of_rows(y))
+    multipliers = np.concatenate(found)
+    if any(segment.grasp_rows.any() for segment in collocation.segments):
         _add_grasps(collocation, z, multipliers)
     return multipliers
 
@@ -41,16 +38,6 @@ def constraint_multipliers(
 def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
     """Give the grasp rows, which are unit rows, what is left of the gradient."""
     slope = collocation.gradient(z) + collocation.jacobian(z).T @ multipliers
-    _, left = collocation.unpack(slope)
-    start = 0
-    for segment, rest in zip(collocation.segments, left, strict=True):
-        stop = start + segment.constraints
-        grasped = np.zeros((segment.grid_rows, segment.dofs), dtype=bool)
-        grasped[:, segment.held_dofs] = segment.explicit_grasps
-        if segment.dynamics.taken is not None:
-            grasped |= segment.dynamics.taken
-        first = segment.dynamics.first_row
-        grasped, rest = grasped[first:, segment.row_dofs], rest[first:, segment.row_dofs]
-        rows = multipliers[start:stop].reshape(segment.constraint_times, -1)
-        rows[grasped] = -rest[grasped] / segment.length_m
-        start = stop
+    for part in collocation.parts(slope):
+        segment, grasped = part.segment, part.segment.grasp_rows
+        multipliers[segment.rows][grasped] = -segment.of_rows(part.x)[grasped] / segment.length_m

@@ -116,13 +116,7 @@ def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) 
             "at the answer: the body is near buckling, or damped more than its motion allows"
         )
     if status in (Status.CONVERGED, Status.STALLED):
-        parts = zip(
-            collocation.segments,
-            collocation.unpack(z)[1],
-            collocation.unpack_own(z),
-            strict=True,
-        )
-        squares = sum(segment.observation.loss(x, phi) for segment, x, phi in parts)
+        squares = sum(part.loss for part in collocation.parts(z))
         misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
         if misfit > MISFIT:
             notes.append(

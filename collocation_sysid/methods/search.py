@@ -56,9 +56,8 @@ class Search:
         self.p, self.x = collocation.guess_p, None
         if start is not None:
             start = np.clip(start, *collocation.bounds())
-            parts = zip(collocation.segments, collocation.unpack(start)[1], strict=True)
             self.p = collocation.parameters_of(start)
-            self.x = [segment.grasped(x) for segment, x in parts]
+            self.x = [part.segment.grasped(part.x) for part in collocation.parts(start)]
         self.first = self.p
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
@@ -278,10 +277,9 @@ class Search:
 
     def _are_feasible(self, x: list[Array], p: Array) -> bool:
         """Whether trajectories satisfy the equations of motion well within the tolerance."""
-        parts = zip(self.collocation.segments, x, self.collocation.settings(p), strict=True)
         return all(
-            np.abs(segment.residual_n(x_k, setting)).max() <= FEASIBLE_FORCE * segment.force_n
-            for segment, x_k, setting in parts
+            np.abs(part.residual_n).max() <= FEASIBLE_FORCE * part.segment.force_n
+            for part in self.collocation.parts_at(p, x)
         )
 
     def _accepted(self, point: Point) -> Point:
@@ -293,20 +291,18 @@ class Search:
     def _record(self, p: Array, x: list[Array], loss: float, point: Point | None = None) -> None:
         """Make it the answer so far; markers are those after the feasibility step of a point."""
         self.p, self.x = p, x
-        q, own = self.collocation.split(p)
         squares, violation_n = [], 0.0
-        settings = [] if point is not None else self.collocation.settings(p)
-        for k, segment in enumerate(self.collocation.segments):
+        for k, part in enumerate(self.collocation.parts_at(p, x)):
             if point is not None:
                 tangent = point.tangents[k]
-                projected, here = x[k] + tangent.step, tangent.violation_n
+                projected, here = part.x + tangent.step, tangent.violation_n
             else:
-                residual = segment.residual_n(x[k], settings[k])
-                projected, here = x[k], float(np.abs(residual).max())
-            squares.append(segment.observation.squared_distances_m2(projected, own[k]))
+                projected, here = part.x, float(np.abs(part.residual_n).max())
+            observation = part.segment.observation
+            squares.append(observation.squared_distances_m2(projected, part.phi))
             violation_n = max(violation_n, here)
         distances = np.concatenate(squares)
         rms_m = float(np.sqrt(distances.mean())) if len(distances) else 0.0
-        values = self.collocation.parameters.values(q)
+        values = self.collocation.values(p)
         time_s = self.recorder.elapsed_s
         self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s))

@@ -101,8 +101,7 @@ def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = 
     positions, failure = marched(collocation, p, stopwatch=stopwatch)
     if failure is not None:
         raise failure
-    q, own = collocation.split(p)
-    return collocation.pack(q, positions, own)
+    return collocation.pack(p, positions)
 
 
 def adjoint_gradient(

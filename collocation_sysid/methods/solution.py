@@ -148,14 +148,9 @@ class Solution:
 
     @cached_property
     def readings_m(self) -> list[Array]:
-        """Fitted markers (T, M, 3) of each experiment, with its own unknowns."""
-        collocation = self.collocation
-        _, positions = collocation.unpack(self.z)
-        own = collocation.unpack_own(self.z)
-        return [
-            segment.observation.predicted(x, phi)
-            for segment, x, phi in zip(collocation.segments, positions, own, strict=True)
-        ]
+        """Fitted markers (T, M, 3) of each experiment, with its φ."""
+        parts = self.collocation.parts(self.z)
+        return [part.segment.observation.predicted(part.x, part.phi) for part in parts]
 
     @cached_property
     def rms_m(self) -> float:

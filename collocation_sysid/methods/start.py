@@ -22,10 +22,10 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     Each experiment is simulated at the guess with the collocation scheme. Where that fails, the
     rest shape carried rigidly by the grasp takes its place: collocation needs no feasible start.
     """
-    q = collocation.parameters.guess_q
+    p = collocation.guess_p
     positions, notes = [], []
     for segment in collocation.segments:
-        theta = segment.constants.theta(q)
+        theta = segment.constants.theta(p[: segment.nq])
         try:
             positions.append(march(segment.experiment, segment.dynamics, theta))
         except SimulationError as error:
@@ -34,7 +34,7 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
                 f"experiment '{segment.experiment.name}': the simulation at the guess failed "
                 f"({error}); started from the rest shape carried rigidly by the grasp"
             )
-    return collocation.pack(q, positions), notes
+    return collocation.pack(p, positions), notes
 
 
 def marched(
@@ -58,14 +58,17 @@ def marched(
     options : NewtonOptions, optional
     stopwatch : Stopwatch, optional
     """
-    _, own = collocation.split(p)
     found, first_failure = [], None
-    parts = zip(collocation.segments, collocation.settings(p), own, strict=True)
-    for k, (segment, setting, phi) in enumerate(parts):
-        dynamics = setting.dynamics if rows is None else setting.dynamics.first_rows(rows[k])
-        x = known[k] if known is not None and len(known[k]) else None
-        experiment = segment.corrected(phi)
-        x, failure = march_on(experiment, dynamics, setting.theta, x, options, stopwatch=stopwatch)
+    for k, part in enumerate(collocation.parts_at(p, known or _nothing(collocation))):
+        dynamics = part.setting.dynamics
+        x, failure = march_on(
+            part.segment.corrected(part.phi),
+            dynamics if rows is None else dynamics.first_rows(rows[k]),
+            part.setting.theta,
+            part.x if len(part.x) else None,
+            options,
+            stopwatch=stopwatch,
+        )
         found.append(x)
         first_failure = first_failure or failure
     return found, first_failure
@@ -73,14 +76,18 @@ def marched(
 
 def completed(collocation: Collocation, p: Array, known: Sequence[Array] | None = None) -> Array:
     """Variables z from p and the first rows of every trajectory, the rest carried rigidly."""
-    q, own = collocation.split(p)
     whole = []
-    for k, segment in enumerate(collocation.segments):
-        x = known[k] if known is not None else np.zeros((0, segment.dofs))
-        if len(x) < segment.grid_rows:
-            x = np.concatenate([x, carried_rigidly(segment, segment.constants.theta(q))[len(x) :]])
+    for part in collocation.parts_at(p, known or _nothing(collocation)):
+        x = part.x
+        if len(x) < part.segment.grid_rows:
+            carried = carried_rigidly(part.segment, part.setting.theta)
+            x = np.concatenate([x, carried[len(x) :]])
         whole.append(x)
-    return collocation.pack(q, whole, own)
+    return collocation.pack(p, whole)
+
+
+def _nothing(collocation: Collocation) -> list[Array]:
+    return [np.zeros((0, segment.dofs)) for segment in collocation.segments]
 
 
 def carried_rigidly(segment: Segment, theta: Array) -> Array:

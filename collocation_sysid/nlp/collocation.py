@@ -9,7 +9,7 @@ Variables z, in this order:
 q                  of each estimated parameter, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
-φ_e                the own unknowns of experiment e, see `nlp.local`; experiment by experiment
+φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by experiment
 =================  =========================================================================
 
 Constraints g, in this order:
@@ -37,7 +37,7 @@ from ..errors import InputError
 from ..experiment.experiment import Experiment
 from .parameters import Parameters
 from .schemes import Scheme
-from .segment import Segment
+from .segment import First, Segment
 from .setting import Setting
 
 
@@ -58,10 +58,44 @@ class Violation:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One experiment at a point of the NLP.
+
+    Attributes
+    ----------
+    segment : Segment
+    q : (nq,) shared parameters
+    phi : (k,) its nuisance parameters
+    x : (N, 3n) positions [m], or its first rows
+    """
+
+    segment: Segment
+    q: Array
+    phi: Array
+    x: Array
+
+    @cached_property
+    def setting(self) -> Setting:
+        """The physical parameters."""
+        return self.segment.setting(self.q, self.phi)
+
+    @property
+    def loss(self) -> float:
+        """Of the markers, without priors."""
+        return self.segment.observation.loss(self.x, self.phi)
+
+    @property
+    def residual_n(self) -> Array:
+        """(N, free dofs) violation of the equations of motion in newtons."""
+        return self.segment.residual_n(self.x, self.setting)
+
+
+@dataclass(frozen=True, eq=False)
 class Collocation:
     """Values and derivatives of the collocation NLP of one or several experiments.
 
-    Parameters
+    Attributes
     ----------
     experiments : sequence of Experiment
         They share the parameters; those for validation are left out.
@@ -80,176 +114,154 @@ class Collocation:
         If nothing is to be fitted.
     """
 
-    def __init__(
-        self,
-        experiments: Sequence[Experiment],
-        parameters: Parameters,
-        scheme: str | Scheme = "midpoint",
-        substeps: int = 1,
-        explicit_grasps: bool = False,
-        huber: float | None = None,
-    ) -> None:
-        fitted = [experiment for experiment in experiments if not experiment.validation]
-        if not fitted:
+    experiments: Sequence[Experiment]
+    parameters: Parameters
+    scheme: str | Scheme = "midpoint"
+    substeps: int = 1
+    explicit_grasps: bool = False
+    huber: float | None = None
+
+    def __post_init__(self) -> None:
+        if all(experiment.validation for experiment in self.experiments):
             raise InputError("every experiment is for validation: there is nothing to fit")
-        if substeps < 1:
-            raise InputError(f"substeps = {substeps}, expected at least 1")
-        if huber is not None and not huber > 0:
-            raise InputError(f"huber = {huber:g}, expected a positive number", None, "solver")
-        self.parameters = parameters
-        self.huber = huber
-        self.scheme = scheme
-        self.substeps = substeps
-        self.nq = len(parameters.free)
-        parameters.fit({id(e.body): e.body for e in fitted}.values())
-        self.segments = [
-            Segment(experiment, scheme, substeps, parameters, explicit_grasps, huber)
-            for experiment in fitted
-        ]
-        sizes = [segment.variables for segment in self.segments]
-        self._x_starts = self.nq + np.concatenate([[0], np.cumsum(sizes)])
-        own = [segment.local.size for segment in self.segments]
-        self._phi_starts = self._x_starts[-1] + np.concatenate([[0], np.cumsum(own)])
-        rows = [segment.constraints for segment in self.segments]
-        self._row_starts = np.concatenate([[0], np.cumsum(rows)])
-        self.loss_scale = 1.0 / max(1, self.measurements)
+        if self.substeps < 1:
+            raise InputError(f"substeps = {self.substeps}, expected at least 1")
+        if self.huber is not None and not self.huber > 0:
+            raise InputError(f"huber = {self.huber:g}, expected a positive number", None, "solver")
+        self.parameters.fit({id(s.body): s.body for s in self.segments}.values())
 
     # Sizes and layout -------------------------------------------------------------------------
+
+    @cached_property
+    def segments(self) -> tuple[Segment, ...]:
+        """One of each experiment that is fitted."""
+        found, first = [], First(self.nq, self.nq, 0)
+        for experiment in self.experiments:
+            if not experiment.validation:
+                segment = Segment(
+                    experiment,
+                    self.parameters,
+                    self.scheme,
+                    self.substeps,
+                    self.explicit_grasps,
+                    self.huber,
+                    first,
+                )
+                found.append(segment)
+                first = segment.after
+        return tuple(found)
+
+    @property
+    def nq(self) -> int:
+        """Number of the shared parameters q."""
+        return len(self.parameters.free)
+
+    @property
+    def nphi(self) -> int:
+        """Number of the nuisance parameters φ, all together."""
+        return self.segments[-1].after.phi - self.nq
 
     @property
     def variables(self) -> int:
         """Length of z."""
-        return int(self._phi_starts[-1])
-
-    @property
-    def own(self) -> int:
-        """Number of the experiments' own unknowns φ, all together."""
-        return int(self._phi_starts[-1] - self._phi_starts[0])
+        return self.segments[-1].after.x + self.nphi
 
     @property
     def constraints(self) -> int:
         """Length of g."""
-        return int(self._row_starts[-1])
+        return self.segments[-1].after.row
 
     @property
     def measurements(self) -> int:
         """Scalar measurements that are present."""
         return sum(segment.observation.count for segment in self.segments)
 
-    def pack(
-        self, q: Array, positions: Sequence[Array], own: Sequence[Array] | None = None
-    ) -> Array:
-        """Variables z from q (nq,), and each experiment's positions (N, 3n) [m] and φ (or zero)."""
-        scaled = [
-            np.ravel(x) / segment.length_m
-            for x, segment in zip(positions, self.segments, strict=True)
-        ]
-        return np.concatenate([q, *scaled, *(own or [np.zeros(self.own)])])
+    @property
+    def loss_scale(self) -> float:
+        """What the objective has the loss multiplied by."""
+        return 1.0 / max(1, self.measurements)
+
+    def pack(self, p: Array, positions: Sequence[Array]) -> Array:
+        """Variables z from p = (q, φ_1, φ_2, …) and each experiment's positions (N, 3n) [m]."""
+        parts = self.parts_at(p, positions)
+        scaled = [np.ravel(part.x) / part.segment.length_m for part in parts]
+        return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Parameters q and positions, as `pack` takes them."""
-        positions = [
-            z[a:b].reshape(segment.grid_rows, segment.dofs) * segment.length_m
-            for segment, a, b in self._spans()
+        """Parameters p and positions, as `pack` takes them."""
+        return self.parameters_of(z), [
+            z[segment.columns].reshape(segment.grid_rows, segment.dofs) * segment.length_m
+            for segment in self.segments
         ]
-        return z[: self.nq], positions
-
-    def unpack_own(self, z: Array) -> list[Array]:
-        """φ of each experiment."""
-        return [z[a:b] for a, b in self._phi_spans()]
-
-    @cached_property
-    def places(self) -> list[Index]:
-        """Positions of each experiment's (q, φ_e) in p = (q, φ_1, φ_2, …)."""
-        shared, first = np.arange(self.nq), self.nq - self._phi_starts[0]
-        return [np.concatenate([shared, np.arange(a, b) + first]) for a, b in self._phi_spans()]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What each entry of p is: the parameters' names, then the experiments' own unknowns."""
-        own = [name for segment in self.segments for name in segment.local.names]
-        return (*(item.name for item in self.parameters.free), *own)
 
     def parameters_of(self, z: Array) -> Array:
         """All estimated parameters p = (q, φ_1, φ_2, …)."""
-        return np.concatenate([z[: self.nq], z[self._phi_starts[0] :]])
+        return np.concatenate([z[: self.nq], z[self.variables - self.nphi :]])
 
-    def split(self, p: Array) -> tuple[Array, list[Array]]:
-        """Parameters q and the φ of each experiment from p."""
-        return p[: self.nq], [p[places[self.nq :]] for places in self.places]
+    def parts(self, z: Array) -> list[Part]:
+        """Every experiment at z."""
+        return self.parts_at(*self.unpack(z))
 
-    def settings(self, p: Array) -> list[Setting]:
-        """Physical parameters of each experiment at p."""
-        q, own = self.split(p)
-        return [segment.setting(q, phi) for segment, phi in zip(self.segments, own, strict=True)]
+    def parts_at(self, p: Array, positions: Sequence[Array]) -> list[Part]:
+        """Every experiment at p and positions, or their first rows."""
+        return [
+            Part(segment, p[: self.nq], p[segment.places[self.nq :]], x)
+            for segment, x in zip(self.segments, positions, strict=True)
+        ]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each entry of p is: the parameters' names, then the nuisance parameters."""
+        nuisance = [name for segment in self.segments for name in segment.nuisance.names]
+        return (*(item.name for item in self.parameters.free), *nuisance)
 
     def prior(self, p: Array) -> tuple[Array, Array]:
         """Residuals of the priors at p, and their slopes; φ counts in its deviations."""
         residuals, slopes = self.parameters.prior(p[: self.nq])
         return (
             np.concatenate([residuals, p[self.nq :]]),
-            np.concatenate([slopes, np.ones(self.own)]),
+            np.concatenate([slopes, np.ones(self.nphi)]),
         )
 
     @property
     def bounds_p(self) -> tuple[Array, Array]:
         """Lower and upper bounds of p."""
         lower, upper = self.parameters.bounds_q
-        limits = np.concatenate([np.zeros(0), *(s.local.limits for s in self.segments)])
+        limits = np.concatenate([segment.nuisance.limits for segment in self.segments])
         return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
 
     @property
     def guess_p(self) -> Array:
-        """The guess of p; own unknowns are zero."""
-        return np.concatenate([self.parameters.guess_q, np.zeros(self.own)])
+        """The guess of p; φ is zero."""
+        return np.concatenate([self.parameters.guess_q, np.zeros(self.nphi)])
 
     @property
     def reach_p(self) -> Array:
         """What a trust region of one allows each entry of p."""
-        return np.concatenate([np.ones(self.nq), *(s.local.reach for s in self.segments)])
-
-    def _phi_spans(self) -> list[tuple[int, int]]:
-        return list(zip(self._phi_starts[:-1], self._phi_starts[1:], strict=True))
-
-    def _parts(self, z: Array) -> list[tuple[Segment, Array, Array, Setting]]:
-        """Segments with their positions, φ, and setting."""
-        _, positions = self.unpack(z)
-        settings = self.settings(self.parameters_of(z))
-        return list(zip(self.segments, positions, self.unpack_own(z), settings, strict=True))
-
-    def _spans(self) -> list[tuple[Segment, int, int]]:
-        return list(zip(self.segments, self._x_starts[:-1], self._x_starts[1:], strict=True))
-
-    def _row_spans(self) -> list[tuple[int, int]]:
-        return list(zip(self._row_starts[:-1], self._row_starts[1:], strict=True))
+        return np.concatenate([np.ones(self.nq), *(s.nuisance.reach for s in self.segments)])
 
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z; equal for what is given."""
-        (lower, own_lower), (upper, own_upper) = map(self.split, self.bounds_p)
+        lower, upper = self.bounds_p
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        return self.pack(lower, lows, own_lower), self.pack(upper, highs, own_upper)
+        return self.pack(lower, lows), self.pack(upper, highs)
 
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
         """L divided by the number of measurements."""
-        _, positions = self.unpack(z)
         residuals, _ = self.prior(self.parameters_of(z))
-        loss = float(residuals @ residuals)
-        for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
-            loss += segment.observation.loss(x, phi)
-        return self.loss_scale * loss
+        loss = sum(part.loss for part in self.parts(z))
+        return self.loss_scale * float(residuals @ residuals + loss)
 
     def gradient(self, z: Array) -> Array:
         """∂objective/∂z."""
-        _, positions = self.unpack(z)
         residuals, slopes = self.prior(self.parameters_of(z))
         by_p, by_x = 2 * residuals * slopes, []
-        parts = zip(self.segments, positions, self.unpack_own(z), self.places, strict=True)
-        for segment, x, phi, places in parts:
-            of_x, of_phi = segment.observation.gradient(x, phi)
-            by_x.append(of_x.ravel() * segment.length_m)
-            by_p[places[self.nq :]] += of_phi
+        for part in self.parts(z):
+            of_x, of_phi = part.segment.observation.gradient(part.x, part.phi)
+            by_x.append(of_x.ravel() * part.segment.length_m)
+            by_p[part.segment.places[self.nq :]] += of_phi
         return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :]])
 
     # Constraints ------------------------------------------------------------------------------
@@ -257,7 +269,7 @@ class Collocation:
     def constraint_values(self, z: Array) -> Array:
         """g, scaled."""
         return np.concatenate(
-            [segment.constraint_values(x, setting) for segment, x, _, setting in self._parts(z)]
+            [part.segment.constraint_values(part.x, part.setting) for part in self.parts(z)]
         )
 
     @cached_property
@@ -266,15 +278,16 @@ class Collocation:
         dense = np.arange(self.nq + 1) * self.constraints
         indptr, indices = [dense], [np.tile(np.arange(self.constraints), self.nq)]
         used = int(dense[-1])
-        for segment, first_row in zip(self.segments, self._row_starts[:-1], strict=True):
+        for segment in self.segments:
             indptr.append(used + segment.jacobian.indptr[1:])
-            indices.append(first_row + segment.jacobian.indices)
+            indices.append(segment.first.row + segment.jacobian.indices)
             used += segment.jacobian.nnz
-        for segment, (a, b) in zip(self.segments, self._row_spans(), strict=True):
-            moves = np.isin(np.arange(segment.local.size), segment.local.moving)
-            indptr.append(used + np.cumsum(moves * (b - a)))
-            indices.append(np.tile(np.arange(a, b), int(moves.sum())))
-            used = int(indptr[-1][-1]) if len(moves) else used
+        for segment in self.segments:
+            moves = np.isin(np.arange(segment.nuisance.size), segment.nuisance.moving)
+            indptr.append(used + np.cumsum(moves * segment.constraints))
+            rows = segment.first.row + np.arange(segment.constraints)
+            indices.append(np.tile(rows, int(moves.sum())))
+            used += len(indices[-1])
         return np.concatenate(indptr), np.concatenate(indices)
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
@@ -287,10 +300,11 @@ class Collocation:
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
         rows, by_phi = np.empty(self.constraints), []
         used = columns.size
-        for (segment, x, _, setting), (a, b) in zip(self._parts(z), self._row_spans(), strict=True):
+        for part in self.parts(z):
+            segment = part.segment
             here = values[used : used + segment.jacobian.nnz]
-            rows[a:b], by_p = segment.constraints_and_jacobian(x, setting, here)
-            columns[:, a:b] = by_p[:, : self.nq].T
+            found, by_p = segment.constraints_and_jacobian(part.x, part.setting, here)
+            rows[segment.rows], columns[:, segment.rows] = found, by_p[:, : self.nq].T
             by_phi.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
         values[used:] = np.concatenate(by_phi)
@@ -311,17 +325,20 @@ class Collocation:
         indptr = [counts * (counts + 1) // 2]
         indices = [np.concatenate([np.arange(k) for k in counts])]
         used = int(indptr[0][-1])
-        for segment, start, _ in self._spans():
+        for segment in self.segments:
             layout = segment.hessian_layout
             indptr.append(used + layout.x_indptr[1:])
-            shift = np.where(layout.x_indices < self.nq, 0, start - self.nq)
+            shift = np.where(layout.x_indices < self.nq, 0, segment.first.x - self.nq)
             indices.append(layout.x_indices + shift)
             used += layout.x_entries
-        for (segment, start, _), (first, _) in zip(self._spans(), self._phi_spans(), strict=True):
-            layout = segment.hessian_layout
+        for segment in self.segments:
+            layout, first = segment.hessian_layout, segment.first
             indptr.append(used + layout.phi_indptr[1:])
             of_x = layout.phi_indices < segment.variables
-            indices.append(layout.phi_indices + np.where(of_x, start, first - segment.variables))
+            # In z all φ stand after all x.
+            first_phi = first.phi - self.nq + self.variables - self.nphi
+            shift = np.where(of_x, first.x, first_phi - segment.variables)
+            indices.append(layout.phi_indices + shift)
             used += len(layout.phi_indices)
         return np.concatenate(indptr), np.concatenate(indices)
 
@@ -342,19 +359,19 @@ class Collocation:
         q = z[: self.nq]
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
         used = self.nq * (self.nq + 1) // 2
-        own = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
+        phi = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
         by_q = np.zeros((self.nq, self.nq))
         weight = loss_weight * self.loss_scale
-        for (segment, x, phi, setting), (a, b) in zip(
-            self._parts(z), self._row_spans(), strict=True
-        ):
+        for part in self.parts(z):
+            segment = part.segment
             of_x = segment.hessian_layout.x_entries
             of_phi = segment.hessian_layout.entries - of_x
             here = np.empty(of_x + of_phi) if of_phi else values[used : used + of_x]
-            by_q += segment.hessian_values(x, phi, setting, multipliers[a:b], weight, here)
+            of_rows = multipliers[segment.rows]
+            by_q += segment.hessian_values(part.x, part.phi, part.setting, of_rows, weight, here)
             if of_phi:
-                values[used : used + of_x], values[own : own + of_phi] = here[:of_x], here[of_x:]
-            used, own = used + of_x, own + of_phi
+                values[used : used + of_x], values[phi : phi + of_phi] = here[:of_x], here[of_x:]
+            used, phi = used + of_x, phi + of_phi
         _, slopes = self.parameters.prior(q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
@@ -375,7 +392,7 @@ class Collocation:
         lower, upper = self.bounds()
         slope[lower == upper] = 0
         near = 1e-6
-        for part in (slice(self.nq), slice(self._phi_starts[0], None)):
+        for part in (slice(self.nq), slice(self.variables - self.nphi, None)):
             at_lower, at_upper = (z - lower)[part] < near, (upper - z)[part] < near
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
@@ -392,22 +409,23 @@ class Collocation:
 
     def violations_n(self, z: Array) -> list[Array]:
         """(N, free dofs) residual of the equations of motion of each experiment [N]."""
-        return [segment.residual_n(x, setting) for segment, x, _, setting in self._parts(z)]
+        return [part.residual_n for part in self.parts(z)]
 
     def largest_force_n(self, z: Array) -> float:
         """Largest internal or external force on a free dof [N], the yardstick of violations."""
         largest = 0.0
-        for segment, x, _, setting in self._parts(z):
-            dynamics = setting.dynamics
-            internal = dynamics.internal_force(x, setting.theta)
+        for part in self.parts(z):
+            dynamics = part.setting.dynamics
+            internal = dynamics.internal_force(part.x, part.setting.theta)
             for force in (internal, dynamics.external_force_n):
-                largest = max(largest, float(np.abs(force[:, segment.free_dofs]).max()))
+                largest = max(largest, float(np.abs(force[:, part.segment.free_dofs]).max()))
         return largest
 
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
         """The worst equations of motion in newtons, largest first."""
         found = []
-        for segment, residual in zip(self.segments, self.violations_n(z), strict=True):
+        for part in self.parts(z):
+            segment, residual = part.segment, part.residual_n
             flat = np.argsort(-np.abs(residual), axis=None)[:count]
             for t, place in zip(*np.unravel_index(flat, residual.shape), strict=True):
                 node, axis = divmod(int(segment.free_dofs[place]), 3)
@@ -424,11 +442,10 @@ class Collocation:
 
     def rms_m(self, z: Array) -> float:
         """Root mean square distance of markers from their measurements."""
-        _, positions = self.unpack(z)
         squares = samples = 0.0
-        for segment, x, phi in zip(self.segments, positions, self.unpack_own(z), strict=True):
-            squares += float(segment.observation.squared_distances_m2(x, phi).sum())
-            samples += segment.experiment.markers.samples
+        for part in self.parts(z):
+            found = part.segment.observation.squared_distances_m2(part.x, part.phi)
+            squares, samples = squares + float(found.sum()), samples + len(found)
         return float(np.sqrt(squares / max(1.0, samples)))
 
     def values(self, z: Array) -> dict[str, float]:

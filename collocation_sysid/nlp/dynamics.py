@@ -52,7 +52,7 @@ class Dynamics:
     mass_kg : (N, 3n) of every dof in each row, point masses included
     weighed_kg : (N, 3n) the same at each row's evaluation, where gravity and γ_m act
     external_force_n : (N, 3n) gravity and other forces at each row's evaluation
-    taken : (N, 3n) bool, or None where no grasp ends or begins
+    taken : (N, 3n) bool
         Held dofs that are free at other times: while one is held, the grasp takes what force
         there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
         first step, from the velocity it has.
@@ -66,7 +66,7 @@ class Dynamics:
     mass_kg: Array
     weighed_kg: Array
     external_force_n: Array
-    taken: NDArray[np.bool_] | None
+    taken: NDArray[np.bool_]
     start_velocity_m_s: Array
 
     @classmethod
@@ -110,7 +110,7 @@ class Dynamics:
             mass_kg=self.mass_kg[:rows],
             weighed_kg=self.weighed_kg[:rows],
             external_force_n=self.external_force_n[:rows],
-            taken=None if self.taken is None else self.taken[:rows],
+            taken=self.taken[:rows],
         )
 
     @property
@@ -171,8 +171,7 @@ class Dynamics:
 
     def without_taken(self, rows: Array) -> Array:
         """Forces (N, 3n, …) with those that a passing grasp takes set to zero, in place."""
-        if self.taken is not None:
-            rows[self.taken] = 0
+        rows[self.taken] = 0
         return rows
 
     def inertia(self, x: Array) -> Array:
@@ -225,7 +224,7 @@ def external_force(experiment: Experiment, time_s: float) -> Array:
     return (weight + experiment.node_forces_n(time_s)[0]).ravel()
 
 
-def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_] | None:
+def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
     held, _ = experiment.grasped(t_s)
     held[:, experiment.held_nodes] = False
-    return np.repeat(held, 3, axis=1) if held.any() else None
+    return np.repeat(held, 3, axis=1)

@@ -54,7 +54,7 @@ class HessianLayout:
         nq: int,
         rows: Index,
         columns: Index,
-        own: int,
+        nphi: int,
         length_m: float,
     ) -> HessianLayout:
         """Merge the band in the columns of x with the loss's entries.
@@ -63,7 +63,7 @@ class HessianLayout:
         ----------
         diagonal : positions of the diagonal of x in the band
         rows, columns : entries of the loss by (x, φ), upper triangle, sorted by column
-        own : number of φ
+        nphi : number of φ
         length_m : unit of the scaled x
         """
         of_x = columns < variables
@@ -77,18 +77,18 @@ class HessianLayout:
         loss = np.empty(len(rows), dtype=np.int64)
         loss[of_x] = np.searchsorted(merged, wanted)
 
-        triangle = [(i, j) for j in range(own) for i in range(j + 1)]
+        triangle = [(i, j) for j in range(nphi) for i in range(j + 1)]
         dense = np.array(triangle, dtype=np.int64).reshape(-1, 2) + variables
-        tall = variables + own
+        tall = variables + nphi
         of_phi = columns[~of_x] * tall + rows[~of_x]
         phi_codes = np.unique(np.concatenate([of_phi, dense[:, 1] * tall + dense[:, 0]]))
         loss[~of_x] = len(merged) + np.searchsorted(phi_codes, of_phi)
-        first, second = (index + variables for index in np.triu_indices(own))
+        first, second = (index + variables for index in np.triu_indices(nphi))
         placed = None if merged is codes else np.searchsorted(merged, codes)
         return cls(
             x_indptr=x_indptr,
             x_indices=merged % height,
-            phi_indptr=np.searchsorted(phi_codes, (variables + np.arange(own + 1)) * tall),
+            phi_indptr=np.searchsorted(phi_codes, (variables + np.arange(nphi + 1)) * tall),
             phi_indices=phi_codes % tall,
             band=placed,
             loss=loss,

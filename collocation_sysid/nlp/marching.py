@@ -93,8 +93,7 @@ def march_on(
             time_s = float(dynamics.t_s[t])
             return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
         forces[t] = row.force(x[t])
-        if dynamics.taken is not None:
-            forces[t, dynamics.taken[t]] = 0
+        forces[t, dynamics.taken[t]] = 0
         if progress:
             progress(t / (dynamics.rows - 1))
     return x, None

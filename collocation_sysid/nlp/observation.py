@@ -1,6 +1,6 @@
 """The loss of one experiment: marker residuals in units of their standard deviation.
 
-A marker reads, from node positions x and the experiment's own unknowns φ (`nlp.local`),
+A marker reads, from node positions x and the experiment's nuisance parameters φ (`nlp.nuisance`),
 
     y = R(a) (Σ_i ℓ_i(τ) h(x_i) − c) + c + d + b,
 
@@ -21,7 +21,7 @@ import scipy.sparse as sp
 
 from ..arrays import Array, Index
 from ..experiment.markers import Markers
-from .local import Local, rotation
+from .nuisance import NuisanceMap, rotation
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5
@@ -44,7 +44,7 @@ class Observation:
     ----------
     markers : Markers
     grid_rows : (T,) row of the collocation grid at each sample
-    local : Local
+    nuisance : NuisanceMap
     huber : float or None
         Huber's loss: ρ(d) = d² up to this many standard deviations, linear beyond; d² without it.
     from_rest : bool
@@ -53,7 +53,7 @@ class Observation:
 
     markers: Markers
     grid_rows: Index
-    local: Local
+    nuisance: NuisanceMap
     huber: float | None = None
     from_rest: bool = True
 
@@ -72,7 +72,7 @@ class Observation:
 
     @cached_property
     def _neighbours(self) -> int:
-        shifted = len(self.local.places("time")) > 0
+        shifted = len(self.nuisance.places("time")) > 0
         return min(NEIGHBOURS, len(self.grid_rows)) if shifted else 1
 
     @cached_property
@@ -88,10 +88,10 @@ class Observation:
         return np.maximum(self._first_neighbour[:, None] + np.arange(self._neighbours), 0)
 
     @cached_property
-    def _own(self) -> Index:
+    def _phi_places(self) -> Index:
         """(M, f) positions in φ of what each marker's reading depends on."""
-        common = self.local.places("time", "turn", "shift")
-        offsets = self.local.places("offset").reshape(-1, 3)
+        common = self.nuisance.places("time", "turn", "shift")
+        offsets = self.nuisance.places("offset").reshape(-1, 3)
         if not len(offsets):
             offsets = np.zeros((len(self.markers.names), 0), dtype=np.int64)
         return np.hstack([offsets, np.tile(common, (len(offsets), 1))])
@@ -99,11 +99,11 @@ class Observation:
     @cached_property
     def _sample(self) -> _Sample:
         nodes = ca.SX.sym("h", 3 * self._neighbours)
-        own = ca.SX.sym("phi", self._own.shape[1])
+        phi = ca.SX.sym("phi", self._phi_places.shape[1])
         data = ca.SX.sym("data", 3 + 1 + 1)  # ŷ, 1/σ, place in the window
         measured, weight, place = ca.vertsplit(data, [0, 3, 4, 5])
-        u = ca.vertcat(nodes, own)
-        residual = weight * (self._reading(nodes, own, place) - measured)
+        u = ca.vertcat(nodes, phi)
+        residual = weight * (self._reading(nodes, phi, place) - measured)
         square = ca.sumsqr(residual)
         loss = square
         if self.huber is not None:
@@ -118,14 +118,14 @@ class Observation:
             ca.Function("hessian", [u, data], [ca.densify(hessian)], {"cse": True}),
         )
 
-    def _reading(self, nodes: ca.SX, own: ca.SX, place: ca.SX) -> ca.SX:
+    def _reading(self, nodes: ca.SX, phi: ca.SX, place: ca.SX) -> ca.SX:
         """Y of one sample."""
-        scale = self.local.scales[self._own[0]]
-        kinds = [self.local.kinds[i] for i in self._own[0]]
+        scale = self.nuisance.scales[self._phi_places[0]]
+        kinds = [self.nuisance.kinds[i] for i in self._phi_places[0]]
 
         def values(kind: str) -> ca.SX:
             chosen = [i for i, name in enumerate(kinds) if name == kind]
-            return own[chosen] * scale[chosen]
+            return phi[chosen] * scale[chosen]
 
         at = ca.reshape(nodes, 3, self._neighbours)
         reading = at[:, 0]
@@ -133,7 +133,7 @@ class Observation:
             step_s = float(self.markers.t_s[1] - self.markers.t_s[0])
             reading = at @ lagrange_weights(place + values("time") / step_s, self._neighbours)
         if "turn" in kinds:
-            pivot = ca.DM(self.local.pivot_m)
+            pivot = ca.DM(self.nuisance.pivot_m)
             reading = rotation(values("turn")) @ (reading - pivot) + pivot
         if "shift" in kinds:
             reading += values("shift")
@@ -160,8 +160,9 @@ class Observation:
         rows = self.grid_rows[: self._window[samples - 1, -1] + 1]
         at = self.markers.observe(x[rows].reshape(len(rows), -1, 3))  # (·, M, 3)
         around = np.moveaxis(at[self._window[:samples]], (1, 3), (0, 1))
-        own = np.broadcast_to(phi[self._own].T[:, None], (self._own.shape[1], *around.shape[2:]))
-        return np.concatenate([around.reshape(-1, *around.shape[2:]), own])
+        places = self._phi_places.T[:, None]
+        here = np.broadcast_to(phi[places], (len(places), *around.shape[2:]))
+        return np.concatenate([around.reshape(-1, *around.shape[2:]), here])
 
     def _mapped(self, chosen: ca.Function, u: Array, data: Array | None = None) -> list[Array]:
         """Outputs of a function of `_sample` for the first samples, (…, samples, M) each."""
@@ -211,7 +212,7 @@ class Observation:
         residual : (t, M, 3) ndarray, slope : (t, M, 3, shared + k) ndarray
         """
         samples = self._readable(x)
-        count, size = len(self.markers.names), shared + self.local.size
+        count, size = len(self.markers.names), shared + self.nuisance.size
         if samples == 0:
             return np.zeros((0, count, 3)), np.zeros((0, count, 3, size))
         values, by_u = self._mapped(self._sample.slope, self._inputs(x, phi, samples))
@@ -221,9 +222,9 @@ class Observation:
         around = around[self._window[:samples]]
         slope = np.zeros((samples, count, 3, size))
         slope[..., columns] = np.einsum("riatm,timak->tmrk", by_nodes, around, optimize=True)
-        by_own = np.moveaxis(by_u[:, nodes:], (0, 1), (2, 3))  # (t, M, 3, f)
-        for m, own in enumerate(self._own):
-            slope[:, m, :, shared + own] += np.moveaxis(by_own[:, m], 2, 0)
+        by_phi = np.moveaxis(by_u[:, nodes:], (0, 1), (2, 3))  # (t, M, 3, f)
+        for m, places in enumerate(self._phi_places):
+            slope[:, m, :, shared + places] += np.moveaxis(by_phi[:, m], 2, 0)
         return np.moveaxis(values[:, 0], 0, 2), slope
 
     def predicted(self, x: Array, phi: Array) -> Array:
@@ -261,14 +262,14 @@ class Observation:
     def gradient(self, x: Array, phi: Array) -> tuple[Array, Array]:
         """∂L/∂x (N, 3n) and ∂L/∂φ (k,)."""
         _, slope = self._mapped(self._sample.loss, self._inputs(x, phi, len(self.grid_rows)))
-        nodes, own = np.split(slope[:, 0], [3 * self._neighbours])
+        nodes, of_phi = np.split(slope[:, 0], [3 * self._neighbours])
         nodes = nodes.reshape(self._neighbours, 3, *nodes.shape[1:]).transpose(0, 2, 3, 1)
         at = np.zeros((len(self.grid_rows), len(self.markers.names), 3))
         for i in range(self._neighbours):
             np.add.at(at, self._window[:, i], nodes[i])
-        by_x, by_phi = np.zeros_like(x), np.zeros(self.local.size)
+        by_x, by_phi = np.zeros_like(x), np.zeros(self.nuisance.size)
         by_x[self.grid_rows] = (self.markers.operator.T @ at.reshape(len(at), -1).T).T
-        np.add.at(by_phi, self._own, own.sum(axis=1).T)
+        np.add.at(by_phi, self._phi_places, of_phi.sum(axis=1).T)
         return by_x, by_phi
 
     # Second derivatives -----------------------------------------------------------------------
@@ -278,7 +279,7 @@ class Observation:
         """U from (x, φ) stacked: rows by sample, marker, and entry of u; x by row and dof."""
         dofs = 3 * self.markers.placement.node_count
         columns = (self.grid_rows[-1] + 1) * dofs
-        markers, entries = len(self.markers.names), 3 * self._neighbours + self._own.shape[1]
+        markers, entries = len(self.markers.names), 3 * self._neighbours + self._phi_places.shape[1]
         reading = sp.coo_array(self.markers.operator)
         marker, axis = np.divmod(np.asarray(reading.coords[0]), 3)
         parts = []
@@ -290,15 +291,15 @@ class Observation:
             column = first + np.tile(reading.coords[1], len(self.grid_rows))
             parts.append((row, column, np.tile(reading.data, len(self.grid_rows))))
         samples = np.arange(len(self.grid_rows) * markers).reshape(-1, markers, 1)
-        own = samples * entries + 3 * self._neighbours + np.arange(self._own.shape[1])
-        column = np.broadcast_to(columns + self._own, own.shape)
-        parts.append((own.ravel(), column.ravel(), np.ones(own.size)))
+        row = samples * entries + 3 * self._neighbours + np.arange(self._phi_places.shape[1])
+        column = np.broadcast_to(columns + self._phi_places, row.shape)
+        parts.append((row.ravel(), column.ravel(), np.ones(row.size)))
         row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
-        shape = (samples.size * entries, columns + self.local.size)
+        shape = (samples.size * entries, columns + self.nuisance.size)
         return sp.csr_array((value, (row, column)), shape=shape)
 
     def _hessian(self, operator: sp.csr_array, by_u: Array) -> sp.coo_array:
-        """Upper triangle from the samples' own (samples, M, u, u)."""
+        """Upper triangle from that of each sample (samples, M, u, u)."""
         entries = by_u.shape[-1]
         blocks = by_u.reshape(-1, entries, entries)
         indices = np.arange(len(blocks))
@@ -308,7 +309,7 @@ class Observation:
     @cached_property
     def hessian_structure(self) -> tuple[Index, Index]:
         """Rows and columns of the entries of ∂²L/∂(x, φ)², upper triangle, sorted by column."""
-        markers, entries = len(self.markers.names), 3 * self._neighbours + self._own.shape[1]
+        markers, entries = len(self.markers.names), 3 * self._neighbours + self._phi_places.shape[1]
         ones = np.ones((len(self.grid_rows), markers, entries, entries))
         # Positive numbers cannot cancel, so that no entry is lost.
         found = self._hessian(abs(self._operator), ones)
@@ -318,7 +319,7 @@ class Observation:
 
     def hessian(self, x: Array, phi: Array) -> Array:
         """Values of the entries of `hessian_structure`."""
-        if self.local.size == 0 and self.huber is None:
+        if self.nuisance.size == 0 and self.huber is None:
             return self._constant_hessian
         return self._hessian_values(x, phi)
 

@@ -48,8 +48,6 @@ class PassingGrasps:
         """The corrections of a segment's Jacobian, whose rows are scaled by `scale`."""
         taken = dynamics.taken
         nothing = np.zeros(0, dtype=np.int64)
-        if taken is None:
-            return cls((), nothing, nothing)
         place = np.full(pattern.size, -1)
         place[row_dofs] = np.arange(len(row_dofs))
         times, dofs = np.nonzero(taken)
@@ -74,7 +72,6 @@ class PassingGrasps:
 def _dropped(
     dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
 ) -> list[_Dropped]:
-    assert dynamics.taken is not None
     tables, step_s, found = dynamics.tables, dynamics.step_s, []
     rows, columns, source = pattern.full
     for k in range(dynamics.first_row, dynamics.rows):

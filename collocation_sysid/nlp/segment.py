@@ -7,93 +7,126 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
+from ..fem.body import Body
 from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
 from .dynamics import Dynamics
 from .hessian_layout import HessianLayout
-from .local import Local
+from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
 from .schemes import Scheme
 from .setting import Setting
 
+T = TypeVar("T", bound=np.generic)
 
+
+@dataclass(frozen=True)
+class First:
+    """Where a segment begins: its x in z, its φ in p = (q, φ_1, φ_2, …), and its rows in g."""
+
+    x: int
+    phi: int
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
 class Segment:
     """The variables x_{t,i} and constraints of one experiment.
 
-    Parameters
+    Attributes
     ----------
     experiment : Experiment
-    scheme : str or Scheme
-    substeps : int
     parameters : Parameters
         At their guess the constraints are scaled.
+    scheme, substeps, huber
+        See `Collocation`.
     explicit_grasps : bool
         Grasped nodes get rows of their own instead of bounds. Those that are held only for a
         while always do.
-    huber : float, optional
-        See `Observation`.
-
-    Attributes
-    ----------
-    constants : ThetaMap
-        The body's constants as functions of q.
-    local : Local
-        The experiment's own unknowns φ.
-    rows_per_time : int
-        Constraint rows of a grid time: free dofs, or all dofs with explicit grasps.
-    row_dofs : (rows_per_time,) the dof of each row
+    first : First
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        scheme: str | Scheme,
-        substeps: int,
-        parameters: Parameters,
-        explicit_grasps: bool = False,
-        huber: float | None = None,
-    ) -> None:
-        self.experiment = experiment
-        self.nq = len(parameters.free)
-        self.body = experiment.body
-        self.constants = ThetaMap(parameters, self.body)
-        self.dynamics = Dynamics.of(experiment, scheme, substeps)
-        grid = self.dynamics.t_s
-        self.local = Local.of(experiment)
-        samples = np.arange(len(experiment.t_s)) * substeps
-        self.observation = Observation(
-            experiment.markers,
-            samples,
-            self.local,
-            huber,
+    experiment: Experiment
+    parameters: Parameters
+    scheme: str | Scheme
+    substeps: int
+    explicit_grasps: bool
+    huber: float | None
+    first: First
+
+    @property
+    def body(self) -> Body:
+        """What moves."""
+        return self.experiment.body
+
+    @cached_property
+    def constants(self) -> ThetaMap:
+        """The body's constants as functions of q."""
+        return ThetaMap(self.parameters, self.body)
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """The equations of motion under gravity as stated."""
+        return Dynamics.of(self.experiment, self.scheme, self.substeps)
+
+    @cached_property
+    def nuisance(self) -> NuisanceMap:
+        """The experiment's φ."""
+        return NuisanceMap.of(self.experiment)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """The loss."""
+        return Observation(
+            self.experiment.markers,
+            np.arange(len(self.experiment.t_s)) * self.substeps,
+            self.nuisance,
+            self.huber,
             from_rest=not self.dynamics.start_velocity_m_s.any(),
         )
-        self.explicit_grasps = explicit_grasps
-        self.dofs = self.body.pattern.size
-        self.free_dofs = dofs_of(experiment.free_nodes)
-        self.held_dofs = dofs_of(experiment.held_nodes)
-        grasped = experiment.grasped(grid)[1].reshape(len(grid), -1)
-        self.held_positions = grasped[:, self.held_dofs]
-        # Positions of dofs held for a while, at the rows (t, dof) of `Dynamics.taken`.
-        taken = self.dynamics.taken
-        self.taken_positions = grasped[taken] if taken is not None else np.zeros(0)
-        self.row_dofs = np.arange(self.dofs) if explicit_grasps else self.free_dofs
-        self.rows_per_time = len(self.row_dofs)
-        self.length_m = float(
-            np.linalg.norm(np.diff(self.body.nodes_m[self.body.mesh.edges], axis=1), axis=2).mean()
-        )
-        self.force_n = self.length_m * self._typical_stiffness(
-            self.constants.theta(parameters.guess_q)
-        )
+
+    # Sizes and places -------------------------------------------------------------------------
+
+    @property
+    def nq(self) -> int:
+        """Number of q."""
+        return len(self.parameters.free)
+
+    @property
+    def dofs(self) -> int:
+        """3n."""
+        return self.body.pattern.size
+
+    @cached_property
+    def free_dofs(self) -> Index:
+        """Dofs that are free at some time."""
+        return dofs_of(self.experiment.free_nodes)
+
+    @cached_property
+    def held_dofs(self) -> Index:
+        """Dofs that are held throughout."""
+        return dofs_of(self.experiment.held_nodes)
+
+    @cached_property
+    def row_dofs(self) -> Index:
+        """(rows_per_time,) the dof of each row of a grid time."""
+        return np.arange(self.dofs) if self.explicit_grasps else self.free_dofs
+
+    @property
+    def rows_per_time(self) -> int:
+        """Constraint rows of a grid time: free dofs, or all dofs with explicit grasps."""
+        return len(self.row_dofs)
 
     @property
     def grid_rows(self) -> int:
@@ -114,6 +147,49 @@ class Segment:
     def constraints(self) -> int:
         """Number of rows."""
         return self.constraint_times * self.rows_per_time
+
+    @property
+    def columns(self) -> slice:
+        """Its x in z."""
+        return slice(self.first.x, self.first.x + self.variables)
+
+    @property
+    def rows(self) -> slice:
+        """Its constraints in g."""
+        return slice(self.first.row, self.first.row + self.constraints)
+
+    @property
+    def places(self) -> Index:
+        """Its (q, φ) in p."""
+        return np.concatenate([np.arange(self.nq), self.first.phi + np.arange(self.nuisance.size)])
+
+    @property
+    def after(self) -> First:
+        """Where the next segment begins."""
+        return First(self.columns.stop, self.first.phi + self.nuisance.size, self.rows.stop)
+
+    # Grasps and scales ------------------------------------------------------------------------
+
+    @cached_property
+    def _grasp_positions(self) -> Array:
+        return self.experiment.grasped(self.dynamics.t_s)[1].reshape(self.grid_rows, -1)
+
+    @cached_property
+    def held_positions(self) -> Array:
+        """(N, held) where the grasps are."""
+        return self._grasp_positions[:, self.held_dofs]
+
+    @cached_property
+    def length_m(self) -> float:
+        """ℓ, the mean edge."""
+        edges = np.diff(self.body.nodes_m[self.body.mesh.edges], axis=1)
+        return float(np.linalg.norm(edges, axis=2).mean())
+
+    @cached_property
+    def force_n(self) -> float:
+        """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
+        theta = self.constants.theta(self.parameters.guess_q)
+        return self.length_m * self._typical_stiffness(theta)
 
     def start_positions(self) -> Array | None:
         """(3n,) the given x_0, or None when it is found as an equilibrium."""
@@ -140,33 +216,32 @@ class Segment:
     @cached_property
     def moving(self) -> Index:
         """Positions in (q, φ) of the parameters that change the motion."""
-        return np.concatenate([np.arange(self.nq), self.nq + self.local.moving])
+        return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.moving])
 
     def setting(self, q: Array, phi: Array) -> Setting:
         """The physical parameters at (q, φ)."""
         theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
         gravity_phi_phi = np.zeros((3, 0, 0))
-        moving = self.local.moving
+        moving = self.nuisance.moving
         if len(moving):
-            gravity, first, second = self.local.gravity(phi)
-            dynamics = dynamics.under_gravity(gravity - self.local.gravity_m_s2)
+            gravity, first, second = self.nuisance.gravity(phi)
+            dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
         return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi)
 
     def corrected(self, phi: Array) -> Experiment:
         """The experiment in the body's frame: gravity turned by φ."""
-        if not len(self.local.moving):
+        if not len(self.nuisance.moving):
             return self.experiment
-        return replace(self.experiment, gravity_m_s2=self.local.gravity(phi)[0])
+        return replace(self.experiment, gravity_m_s2=self.nuisance.gravity(phi)[0])
 
     def grasped(self, x: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
         x = x.copy()
         x[:, self.held_dofs] = self.held_positions
-        if self.dynamics.taken is not None:
-            x[self.dynamics.taken] = self.taken_positions
+        x[self.dynamics.taken] = self._grasp_positions[self.dynamics.taken]
         return x
 
     # Values ---------------------------------------------------------------------------------
@@ -180,9 +255,19 @@ class Segment:
         if self.explicit_grasps:
             rows[:, self.held_dofs] = (x[:, self.held_dofs] - self.held_positions) / self.length_m
         taken = self.dynamics.taken
-        if taken is not None:
-            rows[taken] = (x[taken] - self.taken_positions) / self.length_m
-        return rows[self.dynamics.first_row :, self.row_dofs].ravel()
+        rows[taken] = (x[taken] - self._grasp_positions[taken]) / self.length_m
+        return self.of_rows(rows)
+
+    def of_rows(self, values: NDArray[T]) -> NDArray[T]:
+        """(constraints,) what the rows have of (N, 3n)."""
+        return values[self.dynamics.first_row :, self.row_dofs].ravel()
+
+    @cached_property
+    def grasp_rows(self) -> NDArray[np.bool_]:
+        """(constraints,) rows that hold a node instead of moving it."""
+        grasped = self.dynamics.taken.copy()
+        grasped[:, self.held_dofs] = True
+        return self.of_rows(grasped)
 
     def residual_n(self, x: Array, setting: Setting) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
@@ -370,12 +455,12 @@ class Segment:
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
         pull = (weights * dynamics.weighed_kg[first:]).sum(axis=0).reshape(-1, 3).sum(axis=0)
-        by_phi = np.zeros((self.local.size, self.local.size))
-        by_phi[np.ix_(self.local.moving, self.local.moving)] = np.einsum(
+        by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
+        by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
         )
-        by_phi += 2 * loss_weight * np.eye(self.local.size)  # the prior
-        values[layout.phi] += by_phi[np.triu_indices(self.local.size)]
+        by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
+        values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
         theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
         by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
         return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
@@ -397,7 +482,7 @@ class Segment:
             self.nq,
             rows,
             columns,
-            self.local.size,
+            self.nuisance.size,
             self.length_m,
         )
 

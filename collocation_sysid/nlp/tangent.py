@@ -111,8 +111,7 @@ class BlockSolver:
         self.segment = segment
         self.body = segment.body
         self.free = segment.free_dofs
-        taken = self.dynamics.taken
-        self._taken = None if taken is None or not taken.any() else taken[:, self.free]
+        self._taken = self.dynamics.taken[:, self.free]
         self.factoriser = Factoriser.of(self.body.pattern, self.free, factorisation)
         full_rows, full_columns, source = self.body.pattern.full
         place = np.full(self.body.pattern.size, -1)
@@ -219,8 +218,7 @@ class BlockSolver:
 
     def without_taken(self, t: int, rows: Array) -> Array:
         """Rows (free, …) with zeros at what a passing grasp holds at t, in place."""
-        if self._taken is not None:
-            rows[self._taken[t]] = 0
+        rows[self._taken[t]] = 0
         return rows
 
     @property
@@ -274,13 +272,13 @@ class BlockSolver:
         q = tables.w[rows, 0] * tables.q[rows, 0] / step_s
         s = tables.s[rows, 0] / step_s**2
         pattern, mass = self.body.pattern, self.dynamics.mass_kg[rows]
-        taken = None if self.dynamics.taken is None else self.dynamics.taken[rows]
+        taken = self.dynamics.taken[rows]
 
         def matrix(k: int) -> Array:
             values = -p[k] * at.by_position[k]
             values -= q[k] * at.by_velocity[k]
             values[pattern.diagonal] += s[k] * mass[k]
-            if taken is not None and taken[k].any():
+            if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
                 values[taken[k][pattern.rows] | taken[k][pattern.columns]] = 0
                 values[pattern.diagonal[taken[k]]] = size

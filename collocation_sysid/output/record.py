@@ -150,7 +150,7 @@ def result(finished: Run) -> dict[str, Any]:
         "title": problem.title,
         "parameters": _parameters(finished),
         "derived": {name: _with_error_bar(finished.estimates[name]) for name in finished.derived},
-        "unknowns": _unknowns(finished),
+        "nuisance": _nuisance(finished),
         "uncertainty": _uncertainty(finished),
         "fit": _fit(solution),
         "residuals": [
@@ -170,7 +170,7 @@ def result(finished: Run) -> dict[str, Any]:
                     "rms_m": r.rms_m,
                     "max_m": r.max_m,
                     "fitted": name in fitted,
-                    "unknowns": r.unknowns,
+                    "nuisance": r.nuisance,
                 }
                 if isinstance(r, Rollout)
                 else {"failed": r, "fitted": name in fitted}
@@ -255,17 +255,15 @@ def _with_error_bar(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _unknowns(finished: Run) -> dict[str, dict[str, Any]]:
-    """The experiments' own unknowns in their units, with the deviation of their prior."""
-    deviations = finished.uncertainty.local if finished.uncertainty is not None else {}
+def _nuisance(finished: Run) -> dict[str, dict[str, Any]]:
+    """The nuisance parameters in their units, with the deviation of their prior."""
+    deviations = finished.uncertainty.nuisance if finished.uncertainty is not None else {}
     collocation = finished.solution.collocation
     found = {}
-    for segment, phi in zip(
-        collocation.segments, collocation.unpack_own(finished.solution.z), strict=True
-    ):
-        local = segment.local
-        for name, value, scale in zip(local.names, phi, local.scales, strict=True):
-            found.setdefault(segment.experiment.name, {})[name.partition(": ")[2]] = {
+    for part in collocation.parts(finished.solution.z):
+        nuisance = part.segment.nuisance
+        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
+            found.setdefault(part.segment.experiment.name, {})[name.partition(": ")[2]] = {
                 "value": float(value * scale),
                 "prior": float(scale),
                 "std_error": deviations[name] * scale if name in deviations else None,

@@ -34,13 +34,13 @@ from ..nlp.newton import Solver
 from ..nlp.parameters import Parameters, theta_of
 from ..nlp.rest import start_state
 from .recording_schema import (
-    EstimateSection,
     ExperimentSection,
     ForceSection,
     GraspSection,
     MarkersSection,
     MassSection,
     NodesSection,
+    NuisanceSection,
     PosePrior,
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
@@ -134,7 +134,7 @@ class RecordingReader:
                 validation=section.validation,
                 masses=masses,
                 forces=forces,
-                nuisance=_nuisance(section.estimate),
+                nuisance=_nuisance(section.nuisance),
             )
 
         n = len(self.body.nodes_m)
@@ -341,7 +341,7 @@ class RecordingReader:
         return x.reshape(-1, 3)
 
 
-def _nuisance(section: EstimateSection | None) -> Nuisance:
+def _nuisance(section: NuisanceSection | None) -> Nuisance:
     if section is None:
         return Nuisance()
     pose = section.pose or PosePrior.model_construct()

@@ -242,7 +242,7 @@ class PosePrior(Section):
         return self
 
 
-class EstimateSection(Section):
+class NuisanceSection(Section):
     """What is estimated of this recording alone, each with a prior around zero."""
 
     marker_offsets: LengthPrior | None = Field(
@@ -296,7 +296,7 @@ class ExperimentSection(Section):
     force: list[ForceSection] = Field(
         default_factory=list, description="[[experiment.force]] tables: forces besides gravity."
     )
-    estimate: EstimateSection | None = Field(
+    nuisance: NuisanceSection | None = Field(
         None, description="What is estimated of this recording alone."
     )
     validation: Flag = Field(False, description="Not fitted, only predicted.")

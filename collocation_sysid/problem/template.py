@@ -54,7 +54,7 @@ sigma_m = 0.001                # standard deviation of a coordinate
 # labels = {{ "Body:tip" = "tip" }}           # the file's labels, and the names used here
 # reference_m = {{ tip = [0.0, 0.0, 0.2] }}   # places on the undeformed body, where they are known
 
-# [experiment.estimate]        # what is not known of this recording, with its standard deviation
+# [experiment.nuisance]        # what is not known of this recording, with its standard deviation
 # marker_offsets = {{ prior_m = 0.003 }}
 # time_shift = {{ prior_s = 0.01 }}
 # pose = {{ prior_rad = 0.02, prior_m = 0.002 }}

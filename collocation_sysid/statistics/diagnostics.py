@@ -74,8 +74,8 @@ def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
 
 def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
     """Whether marker offsets and a time shift of the experiment are estimated already."""
-    own = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared :]]
-    return any(n.startswith("offset") for n in own), any(n.startswith("time") for n in own)
+    kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared :]]
+    return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
 
 
 def _diagnose(

@@ -1,7 +1,7 @@
 """The fit near its answer: residuals of all samples and their slopes along the motion equations.
 
 Everything the statistics need to know of a fit. Estimated are the shared parameters, q, and
-possibly local ones of single experiments, such as the offset of a marker on the body.
+possibly nuisance parameters of single experiments, such as the offset of a marker on the body.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class LinearisedFit:
     ----------
     blocks : tuple of FitBlock
         One per fitted experiment.
-    names : (p,) the shared parameters first, which are q; then local ones, with their unit in
+    names : (p,) the shared parameters first, which are q; then φ, with their unit in
         brackets: ``"gravity/offset Tip1 x [m]"``
     shared : int
         Number of shared parameters.
@@ -154,20 +154,17 @@ def linearised_fit(
     SimulationError
         Where the equations of motion are singular.
     """
-    _, positions = collocation.unpack(z)
-    p, own = collocation.parameters_of(z), collocation.unpack_own(z)
+    p = collocation.parameters_of(z)
     if marker_z is None:
         marker_z = marker_sensitivities(collocation, z)
     blocks = []
-    for segment, x, phi, by_p, places in zip(
-        collocation.segments, positions, own, marker_z, collocation.places, strict=True
-    ):
-        markers = segment.experiment.markers
+    for part, by_p in zip(collocation.parts(z), marker_z, strict=True):
+        segment, markers = part.segment, part.segment.experiment.markers
         residual, here = segment.observation.linearised(
-            x, phi, by_p, segment.moving, collocation.nq
+            part.x, part.phi, by_p, segment.moving, collocation.nq
         )
         slope = np.zeros((*residual.shape, len(p)))
-        slope[..., places] = here
+        slope[..., segment.places] = here
         misfit = residual
         if collocation.huber is not None:
             residual, slope = _reweighted(residual, slope, collocation.huber)

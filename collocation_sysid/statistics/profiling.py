@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..errors import InputError
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
-from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameter
 from .linearised import LinearisedFit
 from .profile import Profile, profile
@@ -58,14 +59,7 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
     held = started.with_fixed({item.name: value})
-    collocation = Collocation(
-        [segment.experiment for segment in before.segments],
-        held,
-        before.scheme,
-        before.substeps,
-        huber=before.huber,
-    )
-    found = ReducedSpace()(collocation)
+    found = ReducedSpace()(replace(before, parameters=held))
     if not found.status.converged:
         return float("inf")
     prior = 0.0

@@ -1,7 +1,7 @@
 """How the trajectory follows the parameters: Z = dx/dp with the equations of motion kept.
 
 From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.tangent`; p are the
-shared parameters q and those of an experiment's own that move its body, see `Segment.moving`.
+shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,5 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 
 
 def _by_experiment(collocation: Collocation, z: Array) -> Iterator[tuple[Segment, Iterator[Array]]]:
-    _, positions = collocation.unpack(z)
-    settings = collocation.settings(collocation.parameters_of(z))
-    for segment, x, setting in zip(collocation.segments, positions, settings, strict=True):
-        yield segment, BlockSolver(segment).sensitivities(x, setting)
+    for part in collocation.parts(z):
+        yield part.segment, BlockSolver(part.segment).sensitivities(part.x, part.setting)

@@ -5,7 +5,7 @@ priors, the estimate errs by A⁻¹ Sᵀe, A = SᵀS + PᵀP, and has the covari
 
     C = A⁻¹ (Sᵀ Cov(e) S + PᵀP) A⁻¹,
 
-of which the block of the shared parameters q is reported: local parameters of single
+of which the block of the shared parameters q is reported: nuisance parameters of single
 experiments widen it by what they could have explained. For independent errors of the σ given it
 is A⁻¹. If σ is to be estimated, Cov(e) = s² I with the residuals' variance s², and intervals are
 Student's. If a test finds the residuals correlated, in time or among markers, Cov(e) is that of
@@ -68,7 +68,7 @@ class Uncertainty:
     Attributes
     ----------
     names : (nq,) estimated parameters, in the order of q
-    covariance : (nq, nq) of the parameters' logarithms, with local parameters free
+    covariance : (nq, nq) of the parameters' logarithms, with nuisance parameters free
         Of a parameter that may be negative, of its deviation over its size.
         NaN in rows and columns of parameters at a bound, the others' is as if those were fixed;
         infinite variance where the data do not determine a parameter.
@@ -77,7 +77,7 @@ class Uncertainty:
         1.96, or Student's for a variance that was estimated.
     estimates : by name, all parameters of the user
     derived : by name, the moduli of the other convention
-    local : by name, standard deviation of each parameter of a single experiment
+    nuisance : by name, standard deviation of each parameter of a single experiment
         In the unit it is estimated in, that is deviations of its prior; NaN at a bound.
     noise : {"given", "estimated"}
     errors : {"independent", "autocorrelated"}
@@ -98,7 +98,7 @@ class Uncertainty:
     quantiles: Array
     estimates: Mapping[str, Estimate]
     derived: Mapping[str, Estimate]
-    local: Mapping[str, float]
+    nuisance: Mapping[str, float]
     noise: Noise
     errors: Errors
     dependence: Dependence
@@ -200,7 +200,7 @@ def uncertainty_of(
         quantiles=quantiles,
         estimates=estimates,
         derived=derived_estimates(fit.derived, of_q, bounded, quantiles),
-        local=dict(
+        nuisance=dict(
             zip(fit.names[shared:], np.sqrt(np.diag(of_all)[shared:]).tolist(), strict=True)
         ),
         noise=noise,

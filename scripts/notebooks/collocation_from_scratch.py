@@ -1056,7 +1056,7 @@ for name, experiment in (("as told", wrong), ("offset estimated", aware)):
     offsets[name] = np.log(list(found.parameters.values())), np.sqrt(np.diag(bars.covariance))
     print(f"{name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)
-first_unknown = 0.005 * found.collocation.unpack_own(found.z)[0][3 * tip]
+first_unknown = 0.005 * found.collocation.parts(found.z)[0].phi[3 * tip]
 print(f"estimated offset of tip_1 along x: {1e3 * first_unknown:.2f} mm (truth 4)")
 assert abs(first_unknown - 0.004) < 0.0005
 
@@ -1375,7 +1375,7 @@ for i, name in enumerate(block.marker_names):
 # %% jupyter={"source_hidden": true}
 first, last = MY_PROBLEM.index("[experiment.markers.ref"), MY_PROBLEM.index("[transcription]")
 no_ruler = MY_PROBLEM[:first] + MY_PROBLEM[last:]
-unknown = "[experiment.estimate]\nmarker_offsets = { prior_m = 0.005 }\n\n"
+unknown = "[experiment.nuisance]\nmarker_offsets = { prior_m = 0.005 }\n\n"
 with_offsets = MY_PROBLEM[:first] + unknown + MY_PROBLEM[last:]
 for name, text in (("places from the first frame", no_ruler), ("offsets too", with_offsets)):
     (mine / "problem.toml").write_text(text)

@@ -1,4 +1,4 @@
-"""An experiment's own unknowns φ: marker offsets, a time shift, and corrections of the frame.
+"""Nuisance parameters φ of an experiment: marker offsets, a time shift, corrections of the frame.
 
 Every φ is a number of prior standard deviations, so that its prior is φ² in the loss. In their
 order, those that the experiment's `Nuisance` names:
@@ -34,8 +34,8 @@ KINDS = ("offset", "time", "turn", "shift", "tilt")
 
 
 @dataclass(frozen=True, eq=False)
-class Local:
-    """The unknowns of one experiment.
+class NuisanceMap:
+    """φ of one experiment: what each is, and the gravity it makes.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Local:
     pivot_m: Array
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Local:
+    def of(cls, experiment: Experiment) -> NuisanceMap:
         """What the experiment wants estimated."""
         wanted, entries = experiment.nuisance, []
         if wanted.marker_offset_m:
@@ -90,7 +90,7 @@ class Local:
 
     @property
     def size(self) -> int:
-        """Number of unknowns k."""
+        """Number k of φ."""
         return len(self.names)
 
     def places(self, *kinds: str) -> NDArray[np.int64]:

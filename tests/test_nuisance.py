@@ -10,7 +10,7 @@ from problems_small import (
     GUESS,
     TRUTH,
     cube_with_gaps,
-    cube_with_unknowns,
+    cube_with_nuisance,
     hung_cube,
     measured,
     released_cube,
@@ -23,7 +23,7 @@ from collocation_sysid.experiment import Experiment, Grasp, Nuisance, PoseSequen
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.local import Local
+from collocation_sysid.nlp.nuisance import NuisanceMap
 from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.statistics.uncertainty import covariance
 
@@ -41,7 +41,7 @@ def alone(experiment: Experiment, **options) -> Collocation:
 
 
 def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
-    """What the markers read at the truth with unknowns φ; the scheme's own trajectory."""
+    """What the markers read at the truth with φ; the scheme's own trajectory."""
     (segment,) = alone(experiment).segments
     motion = simulate(segment.corrected(phi), TRUTH, "midpoint")
     return segment.observation.of_samples(motion.positions_m, phi)
@@ -56,18 +56,18 @@ def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:
 # What they do
 
 
-def test_without_unknowns_markers_read_where_they_are():
+def test_without_nuisance_markers_read_where_they_are():
     cube = hung_cube()
     plain = simulate(cube, TRUTH, "midpoint").markers_m
     np.testing.assert_allclose(readings(cube, np.zeros(0)), plain, atol=1e-15)
-    everything = cube_with_unknowns()
-    zero = np.zeros(Local.of(everything).size)
+    everything = cube_with_nuisance()
+    zero = np.zeros(NuisanceMap.of(everything).size)
     np.testing.assert_allclose(readings(everything, zero), plain, atol=1e-12)
 
 
 def test_an_offset_moves_its_marker():
     cube = replace(hung_cube(), nuisance=ONE_OF_EACH["offset"])
-    phi = np.zeros(Local.of(cube).size)
+    phi = np.zeros(NuisanceMap.of(cube).size)
     phi[3:6] = [1.0, -2.0, 0.5]
     change = readings(cube, phi) - readings(cube, 0 * phi)
     expected = np.zeros_like(change)
@@ -99,8 +99,8 @@ def test_before_the_start_a_body_at_rest_reads_its_start():
 def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
     """The reading with φ is that of the experiment whose grasp really is turned and shifted."""
     plain = hung_cube()
-    unknown = Nuisance(pose_turn_rad=0.1, pose_shift_m=0.01)
-    cube = replace(measured(plain), nuisance=unknown)
+    nuisance = Nuisance(pose_turn_rad=0.1, pose_shift_m=0.01)
+    cube = replace(measured(plain), nuisance=nuisance)
     phi = np.array([1.0, -0.6, 0.8, 0.5, -1.0, 0.3])
     pivot = plain.rigid_positions(plain.t_s[:1])[0].mean(axis=0)
     half = 0.1 * phi[:3] / 2  # Cayley's parameters: tan(angle / 2) along the axis
@@ -119,18 +119,18 @@ def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
 
 
 def test_a_tilt_turns_gravity_and_keeps_its_size():
-    local = Local.of(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
-    gravity, slope, _ = local.gravity(np.array([1.0, -2.0]))
+    nuisance = NuisanceMap.of(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
+    gravity, slope, _ = nuisance.gravity(np.array([1.0, -2.0]))
     assert np.linalg.norm(gravity) == pytest.approx(9.81)
-    angle = np.arccos(gravity @ local.gravity_m_s2 / 9.81**2)
+    angle = np.arccos(gravity @ nuisance.gravity_m_s2 / 9.81**2)
     assert angle == pytest.approx(np.arctan(0.05 * np.sqrt(5)), rel=1e-9)
     np.testing.assert_allclose(gravity @ slope, 0, atol=1e-12)
 
 
 def test_without_gravity_there_is_no_tilt():
     floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
-    local = Local.of(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
-    np.testing.assert_array_equal(local.gravity(np.ones(2))[0], np.zeros(3))
+    nuisance = NuisanceMap.of(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
+    np.testing.assert_array_equal(nuisance.gravity(np.ones(2))[0], np.zeros(3))
 
 
 def test_deviations_must_be_positive():
@@ -145,15 +145,15 @@ def test_deviations_must_be_positive():
     "method", [m for m in METHODS if m != "penalty" and not m.startswith("casadi:")]
 )
 @pytest.mark.parametrize("kind", ONE_OF_EACH)
-def test_unknowns_are_found_beside_the_material(kind: str, method: str, rng):
+def test_nuisance_is_found_beside_the_material(kind: str, method: str, rng):
     cube = replace(cube_with_gaps(14), nuisance=ONE_OF_EACH[kind])
     precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-7))
     cube = replace(cube, markers=precise)
-    phi = rng.uniform(-1, 1, Local.of(cube).size)
+    phi = rng.uniform(-1, 1, NuisanceMap.of(cube).size)
     solution = METHODS[method]()(alone(seen_with(cube, phi)))
     assert solution.status.converged
-    (found,) = solution.collocation.unpack_own(solution.z)
-    np.testing.assert_allclose(found, phi, atol=1e-3)
+    (part,) = solution.collocation.parts(solution.z)
+    np.testing.assert_allclose(part.phi, phi, atol=1e-3)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
 
@@ -161,33 +161,33 @@ def test_a_prior_keeps_what_the_data_do_not_tell():
     """With one marker the offset and the pose's shift are the same: the priors share it."""
     cube = hung_cube()
     one = replace(cube, markers=_only_first(cube))
-    unknown = Nuisance(marker_offset_m=0.002, pose_shift_m=0.001)
+    nuisance = Nuisance(marker_offset_m=0.002, pose_shift_m=0.001)
     tracks = measured(one).markers.positions_m + np.array([0.005, 0.0, 0.0])
-    both = replace(with_markers(one, tracks), nuisance=unknown)
+    both = replace(with_markers(one, tracks), nuisance=nuisance)
     solution = ReducedSpace()(alone(both))
-    (phi,) = solution.collocation.unpack_own(solution.z)
-    offset, shift = 0.002 * phi[0], 0.001 * phi[3]
+    (part,) = solution.collocation.parts(solution.z)
+    offset, shift = 0.002 * part.phi[0], 0.001 * part.phi[3]
     assert offset / shift == pytest.approx(4.0, rel=0.05)  # as their variances
     assert offset + shift == pytest.approx(0.005, rel=0.05)
 
 
 def test_a_shift_beyond_the_neighbouring_samples_ends_at_its_bound():
     cube = replace(hung_cube(20), nuisance=Nuisance(time_shift_s=1.0))
-    local = Local.of(cube)
-    np.testing.assert_allclose(local.limits * local.scales, 2 * cube.timestep_s)
+    nuisance = NuisanceMap.of(cube)
+    np.testing.assert_allclose(nuisance.limits * nuisance.scales, 2 * cube.timestep_s)
 
 
-def test_unknowns_widen_the_error_bars_of_the_material():
+def test_nuisance_parameters_widen_the_error_bars_of_the_material():
     plain = measured(hung_cube(20))
     known = ReducedSpace()(alone(plain))
-    unknown = ReducedSpace()(alone(replace(plain, nuisance=cube_with_unknowns().nuisance)))
+    unknown = ReducedSpace()(alone(replace(plain, nuisance=cube_with_nuisance().nuisance)))
     narrow, wide = (
         np.sqrt(np.diag(covariance(s.collocation, s.z).covariance)) for s in (known, unknown)
     )
     assert (wide > 1.05 * narrow).all()
 
 
-def test_experiments_keep_their_unknowns_to_themselves(rng):
+def test_experiments_keep_their_nuisance_to_themselves(rng):
     first, second = (replace(hung_cube(n), nuisance=ONE_OF_EACH["time"]) for n in (12, 16))
     second = replace(second, name="second")
     both = [seen_with(first, np.array([0.7])), seen_with(second, np.array([-0.4]))]
@@ -196,7 +196,7 @@ def test_experiments_keep_their_unknowns_to_themselves(rng):
         for e in both
     ]
     solution = ReducedSpace()(Collocation(exact, GUESS))
-    found = np.concatenate(solution.collocation.unpack_own(solution.z))
+    found = solution.collocation.parameters_of(solution.z)[4:]
     np.testing.assert_allclose(found, [0.7, -0.4], atol=1e-3)
     assert solution.collocation.names[4:] == (
         "hung cube: time shift [s]",
