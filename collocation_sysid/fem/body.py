@@ -10,32 +10,27 @@ part in turn: its material's, its damping law's, and its γ_m.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
-from ..errors import InputError, hint_at
+from ..errors import InputError
 from .batched import Batch, Evaluator, EvaluatorChoice, available_threads
-from .constants import Constant
 from .damping import Damping
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
 from .materials import Energy, Material
 from .mesh import TetMesh
-from .moduli import Source, elastic_names, source_of
+from .model import Model, Theta
 from .nodes import Nodes
 from .pattern import SymmetricPattern, element_destinations
 from .regions import Part, Region, parts_of
 from .selection import Selection
-
-Theta = Sequence[float] | Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +71,7 @@ class Curvature:
     theta: Array
 
 
-class Body:
+class Body(Model):
     """A tetrahedral finite-element body.
 
     Parameters
@@ -133,11 +128,8 @@ class Body:
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
+        super().__init__(parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions))
         self.mesh = mesh
-        self.parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions)
-        self.constants: dict[str, Constant] = {
-            part.full_name(c.name): c for part in self.parts for c in part.constants
-        }
         self.element: Element = element_named(element)
         self.nodes = Nodes.of_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
@@ -217,88 +209,6 @@ class Body:
         """Sparsity of the stiffness matrix."""
         return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
 
-    # Constants ------------------------------------------------------------------------------
-
-    def sources(self, known: Sequence[str]) -> list[Source]:
-        """For each part, which of the names that are known give its constants.
-
-        Raises
-        ------
-        InputError
-            If a constant is missing or given twice.
-        """
-        return [
-            source_of(
-                part.name, part.material, part.constants[len(part.material.constants) :], known
-            )
-            for part in self.parts
-        ]
-
-    def used_names(self, known: Sequence[str]) -> set[str]:
-        """Those of the names that are known which give its constants."""
-        return {name for source in self.sources(known) for name in source.names.values()}
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names that a parameter may have: constants, what may stand for them, and shared ones."""
-        names = []
-        for part in self.parts:
-            owns = [c.name for c in part.constants] + list(elastic_names(part.material))
-            names += [part.full_name(own) for own in owns] + owns
-        return tuple(dict.fromkeys(names))
-
-    def assembled(self, values: Mapping[str, Any]) -> list[Any]:
-        """θ from values by the user's names: numbers, or CasADi expressions.
-
-        Raises
-        ------
-        InputError
-            If a constant is missing or given twice.
-        """
-        theta = []
-        for part, source in zip(self.parts, self.sources(list(values)), strict=True):
-            found = source.constants(values)
-            theta += [found[c.name] for c in part.constants]
-        return theta
-
-    def theta(self, values: Mapping[str, float]) -> Array:
-        """(k,) constants from values by the user's names; values of other bodies do not matter.
-
-        Raises
-        ------
-        InputError
-            If one is missing or given twice.
-        """
-        return np.array([float(value) for value in self.assembled(values)])
-
-    def lame(self, theta: Theta) -> dict[str, tuple[float, float]]:
-        """Small-strain (λ, μ) [Pa] of each part by its name."""
-        found = {}
-        for part, mine in zip(self.parts, self.split(np.asarray(theta, dtype=float)), strict=True):
-            values = part.material.lame(mine[: len(part.material.constants)]).full().ravel()
-            found[part.name] = (float(values[0]), float(values[1]))
-        return found
-
-    def split(self, theta: Any) -> list[Any]:
-        """θ, numbers or a CasADi expression, part by part."""
-        return [theta[a:b] for a, b in pairwise(self._starts)]
-
-    @cached_property
-    def _starts(self) -> list[int]:
-        """Where the constants of each part begin in θ, and where the last end."""
-        return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
-
-    def _elastic(self, constants: Mapping[str, float]) -> Array:
-        """θ without damping."""
-        for name in constants:
-            if name not in self.parameter_names:
-                hint = hint_at(name, self.parameter_names)
-                raise InputError(
-                    f"no constant {name!r}; expected {', '.join(self.constants)}{hint}"
-                )
-        stored = {p.full_name(c.name) for p in self.parts for c in p.material.constants}
-        return self.theta({**dict.fromkeys(set(self.constants) - stored, 0.0), **constants})
-
     # One state ------------------------------------------------------------------------------
 
     def energy(self, positions: ArrayLike, **constants: float) -> float:
@@ -307,12 +217,12 @@ class Body:
         The constants are the material's, or moduli in their place: ``young_pa=1e4, poisson=0.3``.
         """
         x = self._state(positions)
-        return float(self._evaluate("energy", [x], self._elastic(constants))[0, 0])
+        return float(self._evaluate("energy", [x], self.elastic(constants))[0, 0])
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
         """Elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m]; see `energy`."""
         x = self._state(positions)
-        force = self._evaluate("force", [x, np.zeros_like(x)], self._elastic(constants))
+        force = self._evaluate("force", [x, np.zeros_like(x)], self.elastic(constants))
         return force.reshape(-1, 3)
 
     def stiffness(self, positions: ArrayLike, **constants: float) -> sp.csc_array:
@@ -320,7 +230,7 @@ class Body:
 
         See `energy` for the constants.
         """
-        x, theta = self._state(positions), self._elastic(constants)
+        x, theta = self._state(positions), self.elastic(constants)
         return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
 
     # Many states ----------------------------------------------------------------------------
@@ -414,7 +324,7 @@ class Body:
         """
         return {
             end - 1: np.repeat(mass / self.node_mass, 3)
-            for end, mass in zip(self._starts[1:], self._part_masses, strict=True)
+            for end, mass in zip(self.starts[1:], self._part_masses, strict=True)
         }
 
     def _drag(self, theta: Theta) -> Array:
@@ -494,7 +404,7 @@ class Body:
         vector, lower = element_destinations(self.pattern, cells)
         total, count = len(self.constants), len(cells)
         # γ_m comes after the constants of the points and needs no elements.
-        columns = self._starts[number] + np.arange(part.of_points)
+        columns = self.starts[number] + np.arange(part.of_points)
         by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
         square = (columns[:, None] + total * columns).ravel()
         whole = np.zeros((count, 1), dtype=np.int64)

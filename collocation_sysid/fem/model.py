@@ -1,0 +1,124 @@
+"""What θ holds: the constants that the parts of a body declare, and the names that give them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError, hint_at
+from .constants import Constant
+from .moduli import Source, elastic_names, source_of
+from .regions import Part
+
+Theta = Sequence[float] | Array
+
+
+class Model:
+    """A sum of terms, part by part.
+
+    Parameters
+    ----------
+    parts : tuple of Part
+
+    Attributes
+    ----------
+    constants : dict of name to Constant
+        What θ holds, in its order.
+    """
+
+    def __init__(self, parts: tuple[Part, ...]) -> None:
+        self.parts = parts
+        self.constants: dict[str, Constant] = {
+            part.full_name(c.name): c for part in parts for c in part.constants
+        }
+
+    def sources(self, known: Sequence[str]) -> list[Source]:
+        """For each part, which of the names that are known give its constants.
+
+        Raises
+        ------
+        InputError
+            If a constant is missing or given twice.
+        """
+        return [
+            source_of(
+                part.name, part.material, part.constants[len(part.material.constants) :], known
+            )
+            for part in self.parts
+        ]
+
+    def used_names(self, known: Sequence[str]) -> set[str]:
+        """Those of the names that are known which give its constants."""
+        return {name for source in self.sources(known) for name in source.names.values()}
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names that a parameter may have: constants, what may stand for them, and shared ones."""
+        names = []
+        for part in self.parts:
+            owns = [c.name for c in part.constants] + list(elastic_names(part.material))
+            names += [part.full_name(own) for own in owns] + owns
+        return tuple(dict.fromkeys(names))
+
+    def assembled(self, values: Mapping[str, Any]) -> list[Any]:
+        """θ from values by the user's names: numbers, or CasADi expressions.
+
+        Raises
+        ------
+        InputError
+            If a constant is missing or given twice.
+        """
+        theta = []
+        for part, source in zip(self.parts, self.sources(list(values)), strict=True):
+            found = source.constants(values)
+            theta += [found[c.name] for c in part.constants]
+        return theta
+
+    def theta(self, values: Mapping[str, float]) -> Array:
+        """(k,) constants from values by the user's names; values of other bodies do not matter.
+
+        Raises
+        ------
+        InputError
+            If one is missing or given twice.
+        """
+        return np.array([float(value) for value in self.assembled(values)])
+
+    def lame(self, theta: Theta) -> dict[str, tuple[float, float]]:
+        """Small-strain (λ, μ) [Pa] of each part by its name."""
+        found = {}
+        for part, mine in zip(self.parts, self.split(np.asarray(theta, dtype=float)), strict=True):
+            values = part.material.lame(mine[: len(part.material.constants)]).full().ravel()
+            found[part.name] = (float(values[0]), float(values[1]))
+        return found
+
+    def split(self, theta: Any) -> list[Any]:
+        """θ, numbers or a CasADi expression, part by part."""
+        return [theta[a:b] for a, b in pairwise(self.starts)]
+
+    @cached_property
+    def starts(self) -> list[int]:
+        """Where the constants of each part begin in θ, and where the last end."""
+        return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
+
+    def elastic(self, constants: Mapping[str, float]) -> Array:
+        """θ without damping.
+
+        Raises
+        ------
+        InputError
+            For a name that the model does not know, or one that is missing.
+        """
+        for name in constants:
+            if name not in self.parameter_names:
+                hint = hint_at(name, self.parameter_names)
+                raise InputError(
+                    f"no constant {name!r}; expected {', '.join(self.constants)}{hint}"
+                )
+        stored = {p.full_name(c.name) for p in self.parts for c in p.material.constants}
+        return self.theta({**dict.fromkeys(set(self.constants) - stored, 0.0), **constants})
