@@ -11,7 +11,7 @@ from scipy.linalg import block_diag, toeplitz
 
 from collocation_sysid.statistics.autocorrelation import error_processes
 from collocation_sysid.statistics.autocovariance import lagged_products
-from collocation_sysid.statistics.curvature import curvature
+from collocation_sysid.statistics.information import information
 from collocation_sysid.statistics.linearised import LinearisedFit
 
 LAG = 2
@@ -41,7 +41,7 @@ def dense(of: Problem, by_experiment: list[np.ndarray]) -> np.ndarray:
 def test_lags_explain_the_expected_products_of_residuals(name):
     of = PROBLEMS[name]
     fit = some_fit(of)
-    factored = curvature(fit)
+    factored = information(fit)
     lengths = [len(present) for present in of.present]
     found = lagged_products(fit, factored, [LAG] * len(lengths))
     true = [0.7**k * 0.9 ** np.arange(length) for k, length in enumerate(lengths)]
@@ -65,7 +65,7 @@ def test_the_size_of_errors_is_found_where_offsets_hide_their_mean():
     of, variances, lag1 = problem((60,), markers=4), [], []
     for seed in range(60):
         fit = some_fit(of, 0.85, seed)
-        (process,) = error_processes(fit, curvature(fit))
+        (process,) = error_processes(fit, information(fit))
         variances.append(np.diag(process.among_channels).mean())
         lag1.append(process.along_time[1])
     assert np.mean(variances) == pytest.approx(1.0, abs=4 * np.std(variances) / np.sqrt(60))
@@ -77,13 +77,13 @@ def test_error_bars_stay_sane_where_errors_hardly_forget():
     of = problem((60,), markers=4)
     for seed in range(20):
         fit = some_fit(of, 0.98, seed)
-        (process,) = error_processes(fit, curvature(fit))
+        (process,) = error_processes(fit, information(fit))
         assert process.degrees_of_freedom > 5
 
 
 def test_rounding_is_no_process():
     fit = some_fit(PROBLEMS["one"])
     silent = tuple(replace(block, residual=0 * block.residual) for block in fit.blocks)
-    (process,) = error_processes(replace(fit, blocks=silent), curvature(fit))
+    (process,) = error_processes(replace(fit, blocks=silent), information(fit))
     assert process.order == 0
     np.testing.assert_array_equal(process.among_channels, 0.0)

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
 from collocation_sysid.statistics.autocorrelation import dependence, error_processes
-from collocation_sysid.statistics.curvature import curvature
+from collocation_sysid.statistics.information import information
 from collocation_sysid.statistics.linearised import LinearisedFit
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
@@ -90,7 +90,7 @@ def test_intervals_rarely_change_for_white_errors():
 def test_the_test_for_persistence_knows_what_the_fit_took_out(name):
     scores = []
     for fit, _ in draws(PROBLEMS[name], 0.0):
-        found = dependence(fit, curvature(fit))
+        found = dependence(fit, information(fit))
         scores.append(found.lag1 / found.lag1_deviation)
     assert kstest(scores, "norm").pvalue > 1e-3
 
@@ -99,7 +99,7 @@ def test_autocorrelation_is_that_of_the_errors_not_of_the_residuals():
     of = PROBLEMS["one marker, 40 samples"]
     corrected, raw = [], []
     for fit, _ in draws(of, 0.85):
-        corrected.append(dependence(fit, curvature(fit)).lag1)
+        corrected.append(dependence(fit, information(fit)).lag1)
         residual = fit.blocks[0].channels[0]
         raw.append(np.sum(residual[1:] * residual[:-1]) / np.sum(residual**2))
     assert np.median(raw) < 0.75
@@ -113,7 +113,7 @@ def test_processes_of_the_errors_are_found():
     resonance = [1, -2 * 0.9 * np.cos(0.5), 0.81]
     first = 0.1 * lfilter([1], resonance, rng.normal(size=(700, 6)), axis=0)[300:] @ mix
     fit, _ = of.fit([first.reshape(400, 2, 3), autoregressive(rng, 300, 2, 0.0)], np.zeros(18))
-    resonant, white = error_processes(fit, curvature(fit))
+    resonant, white = error_processes(fit, information(fit))
     impulse = 0.1 * lfilter([1], resonance, np.eye(1, 500)[0])
     expected = np.correlate(impulse, impulse, "full")[499:]
     assert resonant.order >= 2
@@ -136,14 +136,14 @@ def sample(seed: int = 0, phi: float = 0.0, **options) -> tuple[LinearisedFit, n
     return of.fit(errors, np.zeros(len(of.names)))
 
 
-def information(fit: LinearisedFit) -> np.ndarray:
+def plain_information(fit: LinearisedFit) -> np.ndarray:
     rows = np.concatenate([b.slope.reshape(-1, len(fit.names)) for b in fit.blocks])
     return rows.T @ rows + np.diag(fit.prior_slope**2)
 
 
 def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_parameters():
     fit, wrong = sample()
-    full, k = information(fit), fit.shared
+    full, k = plain_information(fit), fit.shared
     schur = full[:k, :k] - full[:k, k:] @ np.linalg.solve(full[k:, k:], full[k:, :k])
     found = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
     scale = np.sqrt(np.diag(found.covariance))
@@ -161,7 +161,7 @@ def test_local_parameters_have_standard_deviations():
     fit, wrong = sample()
     found = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
     assert tuple(found.nuisance) == fit.names[4:]
-    expected = np.sqrt(np.diag(np.linalg.inv(information(fit))))[4:]
+    expected = np.sqrt(np.diag(np.linalg.inv(plain_information(fit))))[4:]
     np.testing.assert_allclose(list(found.nuisance.values()), expected, rtol=1e-6)
 
 
@@ -169,7 +169,7 @@ def test_a_local_parameter_at_its_bound_counts_as_fixed():
     fit, wrong = sample()
     bounded = replace(fit, at_bound=np.arange(len(fit.names)) == 4)
     found = uncertainty_of(bounded, PARAMETERS, wrong[:4], errors="independent")
-    kept = np.delete(np.delete(information(fit), 4, 0), 4, 1)
+    kept = np.delete(np.delete(plain_information(fit), 4, 0), 4, 1)
     expected = np.linalg.inv(kept)[:4, :4]
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-6)
     assert np.isnan(found.nuisance[fit.names[4]])
@@ -203,7 +203,9 @@ def test_persistent_errors_far_below_the_sigma_given_change_nothing():
     small = replace(fit, blocks=tuple(replace(b, residual=0.01 * b.residual) for b in fit.blocks))
     found = uncertainty_of(small, PARAMETERS, wrong[:4])
     assert found.errors == "independent"
-    np.testing.assert_allclose(found.covariance, np.linalg.inv(information(fit))[:4, :4], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.covariance, np.linalg.inv(plain_information(fit))[:4, :4], rtol=1e-6
+    )
 
 
 def test_error_bars_never_fall_below_those_of_the_sigma_given():

@@ -73,13 +73,11 @@ class Unconstrained:
         if not np.isfinite(z).all():
             return False
         with self.stopwatch.evaluating():
-            return all(
-                part.segment.body.volume_ratios(
-                    part.segment.dynamics.evaluation_states(part.x)[0]
-                ).min()
-                > 0
-                for part in self.nlp.parts(z)
-            )
+            for part in self.nlp.parts(z):
+                states, _ = part.segment.dynamics.evaluation_states(part.x)
+                if not part.segment.body.volume_ratios(states).min() > 0:
+                    return False
+        return True
 
     def projected(self, z: Array, slope: Array) -> Array:
         """A gradient without what is given, or pushes against a bound."""
@@ -101,12 +99,8 @@ class Unconstrained:
         """Multipliers of the given collocation's rows from those of all rows."""
         if self.nlp is self.given:
             return explicit
-        return np.concatenate(
-            [
-                explicit[s.rows].reshape(-1, s.dofs)[:, s.free_dofs].ravel()
-                for s in self.nlp.segments
-            ]
-        )
+        rows = ((s, explicit[s.rows].reshape(-1, s.dofs)) for s in self.nlp.segments)
+        return np.concatenate([each[:, segment.free_dofs].ravel() for segment, each in rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,20 +135,12 @@ class Collocation:
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
         """One of each experiment that is fitted."""
+        options = (self.parameters, self.scheme, self.substeps, self.explicit_grasps, self.huber)
         found, first = [], First(self.nq, self.nq, 0)
         for experiment in self.experiments:
             if not experiment.validation:
-                segment = Segment(
-                    experiment,
-                    self.parameters,
-                    self.scheme,
-                    self.substeps,
-                    self.explicit_grasps,
-                    self.huber,
-                    first,
-                )
-                found.append(segment)
-                first = segment.after
+                found.append(Segment(experiment, *options, first))
+                first = found[-1].after
         return tuple(found)
 
     @property

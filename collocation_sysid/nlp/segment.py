@@ -188,8 +188,13 @@ class Segment:
     @cached_property
     def force_n(self) -> float:
         """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
+        dynamics, diagonal, at_rest = self.dynamics, self.body.pattern.diagonal, self.body.nodes_m
         theta = self.constants.theta(self.parameters.guess_q)
-        return self.length_m * self._typical_stiffness(theta)
+        forces = self.body.linearise(at_rest[None], np.zeros_like(at_rest)[None], theta)
+        ((_, a, b),) = dynamics.block_terms(0)
+        value = a[-1] * forces.by_position[0, diagonal] + b[-1] * forces.by_velocity[0, diagonal]
+        value += dynamics.inertia_coefficient(0)[-1] * dynamics.mass_kg[-1]
+        return self.length_m * float(np.abs(value[self.free_dofs]).mean())
 
     def start_positions(self) -> Array | None:
         """(3n,) the given x_0, or None when it is found as an equilibrium."""
@@ -491,19 +496,6 @@ class Segment:
     def _row_starts(self) -> Index:
         starts = (np.arange(self.grid_rows) - self.dynamics.first_row) * self.rows_per_time
         return np.maximum(starts, -1) if self.dynamics.first_row else starts
-
-    def _typical_stiffness(self, theta: Array) -> float:
-        """Mean of |∂c_t/∂x_t| on the diagonal, at the undeformed shape [N/m]."""
-        at_rest = self.body.nodes_m[None]
-        forces = self.body.linearise(at_rest, np.zeros_like(at_rest), theta)
-        row = self.grid_rows - 1
-        diagonal = self.body.pattern.diagonal
-        value = self.dynamics.inertia_coefficient(0)[row] * self.dynamics.mass_kg[row]
-        for j, a, b in self.dynamics.block_terms(0):
-            if j == 0:
-                value = value + a[row] * forces.by_position[0, diagonal]
-                value = value + b[row] * forces.by_velocity[0, diagonal]
-        return float(np.abs(value[self.free_dofs]).mean())
 
 
 def _ahead(values: Array, steps: int) -> Array:

@@ -111,7 +111,6 @@ class BlockSolver:
         self.segment = segment
         self.body = segment.body
         self.free = segment.free_dofs
-        self._taken = self.dynamics.taken[:, self.free]
         self.factoriser = Factoriser.of(self.body.pattern, self.free, factorisation)
         full_rows, full_columns, source = self.body.pattern.full
         place = np.full(self.body.pattern.size, -1)
@@ -218,7 +217,7 @@ class BlockSolver:
 
     def without_taken(self, t: int, rows: Array) -> Array:
         """Rows (free, …) with zeros at what a passing grasp holds at t, in place."""
-        rows[self._taken[t]] = 0
+        rows[self.dynamics.taken[t, self.free]] = 0
         return rows
 
     @property

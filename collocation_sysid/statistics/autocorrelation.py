@@ -26,7 +26,7 @@ from scipy.stats import chi2, norm
 
 from ..arrays import Array
 from .autocovariance import along_time, autocorrelation, autoregression, lagged_products
-from .curvature import Curvature
+from .information import Information
 from .linearised import FitBlock, LinearisedFit
 
 MAX_ORDER = 4
@@ -101,11 +101,11 @@ class ErrorProcess:
     degrees_of_freedom: float
 
 
-def dependence(fit: LinearisedFit, curvature: Curvature) -> Dependence:
+def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     """Test the residuals for correlation, in time and among channels."""
     if fit.chi_squared <= ROUNDING**2 * fit.measurements:
         return Dependence(0.0, np.inf, 1.0)
-    found = lagged_products(fit, curvature, [1] * len(fit.blocks))
+    found = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
     products, expected = pool @ found.products, pool @ found.expected @ pool.T
@@ -133,23 +133,23 @@ def _shared_p(fit: LinearisedFit) -> float:
     return float(chi2.sf(statistic, pairs)) if pairs else 1.0
 
 
-def error_processes(fit: LinearisedFit, curvature: Curvature) -> tuple[ErrorProcess, ...]:
+def error_processes(fit: LinearisedFit, information: Information) -> tuple[ErrorProcess, ...]:
     """The error process of each experiment."""
     orders = [min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER) for block in fit.blocks]
-    moments = lagged_products(fit, curvature, [max(1, order) for order in orders])
+    moments = lagged_products(fit, information, [max(1, order) for order in orders])
     found = moments.autocovariances()
     for _ in range(ROUNDS):
         tails = [
             _tail(block, gamma, order)
             for block, gamma, order in zip(fit.blocks, found, orders, strict=True)
         ]
-        before, found = found, moments.autocovariances(moments.beyond(fit, curvature, tails))
+        before, found = found, moments.autocovariances(moments.beyond(fit, information, tails))
         if np.allclose(np.concatenate(found), np.concatenate(before), rtol=SETTLED, atol=0):
             break
     return tuple(
         _error_process(block, slope, gamma[: order + 1])
         for block, slope, gamma, order in zip(
-            fit.blocks, curvature.slopes, found, orders, strict=True
+            fit.blocks, information.slopes, found, orders, strict=True
         )
     )
 
@@ -208,16 +208,16 @@ def _effective_channels(covariance: Array) -> float:
 
 
 def score_covariance(
-    curvature: Curvature, processes: tuple[ErrorProcess, ...], shared: int
+    information: Information, processes: tuple[ErrorProcess, ...], shared: int
 ) -> tuple[Array, Array]:
     """LᵀB L (r, r), and the degrees of freedom of the shared parameters' variances (shared,).
 
     The latter after Satterthwaite (1946), with a Wishart matrix for Σ; priors are exact.
     """
-    directions = curvature.root[:shared].T
-    total = curvature.prior.copy()
+    directions = information.root[:shared].T
+    total = information.prior.copy()
     doubt = np.zeros(directions.shape[1])
-    for slope, process in zip(curvature.slopes, processes, strict=True):
+    for slope, process in zip(information.slopes, processes, strict=True):
         width = slope.shape[2]
         smoothed = along_time(process.along_time, slope)
         mixed = np.einsum("cd,tdr->tcr", process.among_channels, smoothed)

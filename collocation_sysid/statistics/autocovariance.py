@@ -1,6 +1,6 @@
 """Autocovariances of a fit's errors, found from the lagged products of its residuals.
 
-The residuals are r = M e, M = I − S A⁻¹ Sᵀ = I − D Dᵀ (see `curvature`): smaller than the errors
+The residuals are r = M e, M = I − S A⁻¹ Sᵀ = I − D Dᵀ (see `information`): smaller than the errors
 e and less persistent. Their lagged products r D_k r have the expectations Σ_l γ_l tr(D_k M D_l M),
 linear in the autocovariances γ (Worsley et al. 2002, "A general statistical analysis for fMRI
 data", NeuroImage 15, there for one series), with D_k the matrix that has ones on both k-th
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
 
 from ..arrays import Array
-from .curvature import Curvature
+from .information import Information
 from .linearised import LinearisedFit
 
 Mask = NDArray[np.bool_]
@@ -55,7 +55,7 @@ class LaggedProducts:
         found = np.linalg.lstsq(self.expected, self.products - beyond)[0]
         return self.split(found.astype(np.float64))
 
-    def beyond(self, fit: LinearisedFit, curvature: Curvature, tails: Sequence[Array]) -> Array:
+    def beyond(self, fit: LinearisedFit, information: Information, tails: Sequence[Array]) -> Array:
         """(K,) what autocovariances of the lags beyond, (T,) each, put into the products.
 
         tr(D_k M C M) with their Toeplitz matrix C, whose k-th diagonals are zero.
@@ -64,7 +64,7 @@ class LaggedProducts:
             return np.zeros_like(self.products)
         overlap, total = [], np.zeros(self.shifted.shape[1:])
         for block, slope, last, tail in zip(
-            fit.blocks, curvature.slopes, self.lags, tails, strict=True
+            fit.blocks, information.slopes, self.lags, tails, strict=True
         ):
             smoothed = along_time(tail, slope) * block.channels[2][:, :, None]
             total += np.einsum("tcr,tcs->rs", slope, smoothed, optimize=True)
@@ -78,11 +78,11 @@ class LaggedProducts:
 
 
 def lagged_products(
-    fit: LinearisedFit, curvature: Curvature, lags: Sequence[int]
+    fit: LinearisedFit, information: Information, lags: Sequence[int]
 ) -> LaggedProducts:
     """The products of each experiment's residuals up to a lag, and what they are expected to be."""
     products, shifted, own, overlaps = [], [], [], []
-    for block, slope, last in zip(fit.blocks, curvature.slopes, lags, strict=True):
+    for block, slope, last in zip(fit.blocks, information.slopes, lags, strict=True):
         residual, _, present = block.channels
         width = slope.shape[2]
         here = np.zeros((last + 1, width, width))

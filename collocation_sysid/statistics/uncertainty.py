@@ -1,4 +1,4 @@
-"""Error bars of the estimated parameters, from the curvature of the fit and from its residuals.
+"""Error bars of the estimated parameters, from the information of the fit and from its residuals.
 
 With S the slopes of the residuals (h(x) − ŷ)/σ along the equations of motion and P those of the
 priors, the estimate errs by A⁻¹ Sᵀe, A = SᵀS + PᵀP, and has the covariance
@@ -28,7 +28,6 @@ from ..nlp.collocation import Collocation
 from ..nlp.lapack import one_blas_thread
 from ..nlp.parameters import Parameters
 from .autocorrelation import Dependence, dependence, error_processes, score_covariance
-from .curvature import Curvature, curvature
 from .estimates import (
     UNDETERMINED,
     Estimate,
@@ -37,6 +36,7 @@ from .estimates import (
     relative_slopes,
     user_estimates,
 )
+from .information import Information, information
 from .linearised import AT_BOUND, LinearisedFit, linearised_fit
 from .sensitivity import marker_sensitivities, sensitivities
 
@@ -170,7 +170,7 @@ def uncertainty_of(
         If the noise is to be estimated from fewer measurements than parameters.
     """
     _check(noise, errors)
-    factored = curvature(fit)
+    factored = information(fit)
     freedom = fit.measurements - round(factored.fitted, 9)
     if noise == "estimated" and freedom < 1:
         raise InputError(
@@ -225,7 +225,7 @@ def _check(noise: str, errors: str) -> None:
 
 
 def _independent(
-    fit: LinearisedFit, factored: Curvature, noise: Noise, reduced: float, freedom: float
+    fit: LinearisedFit, factored: Information, noise: Noise, reduced: float, freedom: float
 ) -> tuple[Array, Array]:
     """Covariance of all parameters, and the quantiles of the shared ones."""
     identity = np.eye(len(factored.prior))
@@ -235,7 +235,7 @@ def _independent(
     return factored.covariance(of_score), np.full(fit.shared, t.ppf(0.975, freedom))
 
 
-def _autocorrelated(fit: LinearisedFit, factored: Curvature, noise: Noise) -> tuple[Array, Array]:
+def _autocorrelated(fit: LinearisedFit, factored: Information, noise: Noise) -> tuple[Array, Array]:
     of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared)
     if noise == "given":  # in no direction less than independent errors of the σ given bring
         values, vectors = np.linalg.eigh(of_score)

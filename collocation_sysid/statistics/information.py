@@ -1,4 +1,4 @@
-"""The curvature of the fit, factored, in coordinates where the statistics are simple.
+"""The information of the fit, factored, in coordinates where the statistics are simple.
 
 With S the slopes of all residuals and P the priors' slopes, the information is A = SᵀS + PᵀP.
 The root L with A⁻¹ = L Lᵀ turns S into D = S L, for which DᵀD + LᵀPᵀP L = I: a covariance B of
@@ -24,7 +24,7 @@ NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Curvature:
+class Information:
     """A⁻¹ = L Lᵀ of the parameters within their bounds, in the r directions that are determined.
 
     Attributes
@@ -55,23 +55,23 @@ class Curvature:
         return found
 
 
-def curvature(fit: LinearisedFit) -> Curvature:
+def information(fit: LinearisedFit) -> Information:
     """Factor the information of a fit; parameters at a bound count as fixed."""
     free = np.flatnonzero(~fit.at_bound)
     slopes = [block.channels[1][..., free] for block in fit.blocks]
-    information = np.diag(fit.prior_slope[free] ** 2)
+    matrix = np.diag(fit.prior_slope[free] ** 2)
     for slope in slopes:
         rows = slope.reshape(slope.shape[0] * slope.shape[1], len(free))
-        information = information + rows.T @ rows
-    units = np.sqrt(np.diag(information))
+        matrix = matrix + rows.T @ rows
+    units = np.sqrt(np.diag(matrix))
     units[units == 0] = 1.0
-    values, vectors = np.linalg.eigh(information / np.outer(units, units))
+    values, vectors = np.linalg.eigh(matrix / np.outer(units, units))
     known = values > SINGULAR
     root = np.zeros((len(fit.names), int(known.sum())))
     root[free] = vectors[:, known] / np.sqrt(values[known]) / units[:, None]
     undetermined = np.zeros(len(fit.names), dtype=bool)
     undetermined[free] = (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
     prior = root * fit.prior_slope[:, None]
-    return Curvature(
+    return Information(
         root, tuple(slope @ root[free] for slope in slopes), prior.T @ prior, undetermined
     )
