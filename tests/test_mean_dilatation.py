@@ -23,7 +23,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.reduced_space import solve as reduced_space
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import simulate, with_markers
@@ -343,7 +343,7 @@ def bar() -> Experiment:
 
 
 def test_reduced_space_finds_the_truth():
-    found = reduced_space(Collocation([bar()], GUESS)).parameters
+    found = ReducedSpace()(Collocation([bar()], GUESS)).parameters
     for name, value in TRUTH.items():
         assert found[name] == pytest.approx(value, rel=1e-6)
 
@@ -351,7 +351,7 @@ def test_reduced_space_finds_the_truth():
 def test_with_noise_it_finds_an_optimum_of_the_whole_program(rng):
     tracks = bar().markers.positions_m
     noisy = with_markers(bar(), tracks + 1e-4 * rng.standard_normal(tracks.shape))
-    solution = reduced_space(Collocation([noisy], GUESS))
+    solution = ReducedSpace()(Collocation([noisy], GUESS))
     assert solution.status.converged
     assert solution.kkt_residual < 1e-8
     assert solution.parameters["young_pa"] != pytest.approx(TRUTH["young_pa"], rel=1e-5)

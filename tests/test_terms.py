@@ -163,8 +163,8 @@ def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypa
             return do(matrix, count, threads)
 
         object.__setattr__(solver.factoriser, "factorise_each", counted)
-        setting = collocation.settings(collocation.parameters_of(z))[0]
-        tangent = solver.forward(collocation.unpack(z)[1][0], setting)
+        (part,) = collocation.parts(z)
+        tangent = solver.forward(part.x, part.setting)
         assert tangent.by_p.shape[2] == len(names)
         counts.append(sum(factorised))
     assert counts[0] == counts[1] == segment.constraint_times
