@@ -338,7 +338,7 @@ def bar() -> Experiment:
     gently = smooth_poses(t_s, (0.004, 0.002, -0.003), (0.04, -0.03, 0.06))
     grasp = Grasp(nodes_where(body, 0, 0.0), gently)
     markers = point_markers(body, body.nodes_m[-5:], t_s)
-    unseen = Experiment("bar", body, t_s, (grasp,), markers, np.array([0.0, 0.0, -9.81]))
+    unseen = Experiment(body, t_s, (grasp,), markers)
     return with_markers(unseen, simulate(unseen, TRUTH, "midpoint").markers_m)
 
 
