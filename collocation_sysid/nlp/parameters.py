@@ -403,6 +403,9 @@ def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str,
         young, poisson = engineering(lame[0], lame[1])
         moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
         by_young = "young_pa" in source.names
+        shares_all = all("." not in name for name in source.names.values())
+        if found and shares_all:
+            continue  # it has the moduli of the rest
         for own, value in moduli.items():
             if own not in source.names and (own in ENGINEERING or by_young):
                 found[part.full_name(own)] = value

@@ -63,10 +63,11 @@ def mesh_picture(
     room = COLUMN_MM - 2 * margin
     width = (room - GAP_MM) / 2 if beside else room
     height = min(width / aspect, TALLEST_MM / (1 if beside else 2))
-    total = HEAD_MM + FOOT_MM + (height if beside else 2 * height + GAP_MM)
+    head = HEAD_MM + (LINE_MM if len(part_names) > 1 else 0.0)
+    total = head + FOOT_MM + (height if beside else 2 * height + GAP_MM)
     figure, axes = sheet(COLUMN_MM, total)
     corners = (
-        (margin, total - HEAD_MM - height),
+        (margin, total - head - height),
         (margin + width + GAP_MM, FOOT_MM) if beside else (margin, FOOT_MM),
     )
     first = _seen_first(front, behind, places_m, nodes_m, surface)
@@ -85,10 +86,10 @@ def mesh_picture(
     draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
     entries = ["grasped"] if held.any() else []
     entries += ["markers", "behind the body"] if len(names) else []
-    handles = key(*entries)
+    draw_key(axes, key(*entries), (1.0, total - 1.5))
     if len(part_names) > 1:
-        handles += [skin_key(k, name or "rest") for k, name in enumerate(part_names)]
-    draw_key(axes, handles, (1.0, total - 1.5))
+        skins = [skin_key(k, name or "rest") for k, name in enumerate(part_names)]
+        draw_key(axes, skins, (1.0, total - 1.5 - LINE_MM))
     return figure
 
 

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
@@ -180,8 +181,11 @@ def skin_key(part: int, name: str) -> Line2D:
 
 def draw_key(axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike) -> None:
     """One line of legend whose upper left corner is at `corner_mm`."""
-    axes.legend(
-        handles=entries, loc="upper left", bbox_to_anchor=tuple(np.asarray(corner_mm)),
+    names = [str(entry.get_label()) for entry in entries]
+    place: Any = tuple(np.asarray(corner_mm))
+    box = Legend(
+        axes, list(entries), names, loc="upper left", bbox_to_anchor=place,
         bbox_transform=axes.transData, ncols=len(entries), fontsize=SMALL_PT, frameon=False,
         handletextpad=0.0, columnspacing=0.8, borderaxespad=0.0, borderpad=0.0,
     )  # fmt: skip
+    axes.add_artist(box)
