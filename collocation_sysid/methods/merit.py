@@ -40,9 +40,8 @@ class Unconstrained:
         self.given = collocation
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
-            self.nlp = collocation
-            if not collocation.explicit_grasps:
-                self.nlp = replace(collocation, explicit_grasps=True)
+            explicit = collocation.explicit_grasps
+            self.nlp = collocation if explicit else replace(collocation, explicit_grasps=True)
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraints, self.nlp.variables)
             self._entries = np.zeros(len(indices))

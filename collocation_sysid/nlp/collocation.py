@@ -348,7 +348,6 @@ class Collocation:
         self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
     ) -> Array:
         """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
-        q = z[: self.nq]
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
         used = self.nq * (self.nq + 1) // 2
         phi = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
@@ -364,7 +363,7 @@ class Collocation:
             if of_phi:
                 values[used : used + of_x], values[phi : phi + of_phi] = here[:of_x], here[of_x:]
             used, phi = used + of_x, phi + of_phi
-        _, slopes = self.parameters.prior(q)
+        _, slopes = self.parameters.prior(z[: self.nq])
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
         order = np.lexsort((rows, columns))

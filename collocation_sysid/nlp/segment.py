@@ -192,8 +192,9 @@ class Segment:
         theta = self.constants.theta(self.parameters.guess_q)
         forces = self.body.linearise(at_rest[None], np.zeros_like(at_rest)[None], theta)
         ((_, a, b),) = dynamics.block_terms(0)
-        value = a[-1] * forces.by_position[0, diagonal] + b[-1] * forces.by_velocity[0, diagonal]
-        value += dynamics.inertia_coefficient(0)[-1] * dynamics.mass_kg[-1]
+        value = dynamics.inertia_coefficient(0)[-1] * dynamics.mass_kg[-1]
+        value = value + a[-1] * forces.by_position[0, diagonal]
+        value += b[-1] * forces.by_velocity[0, diagonal]
         return self.length_m * float(np.abs(value[self.free_dofs]).mean())
 
     def start_positions(self) -> Array | None:

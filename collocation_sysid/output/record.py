@@ -68,15 +68,14 @@ def _write_pictures(finished: Run, seen: Sequence[Replay], place: Path) -> None:
 
 def _write_all_frames(solution: Solution, place: Path) -> None:
     collocation = solution.collocation
-    segments = collocation.segments
-    for segment, positions, violations in zip(
-        segments, solution.positions_m, collocation.violations_n(solution.z), strict=True
-    ):
-        here = place if len(segments) == 1 else place / segment.experiment.name
+    for part in collocation.parts(solution.z):
+        segment, positions = part.segment, part.x.reshape(len(part.x), -1, 3)
+        alone = len(collocation.segments) == 1
+        here = place if alone else place / segment.experiment.name
         here.mkdir(exist_ok=True)
         body = segment.body
         residual = np.zeros((len(positions), segment.dofs))
-        residual[:, segment.free_dofs] = violations
+        residual[:, segment.free_dofs] = part.residual_n
         write_frames(
             here,
             segment.dynamics.t_s,

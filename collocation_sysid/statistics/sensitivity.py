@@ -6,14 +6,11 @@ shared parameters q and those φ of an experiment that move its body, see `Segme
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from ..arrays import Array
 from ..nlp.collocation import Collocation
 from ..nlp.lapack import one_blas_thread
-from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 
 
@@ -27,7 +24,10 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     SimulationError
         Where the equations of a step are singular.
     """
-    return [np.stack(list(rows)) for _, rows in _by_experiment(collocation, z)]
+    return [
+        np.stack(list(BlockSolver(part.segment).sensitivities(part.x, part.setting)))
+        for part in collocation.parts(z)
+    ]
 
 
 @one_blas_thread()
@@ -43,13 +43,9 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
         Where the equations of a step are singular.
     """
     found = []
-    for segment, rows in _by_experiment(collocation, z):
-        sampled = set(segment.observation.grid_rows.tolist())
-        operator = segment.experiment.markers.operator
+    for part in collocation.parts(z):
+        rows = BlockSolver(part.segment).sensitivities(part.x, part.setting)
+        sampled = set(part.segment.observation.grid_rows.tolist())
+        operator = part.segment.experiment.markers.operator
         found.append(np.stack([operator @ row for t, row in enumerate(rows) if t in sampled]))
     return found
-
-
-def _by_experiment(collocation: Collocation, z: Array) -> Iterator[tuple[Segment, Iterator[Array]]]:
-    for part in collocation.parts(z):
-        yield part.segment, BlockSolver(part.segment).sensitivities(part.x, part.setting)
