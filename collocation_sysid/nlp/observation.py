@@ -119,7 +119,7 @@ class Observation:
         )
 
     def _reading(self, nodes: ca.SX, phi: ca.SX, place: ca.SX) -> ca.SX:
-        """Y of one sample."""
+        """The reading y of one sample."""
         scale = self.nuisance.scales[self._phi_places[0]]
         kinds = [self.nuisance.kinds[i] for i in self._phi_places[0]]
 
@@ -276,7 +276,7 @@ class Observation:
 
     @cached_property
     def _operator(self) -> sp.csr_array:
-        """U from (x, φ) stacked: rows by sample, marker, and entry of u; x by row and dof."""
+        """From (x, φ) to u, stacked: rows by sample, marker, and entry of u; x by row and dof."""
         dofs = 3 * self.markers.placement.node_count
         columns = (self.grid_rows[-1] + 1) * dofs
         markers, entries = len(self.markers.names), 3 * self._neighbours + self._phi_places.shape[1]
