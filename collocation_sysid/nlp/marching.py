@@ -13,6 +13,7 @@ from .dynamics import Dynamics
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
+from .row import Row
 from .stopwatch import Stopwatch
 
 Progress = Callable[[float], None]
@@ -83,7 +84,7 @@ def march_on(
         forces[first:done] = internal + dynamics.external_force_n[first:done]
     dynamics.without_taken(forces)
     for t in range(done, dynamics.rows):
-        row = _Row(dynamics, theta, x, forces, t)
+        row = _Step(dynamics, theta, x, forces, t)
         solver = solvers.holding(held[t])
         guess = _predicted(x[:t], dynamics.step_s * v0)
         goal = held_positions[t].ravel()[solver.held]
@@ -106,23 +107,20 @@ def _predicted(x: Array, first_step: Array) -> Array:
     return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
 
 
-class _Row:
+class _Step:
     """Row t of the discrete equations as a function of x_t alone."""
 
     def __init__(self, dynamics: Dynamics, theta: Array, x: Array, forces: Array, t: int) -> None:
-        self.dynamics, self.theta = dynamics, theta
-        table, step = dynamics.tables, dynamics.step_s
-        self.mass, self.damped = dynamics.mass_kg[t], dynamics.weighed_kg[t]
-        self.load = dynamics.external_force_n[t]
-        past = range(1, min(dynamics.reach, t) + 1)
-        zero = np.zeros(x.shape[1])
-        self.p, self.q = table.p[t, 0], table.q[t, 0] / step
-        self.w, self.s = table.w[t, 0], table.s[t, 0] / step**2
-        self.xi = sum((table.p[t, i] * x[t - i] for i in past), zero)
-        self.nu = sum((table.q[t, i] * x[t - i] for i in past), zero) / step
-        self.known = sum((table.w[t, j] * forces[t - j] for j in past), zero)
-        self.known -= self.mass * sum((table.s[t, i] * x[t - i] for i in past), zero) / step**2
-        self.known -= self.mass * table.r[t] * dynamics.start_velocity_m_s / step
+        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t)
+        row, damped = self.row, dynamics.weighed_kg[t]
+        self.damped, self.load = damped, dynamics.external_force_n[t]
+        first, shape = max(0, t - dynamics.reach), x.shape[1:]
+        past, past_forces = x[first:t][::-1], forces[first:t][::-1]
+        self.xi = row.weighted(row.p, past, shape)
+        self.nu = row.weighted(row.q, past, shape)
+        self.known = row.weighted(row.w, past_forces, shape)
+        self.known -= row.mass_kg * row.weighted(row.s, past, shape)
+        self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def force(self, x: Array) -> Array:
         """F_t."""
@@ -130,23 +128,25 @@ class _Row:
         return body.force(*states, self.theta, self.damped)[0] + self.load
 
     def _states(self, x: Array) -> tuple[Array, Array]:
-        return (self.xi + self.p * x)[None], (self.nu + self.q * x)[None]
+        return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
+
+    def _balanced(self, force: Array, x: Array) -> Array:
+        row = self.row
+        return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual(self, x: Array) -> Array:
         """c_t."""
-        return self.w * self.force(x) + self.known - self.s * self.mass * x
+        return self._balanced(self.force(x), x)
 
     def linearise(self, x: Array) -> tuple[Array, Array]:
         """c_t and the lower triangle of −∂c_t/∂x_t."""
         body = self.dynamics.body
         at = body.linearise(*self._states(x), self.theta, dof_mass=self.damped)
-        matrix = -self.w * (self.p * at.by_position[0] + self.q * at.by_velocity[0])
-        matrix[body.pattern.diagonal] += self.s * self.mass
-        force = at.force[0] + self.load
-        return self.w * force + self.known - self.s * self.mass * x, matrix
+        matrix = self.row.block(at.by_position[0], at.by_velocity[0], body.pattern)
+        return self._balanced(at.force[0] + self.load, x), matrix
 
 
-def _solve_row(solver: Solver, row: _Row, guess: Array, previous: Array, held: Array) -> Array:
+def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: Array) -> Array:
     """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way."""
     try:
         start = guess.copy()

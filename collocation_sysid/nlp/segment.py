@@ -25,6 +25,7 @@ from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
+from .row import Row
 from .schemes import Scheme
 from .setting import Setting
 
@@ -188,14 +189,13 @@ class Segment:
     @cached_property
     def force_n(self) -> float:
         """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
-        dynamics, diagonal, at_rest = self.dynamics, self.body.pattern.diagonal, self.body.nodes_m
+        dynamics, at_rest = self.dynamics, self.body.nodes_m
         theta = self.constants.theta(self.parameters.guess_q)
         forces = self.body.linearise(at_rest[None], np.zeros_like(at_rest)[None], theta)
-        ((_, a, b),) = dynamics.block_terms(0)
-        value = dynamics.inertia_coefficient(0)[-1] * dynamics.mass_kg[-1]
-        value = value + a[-1] * forces.by_position[0, diagonal]
-        value += b[-1] * forces.by_velocity[0, diagonal]
-        return self.length_m * float(np.abs(value[self.free_dofs]).mean())
+        last, pattern = Row.of(dynamics, dynamics.rows - 1), self.body.pattern
+        block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
+        stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
+        return self.length_m * float(stiffness)
 
     def start_positions(self) -> Array | None:
         """(3n,) the given x_0, or None when it is found as an equilibrium."""

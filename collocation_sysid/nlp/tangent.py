@@ -27,6 +27,7 @@ from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
+from .row import Row
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
@@ -181,7 +182,7 @@ class BlockSolver:
         Dofs that a passing grasp holds have zeros.
         """
         dynamics, reach = self.dynamics, self.dynamics.reach
-        tables, step_s = dynamics.tables, dynamics.step_s
+        rows = [Row.of(dynamics, t) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
         for step in self._steps(x, theta, backward=True):
@@ -192,11 +193,12 @@ class BlockSolver:
             known = self.without_taken(
                 t,
                 sum(
-                    (tables.w[t + j, j] * y[t + j] for j in later if tables.w[t + j, j]),
+                    (rows[t + j].w[j] * y[t + j] for j in later if rows[t + j].w[j]),
                     np.zeros(len(self.free)),
                 ),
             )
-            p, q, w = tables.p[t], tables.q[t] / step_s, tables.w[t, 0]
+            row = rows[t]
+            p, q, w = row.p, row.q, row.w[0]
             by_position, by_velocity = None, None
             if known.any():
                 by_position = self.apply(step.by_position, known)
@@ -210,7 +212,7 @@ class BlockSolver:
             for i in lags:
                 if i > 0:
                     pulled[t - i] -= p[i] * by_position + q[i] * by_velocity
-                    pulled[t - i] += tables.s[t, i] / step_s**2 * mass * y[t]
+                    pulled[t - i] += row.s[i] * mass * y[t]
         full = np.zeros_like(x)
         full[:, self.free] = y
         return full
@@ -266,17 +268,11 @@ class BlockSolver:
                 )
 
     def _factorise(self, at: Linearisation, rows: slice) -> list[Factor]:
-        tables, step_s = self.dynamics.tables, self.dynamics.step_s
-        p = tables.w[rows, 0] * tables.p[rows, 0]
-        q = tables.w[rows, 0] * tables.q[rows, 0] / step_s
-        s = tables.s[rows, 0] / step_s**2
-        pattern, mass = self.body.pattern, self.dynamics.mass_kg[rows]
-        taken = self.dynamics.taken[rows]
+        pattern, taken = self.body.pattern, self.dynamics.taken[rows]
 
         def matrix(k: int) -> Array:
-            values = -p[k] * at.by_position[k]
-            values -= q[k] * at.by_velocity[k]
-            values[pattern.diagonal] += s[k] * mass[k]
+            row = Row.of(self.dynamics, rows.start + k)
+            values = row.block(at.by_position[k], at.by_velocity[k], pattern)
             if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
                 values[taken[k][pattern.rows] | taken[k][pattern.columns]] = 0
@@ -284,7 +280,7 @@ class BlockSolver:
             return values
 
         try:
-            return self.factoriser.factorise_each(matrix, len(p), self.body.threads)
+            return self.factoriser.factorise_each(matrix, len(at.force), self.body.threads)
         except np.linalg.LinAlgError as error:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
@@ -306,8 +302,6 @@ class _Forward:
         self.solver = solver
         self.setting = setting
         self.shape = shape
-        self.tables = solver.dynamics.tables
-        self.step_s = solver.dynamics.step_s
         reach = solver.dynamics.reach
         nothing = (np.zeros(shape),) * reach
         memory = memory or Memory(nothing, nothing, (np.zeros(len(solver.free)),) * reach)
@@ -324,12 +318,12 @@ class _Forward:
 
     def residual(self, step: _Step, inertia: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
-        solver, w = self.solver, self.tables.w[step.t]
+        solver, row = self.solver, Row.of(self.solver.dynamics, step.t)
         force = (step.force + self.setting.dynamics.external_force_n[step.t])[solver.free]
         solver.without_taken(step.t, force)
-        total = w[0] * force - inertia[solver.free]
+        total = row.w[0] * force - inertia[solver.free]
         if self.weighs_past:
-            total += weighted(w[1:], self.past_forces, force.shape)
+            total += row.weighted(row.w, self.past_forces, force.shape)
             self.past_forces.appendleft(force)
         return solver.without_taken(step.t, total)
 
@@ -340,12 +334,12 @@ class _Forward:
 
     def advance(self, step: _Step, right: Array, force: Array) -> Array:
         """Y_t from R_t and F_R, each (free, columns)."""
-        tables, t, solver = self.tables, step.t, self.solver
-        w, s = tables.w[t], tables.s[t] / self.step_s**2
-        mass = solver.dynamics.mass_kg[t, solver.free, None]
-        right += weighted(w[1:], self.past_increments, self.shape)
-        right -= mass * weighted(s[1:], self.past, self.shape)
-        force += self._of_past(step, tables.p[t, 1:], tables.q[t, 1:] / self.step_s)
+        t, solver = step.t, self.solver
+        row = Row.of(solver.dynamics, t)
+        w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
+        right += row.weighted(w, self.past_increments, self.shape)
+        right -= mass * row.weighted(s, self.past, self.shape)
+        force += self._of_past(step, row)
         solver.without_taken(t, right)
         solver.without_taken(t, force)
         solution = step.factor.solve(right + w[0] * force)
@@ -354,8 +348,9 @@ class _Forward:
         self.past.appendleft(solution)
         return solution
 
-    def _of_past(self, step: _Step, p: Array, q: Array) -> Array:
+    def _of_past(self, step: _Step, row: Row) -> Array:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
+        p, q = row.p[1:], row.q[1:]
         lags = np.flatnonzero((p != 0) | (q != 0))
         if len(lags) == 0:
             return np.zeros(self.shape)
@@ -363,16 +358,7 @@ class _Forward:
             i = lags[0]
             block = p[i] * step.by_position + q[i] * step.by_velocity
             return self.solver.apply(block, self.past[i])
-        total = self.solver.apply(step.by_velocity, weighted(q, self.past, self.shape))
+        total = self.solver.apply(step.by_velocity, row.weighted(row.q, self.past, self.shape))
         if p.any():
-            total += self.solver.apply(step.by_position, weighted(p, self.past, self.shape))
+            total += self.solver.apply(step.by_position, row.weighted(row.p, self.past, self.shape))
         return total
-
-
-def weighted(weights: Array, past: deque[Array], shape: tuple[int, ...]) -> Array:
-    """Σ_i weights[i] past[i]."""
-    total = np.zeros(shape)
-    for weight, item in zip(weights, past, strict=True):
-        if weight:
-            total += weight * item
-    return total

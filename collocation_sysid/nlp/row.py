@@ -1,0 +1,67 @@
+"""One row of the discrete equations: its coefficients, with the time step put in, and its block.
+
+    c_t = Σ_j w_j F_{t−j} − M (Σ_i s_i x_{t−i} + r v_0),
+    F_t = f(Σ_i p_i x_{t−i}, Σ_i q_i x_{t−i}; θ) + f_ext,
+
+so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `nlp.schemes`)
+
+    −∂c_t/∂x_t = s_0 M − w_0 (p_0 G + q_0 C).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Array
+from ..fem.pattern import SymmetricPattern
+from .dynamics import Dynamics
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Row t of an experiment's equations of motion.
+
+    Attributes
+    ----------
+    p, q, w, s : (reach + 1,) stencil, by lag
+    r : float
+    mass_kg : (3n,) of every dof
+    """
+
+    p: Array
+    q: Array
+    w: Array
+    s: Array
+    r: float
+    mass_kg: Array
+
+    @classmethod
+    def of(cls, dynamics: Dynamics, t: int) -> Row:
+        """Row t of the tables."""
+        tables, step_s = dynamics.tables, dynamics.step_s
+        return cls(
+            tables.p[t],
+            tables.q[t] / step_s,
+            tables.w[t],
+            tables.s[t] / step_s**2,
+            float(tables.r[t]) / step_s,
+            dynamics.mass_kg[t],
+        )
+
+    def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:
+        """Lower triangle (m,) of −∂c_t/∂x_t from those of G and C."""
+        values = -self.w[0] * self.p[0] * by_position
+        values -= self.w[0] * self.q[0] * by_velocity
+        values[pattern.diagonal] += self.s[0] * self.mass_kg
+        return values
+
+    def weighted(self, coefficients: Array, past: Iterable[Array], shape: tuple[int, ...]) -> Array:
+        """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""
+        total = np.zeros(shape)
+        for coefficient, item in zip(coefficients[1:], past, strict=False):
+            if coefficient:
+                total += coefficient * item
+        return total
