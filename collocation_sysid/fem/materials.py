@@ -66,7 +66,7 @@ class Material:
         """
         name = name or getattr(energy, "__name__", "energy").replace("_", "-")
         told = {constant.name: constant for constant in constants}
-        arguments = list(inspect.signature(energy).parameters)[1:]
+        arguments = _arguments(energy)
         if not arguments:
             raise InputError(
                 f"material {name!r} has no constants; expected a function of the deformation "
@@ -200,13 +200,14 @@ def _volumetric(F: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     return 0.5 * kappa_pa * (ca.det(F) - 1) ** 2
 
 
-def _known(name: str, energy: Energy) -> Material:
-    arguments = list(inspect.signature(energy).parameters)[1:]
-    return Material(name, energy, tuple(map(constant_named, arguments)))
+def _arguments(energy: Energy) -> list[str]:
+    """Names of the constants of an energy function: its arguments after F."""
+    return list(inspect.signature(energy).parameters)[1:]
 
 
+# Made without `Material.of`, whose check would cost every start-up; the tests check them.
 MATERIALS: dict[str, Material] = {
-    name: _known(name, energy)
+    name: Material(name, energy, tuple(map(constant_named, _arguments(energy))))
     for name, energy in {
         "neo-hookean": neo_hookean,
         "stable-neo-hookean": stable_neo_hookean,

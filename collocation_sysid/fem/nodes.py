@@ -16,23 +16,53 @@ if TYPE_CHECKING:
     from .elements import Element
 
 
-class _Mesh(Protocol):
+class Mesh(Protocol):
     """What is needed of a `TetMesh`, which describes it."""
 
     @property
-    def points_m(self) -> np.ndarray: ...
+    def points_m(self) -> np.ndarray:
+        """(n, 3) [m]."""
+        ...
+
     @property
-    def tetrahedra(self) -> np.ndarray: ...
+    def tetrahedra(self) -> np.ndarray:
+        """(E, 4) corners."""
+        ...
+
     @cached_property
-    def edges(self) -> np.ndarray: ...
+    def edges(self) -> np.ndarray:
+        """(m, 2) pairs of nodes, sorted."""
+        ...
+
     @property
-    def bounds_m(self) -> np.ndarray: ...
+    def bounds_m(self) -> np.ndarray:
+        """(2, 3) lowest and highest coordinates."""
+        ...
+
     @property
-    def point_arrays(self) -> Mapping[str, np.ndarray]: ...
+    def point_arrays(self) -> Mapping[str, np.ndarray]:
+        """Values per node, by name."""
+        ...
+
     @property
-    def file_index(self) -> np.ndarray: ...
+    def cell_arrays(self) -> Mapping[str, np.ndarray]:
+        """Values per cell, by name."""
+        ...
+
+    @cached_property
+    def centres_m(self) -> np.ndarray:
+        """(E, 3) of the cells."""
+        ...
+
     @property
-    def file_node_count(self) -> int: ...
+    def file_index(self) -> np.ndarray:
+        """(n,) number of each node in the file."""
+        ...
+
+    @property
+    def file_node_count(self) -> int:
+        """Nodes in the file."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +78,18 @@ class Nodes:
     ends : (k, 2) the corners at the ends of each mid node's edge: rows of `mesh.edges`, or none
     """
 
-    mesh: _Mesh
+    mesh: Mesh
     points_m: Array
     cells: Index
     ends: Index
 
     @classmethod
-    def corners(cls, mesh: _Mesh) -> Nodes:
+    def corners(cls, mesh: Mesh) -> Nodes:
         """Only the mesh's own."""
         return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
 
     @classmethod
-    def of_element(cls, mesh: _Mesh, element: Element) -> Nodes:
+    def of_element(cls, mesh: Mesh, element: Element) -> Nodes:
         """All that the element has."""
         if not element.edges:
             return cls.corners(mesh)

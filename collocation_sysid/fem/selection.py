@@ -14,8 +14,7 @@ import numpy as np
 from ..errors import InputError
 
 if TYPE_CHECKING:
-    from .mesh import TetMesh
-    from .nodes import Nodes
+    from .nodes import Mesh, Nodes
 
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
 ROUND_OFF = 1e-9
@@ -49,7 +48,7 @@ class Box:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         return _chosen(self._holds(nodes.points_m), nodes, str(self))
 
-    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
 
@@ -83,7 +82,7 @@ class Ball:
         )
         return _chosen(self._holds(nodes.points_m), nodes, str(self), nearest)
 
-    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
 
@@ -133,7 +132,7 @@ class Indices:
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, wanted))
         return _chosen(chosen, nodes, "an empty list of indices")
 
-    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         count = len(mesh.tetrahedra)
         outside = [index for index in self.indices if not 0 <= index < count]
@@ -162,7 +161,7 @@ class Named:
         mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
         return _chosen(nodes.with_mid_nodes(mask), nodes, what)
 
-    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         what = f'cell array "{self.name}"'
         return _chosen_cells(self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what), mesh, what)
@@ -190,7 +189,7 @@ class Named:
 Selection = Box | Ball | Indices | Named
 
 
-def _chosen_cells(mask: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
+def _chosen_cells(mask: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:
     if not mask.any():
         raise InputError(
             f"{what} selects none of the {len(mask)} cells, by their centres; the body spans "

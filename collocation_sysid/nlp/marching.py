@@ -13,7 +13,7 @@ from .dynamics import Dynamics
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
-from .row import Row
+from .row import Row, weighted
 from .stopwatch import Stopwatch
 
 Progress = Callable[[float], None]
@@ -116,10 +116,10 @@ class _Step:
         self.damped, self.load = damped, dynamics.external_force_n[t]
         first, shape = max(0, t - dynamics.reach), x.shape[1:]
         past, past_forces = x[first:t][::-1], forces[first:t][::-1]
-        self.xi = row.weighted(row.p, past, shape)
-        self.nu = row.weighted(row.q, past, shape)
-        self.known = row.weighted(row.w, past_forces, shape)
-        self.known -= row.mass_kg * row.weighted(row.s, past, shape)
+        self.xi = weighted(row.p, past, shape)
+        self.nu = weighted(row.q, past, shape)
+        self.known = weighted(row.w, past_forces, shape)
+        self.known -= row.mass_kg * weighted(row.s, past, shape)
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def force(self, x: Array) -> Array:

@@ -58,10 +58,11 @@ class Row:
         values[pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
-    def weighted(self, coefficients: Array, past: Iterable[Array], shape: tuple[int, ...]) -> Array:
-        """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""
-        total = np.zeros(shape)
-        for coefficient, item in zip(coefficients[1:], past, strict=False):
-            if coefficient:
-                total += coefficient * item
-        return total
+
+def weighted(coefficients: Array, past: Iterable[Array], shape: tuple[int, ...]) -> Array:
+    """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""
+    total = np.zeros(shape)
+    for coefficient, item in zip(coefficients[1:], past, strict=False):
+        if coefficient:
+            total += coefficient * item
+    return total

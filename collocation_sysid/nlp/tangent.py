@@ -27,7 +27,7 @@ from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
-from .row import Row
+from .row import Row, weighted
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
@@ -323,7 +323,7 @@ class _Forward:
         solver.without_taken(step.t, force)
         total = row.w[0] * force - inertia[solver.free]
         if self.weighs_past:
-            total += row.weighted(row.w, self.past_forces, force.shape)
+            total += weighted(row.w, self.past_forces, force.shape)
             self.past_forces.appendleft(force)
         return solver.without_taken(step.t, total)
 
@@ -337,8 +337,8 @@ class _Forward:
         t, solver = step.t, self.solver
         row = Row.of(solver.dynamics, t)
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
-        right += row.weighted(w, self.past_increments, self.shape)
-        right -= mass * row.weighted(s, self.past, self.shape)
+        right += weighted(w, self.past_increments, self.shape)
+        right -= mass * weighted(s, self.past, self.shape)
         force += self._of_past(step, row)
         solver.without_taken(t, right)
         solver.without_taken(t, force)
@@ -358,7 +358,7 @@ class _Forward:
             i = lags[0]
             block = p[i] * step.by_position + q[i] * step.by_velocity
             return self.solver.apply(block, self.past[i])
-        total = self.solver.apply(step.by_velocity, row.weighted(row.q, self.past, self.shape))
+        total = self.solver.apply(step.by_velocity, weighted(row.q, self.past, self.shape))
         if p.any():
-            total += self.solver.apply(step.by_position, row.weighted(row.p, self.past, self.shape))
+            total += self.solver.apply(step.by_position, weighted(row.p, self.past, self.shape))
         return total
