@@ -11,7 +11,7 @@ help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' Makefile
 
 solve: $(CORE) ## identify the foam cylinder's parameters
-	@$(BIN)/collocation-sysid solve problems/foam_cylinder/problem.toml --out $(RUN)
+	@$(BIN)/collocation-sysid solve problems/foam_cylinder/recording.toml --out $(RUN)
 	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
 
 test: $(DEV) ## run the tests

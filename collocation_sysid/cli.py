@@ -1,6 +1,7 @@
 """The command line: results on stdout, progress and messages on stderr.
 
-Exit codes: 0 converged, 1 not converged, 2 bad input, 130 interrupted.
+Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ AllowCode = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list the runs.")]
 
 EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
 def _examples(*commands: str) -> str:
@@ -83,19 +85,30 @@ def _examples(*commands: str) -> str:
         "solve problem.toml",
         "solve problem.toml --method interior-point --out runs/ip",
         "solve problem.toml --set parameters.mu_pa.guess=200",
+        "solve finer.toml --start runs/coarse",
     )
 )
 def solve(
     problem: ProblemPath,
     method: Annotated[str | None, typer.Option(help="Method, instead of the problem's.")] = None,
     out: Out = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="Start from the answer in this run folder."),
+    ] = None,
     set_: Overrides = None,
     allow_code: AllowCode = False,
     as_json: AsJson = False,
     verbose: Verbose = False,
     quiet: Quiet = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit code 1 if the verdict is doubtful.")
+    ] = False,
 ) -> None:
     """Identify the parameters and write a run folder.
+
+    Parameters need no guess: a scan of the stiffness finds where to start. --start takes an earlier
+    answer instead, also of another mesh or timestep.
 
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
@@ -116,7 +129,7 @@ def solve(
     require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
-        finished = run(loaded, method, watch=progress.iteration, log=progress.say)
+        finished = run(loaded, method, progress.iteration, progress.say, start)
         progress.say("writing the run folder")
         finished.save(folder)
     if as_json:
@@ -126,6 +139,8 @@ def solve(
     status = finished.solution.status
     if status is Status.INTERRUPTED:
         raise typer.Exit(EXIT_INTERRUPTED)
+    if strict and finished.trust.verdict == "doubtful":
+        raise typer.Exit(EXIT_DOUBTFUL)
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
 
 
@@ -341,7 +356,8 @@ def check(
         typer.echo(json.dumps(findings.as_dict(), indent=1))
     else:
         _show(check_table(findings))
-    raise typer.Exit(0 if findings.derivatives_agree else EXIT_NOT_CONVERGED)
+    good = findings.derivatives_agree and not findings.causes
+    raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 
 @app.command(epilog=_examples("plot runs/swing"))

@@ -29,12 +29,15 @@ class Rollout:
         Its markers are read with the experiment's nuisance parameters.
     nuisance : mapping of name to value
         Nuisance parameters of an experiment for validation, fitted with the material as found.
+        Of places they are the way from where these were started.
+    places_m : mapping of marker to place [x, y, z], for validation likewise
     """
 
     rms_m: float
     max_m: float
     trajectory: Trajectory
     nuisance: Mapping[str, float]
+    places_m: Mapping[str, list[float]]
 
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
@@ -63,6 +66,9 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         float(present.max()),
         replace(trajectory, markers_m=readings),
         dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True))
+        if experiment.validation
+        else {},
+        dict(zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True))
         if experiment.validation
         else {},
     )

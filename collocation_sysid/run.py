@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -11,21 +11,45 @@ from typing import Any
 
 import numpy as np
 
+from .arrays import Array
+from .check.motion import Motion
+from .earlier import Earlier
 from .errors import InputError, SimulationError, hint_at
 from .fem.constants import unit_of
 from .methods.method import Method, Watch
+from .methods.scan import Scan, rescue, started
 from .methods.solution import Solution, Status
+from .methods.start import placed_at_guess
+from .nlp.collocation import Collocation
+from .nlp.parameters import Parameters
 from .problem import Problem
 from .rollout import Rollout, roll_out
+from .statistics.cause import Cause
+from .statistics.causes import likely_causes
 from .statistics.diagnostics import MarkerDiagnosis, diagnose
 from .statistics.estimates import Estimate
 from .statistics.identifiability import verdicts
 from .statistics.linearised import Derived, linearised_fit
+from .statistics.places import Place, places_of
+from .statistics.pose_noise import pose_noise_draws
 from .statistics.profile import Profile
 from .statistics.profiling import profile_of
+from .statistics.trust import Trust, cause_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
+from .verdict import concerns, expected_rms_m, motions_of
 
 Log = Callable[[str], None]
+# How a search ends that went astray; another start may help.
+LOST = (
+    Status.INFEASIBLE,
+    Status.STALLED,
+    Status.DIVERGED,
+    Status.NUMERICAL_FAILURE,
+    Status.NOT_SIMULABLE,
+)
+
+# A solve is repeated so often where markers turn out to sit in other elements.
+REREADINGS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +66,8 @@ class Run:
     profiles : tuple of Profile, those asked for
     notes : tuple of str
         What went wrong after the solve.
+    causes : tuple of Cause
+        What is likely described wrongly, likeliest first.
     """
 
     problem: Problem
@@ -51,18 +77,25 @@ class Run:
     diagnoses: tuple[MarkerDiagnosis, ...] = ()
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()
+    causes: tuple[Cause, ...] = ()
 
     def __repr__(self) -> str:
         solution = self.solution
         free = [item.name for item in self.problem.parameters.free]
         found = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
-        return f"Run({solution.method}, {solution.status.value}: {found}; {rms})"
+        said = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
+        return f"Run({said}: {found}; {rms})"
 
     @property
     def parameters(self) -> dict[str, float]:
         """Every parameter, by name."""
         return self.solution.parameters
+
+    @property
+    def started_from(self) -> Parameters:
+        """The parameters with the guesses that the search started from."""
+        return self.solution.collocation.parameters
 
     @cached_property
     def derived(self) -> dict[str, float]:
@@ -77,6 +110,30 @@ class Run:
         known = {} if found is None else {**found.estimates, **found.derived}
         values = self.parameters | self.derived
         return {name: known.get(name, Estimate(value)) for name, value in values.items()}
+
+    @cached_property
+    def places(self) -> dict[str, dict[str, Place]]:
+        """Where the markers sit on the undeformed body, by fitted experiment and by marker."""
+        parts = self.solution.collocation.parts(self.solution.z)
+        return {p.segment.experiment.name: places_of(p, self.uncertainty) for p in parts}
+
+    @cached_property
+    def trust(self) -> Trust:
+        """How far the answer can be trusted, in one word, with the reasons."""
+        found = concerns(
+            self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
+        )
+        return Trust.of((*cause_concerns(self.causes), *found))
+
+    @cached_property
+    def motions(self) -> dict[str, Motion]:
+        """How each experiment's body oscillates with the answer, by name."""
+        return motions_of(self.problem, self.solution)
+
+    @property
+    def noise_rms_m(self) -> float:
+        """RMS distance of the fitted markers that noise of the sigma_m given would leave."""
+        return expected_rms_m(self.solution, self.uncertainty)
 
     def interval(self, name: str) -> tuple[float, float] | None:
         """95 % interval of a parameter or derived modulus; None where there is none.
@@ -116,7 +173,7 @@ class Run:
             pandas = import_module("pandas")
         except ImportError as error:
             raise InputError("a data frame needs pandas: pip install pandas") from error
-        items = self.problem.parameters.items
+        items = self.started_from.items
         guesses = {item.name: item.guess for item in items if item.tied is None}
         rows = {}
         for name, estimate in self.estimates.items():
@@ -165,7 +222,10 @@ def _with_error(estimate: Estimate) -> str:
 
 
 def solve(
-    problem: Problem, method: str | Method | None = None, watch: Watch | None = None
+    problem: Problem,
+    method: str | Method | None = None,
+    watch: Watch | None = None,
+    start: str | Path | None = None,
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
 
@@ -177,20 +237,64 @@ def solve(
         problem's own by default.
     watch : callable, optional
         Called with every `Iteration`.
+    start : str or Path, optional
+        The folder of an earlier run, of any mesh or timestep, whose answer takes the place of the
+        guesses where names match.
 
     Raises
     ------
     InputError
-        For an unknown method, and when the solver refuses the problem.
+        For an unknown method, a start that is no run or has no parameter of these, where no start
+        is found, and when the solver refuses the problem.
     """
     solver = problem.solver(method)
+    earlier = None if start is None else Earlier.read(start)
+    problem = problem if earlier is None else earlier.started(problem)
     try:
-        solution = solver(problem.collocation(), watch)
+        whole = getattr(solver, "needs_whole_start", False)
+        collocation, scan = started(problem.collocation(), whole)
+        collocation, variables = placed_at_guess(collocation), None
+        if earlier is not None and not scan:
+            collocation = earlier.placed(collocation)
+            variables = earlier.variables(collocation)
+        solution = _read_where_found(solver, collocation, watch, variables)
+        if scan is None and solution.status in LOST:
+            scan, solution = _again(solver, solution, watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
+    if scan is None:
+        return solution
+    return replace(solution, scan=scan, notes=(scan.sentence, *solution.notes))
+
+
+def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | None, Solution]:
+    """Solve from a scan what could not be solved from its guess; the loser where that fails too."""
+    reason = f"the search from the guess was lost ({lost.status.value})"
+    whole = getattr(solver, "needs_whole_start", False)
+    scan = rescue(lost.collocation, reason, whole)
+    if scan is None:
+        return None, lost
+    again = placed_at_guess(replace(lost.collocation, parameters=scan.parameters))
+    found = _read_where_found(solver, again, watch)
+    return (scan, found) if found.status.converged else (None, lost)
+
+
+def _read_where_found(
+    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
+) -> Solution:
+    """Solve, and again from there as long as estimates leave where the recordings are read."""
+    solution = solver(collocation, watch, start)
+    for _ in range(REREADINGS):
+        if not solution.status.converged:
+            break
+        p, positions = solution.collocation.unpack(solution.z)
+        collocation, moved = solution.collocation.following(p)
+        if collocation is solution.collocation:
+            break
+        solution = solver(collocation, watch, collocation.pack(moved, positions))
     return solution
 
 
@@ -199,13 +303,14 @@ def run(
     method: str | Method | None = None,
     watch: Watch | None = None,
     log: Log | None = None,
+    start: str | Path | None = None,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
 
     Parameters
     ----------
     problem : Problem
-    method, watch
+    method, watch, start
         See `solve`.
     log : callable, optional
         Called with what is being done now, a text.
@@ -216,23 +321,35 @@ def run(
         As `solve` does.
     """
     say = log or (lambda _: None)
-    solution = solve(problem, method, watch)
+    solution = solve(problem, method, watch, start)
     say("checking the answer by a forward simulation")
     rollouts = {e.name: roll_out(problem, e, solution) for e in problem.experiments}
+    found = _checked(problem, solution, rollouts, say)
+    say("looking for causes of the misfit")
+    return replace(found, causes=likely_causes(solution))
+
+
+def _checked(
+    problem: Problem, solution: Solution, rollouts: Mapping[str, Rollout | str], say: Log
+) -> Run:
+    """A solution with its error bars, where there are any."""
     if not solution.status.converged:
         return Run(problem, solution, rollouts, None)
     say("finding the error bars")
     try:
         fit = linearised_fit(solution.collocation, solution.z)
+        say("finding what noise of the poses does")
+        extra, noises = pose_noise_draws(solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",))
-    diagnoses = diagnose(fit)
+    diagnoses = diagnose(fit, extra)
+    notes = tuple(noise.sentence for noise in noises)
     if not solution.collocation.nq:
         return Run(problem, solution, rollouts, None, diagnoses)
     options = problem.uncertainty
     try:
         uncertainty = uncertainty_of(
-            fit, problem.parameters, solution.q, options.noise, options.errors
+            fit, problem.parameters, solution.q, options.noise, options.errors, extra
         )
         profiles = []
         for name in options.profile:
@@ -240,4 +357,4 @@ def run(
             profiles.append(profile_of(solution, fit, uncertainty, name))
     except InputError as error:
         raise error.located(problem.path) from error
-    return Run(problem, solution, rollouts, uncertainty, diagnoses, tuple(profiles))
+    return Run(problem, solution, rollouts, uncertainty, diagnoses, tuple(profiles), notes)

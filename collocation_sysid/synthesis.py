@@ -47,12 +47,13 @@ def write_data(
     Raises
     ------
     InputError
-        For an unknown integrator, a timestep, noise or seed that cannot be, and before a file
-        that the problem reads is overwritten.
+        For a parameter without a guess, an unknown integrator, a timestep, noise or seed that
+        cannot be, and before a file that the problem reads is overwritten.
     SimulationError
         Before anything is written.
     """
     place = Path(folder)
+    _refuse_unguessed(problem)
     _refuse_options(integrator, timestep_s, noise_m, seed)
     _refuse_inputs(problem, place)
     rng = np.random.default_rng(seed)
@@ -90,6 +91,16 @@ def _refuse_options(integrator: str, timestep_s: float | None, noise_m: float, s
         raise InputError(f"found {noise_m:g}; expected metres, 0 or more", None, "--noise-m")
     if seed < 0:
         raise InputError(f"found {seed}; expected a whole number, 0 or more", None, "--seed")
+
+
+def _refuse_unguessed(problem: Problem) -> None:
+    if names := problem.parameters.unguessed:
+        key = f"parameters.{names[0]}"
+        raise InputError(
+            f"has no guess, and a simulation needs a value; expected --set {key}.guess=VALUE",
+            problem.path,
+            key,
+        )
 
 
 def _refuse_inputs(problem: Problem, place: Path) -> None:

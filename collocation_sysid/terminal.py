@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
 from types import TracebackType
@@ -13,17 +14,29 @@ from rich.table import Table
 from rich.text import Text
 
 from .check import BodyFinding, Findings
+from .check.hold import hold_sentence
 from .fem.constants import symbol_of, unit_of
 from .methods.solution import Iteration
+from .nlp.collocation import Part
 from .nlp.parameters import Parameter
 from .problem import Problem
 from .rollout import Rollout
 from .run import Run
+from .statistics.places import Place
 from .statistics.uncertainty import Estimate
 
+COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
 WIDE = 200
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2
+VECTORS = (
+    ("offset", "camera offsets up to", " mm"),
+    ("tilt", "gravity tilted by", "°"),
+    ("grasp-turn", "body turned in its grasp by", "°"),
+    ("grasp-shift", "body shifted in its grasp by", " mm"),
+    ("turn", "poses turned by", "°"),
+    ("shift", "poses shifted by", " mm"),
+)
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
@@ -40,7 +53,7 @@ class Progress:
         live = console.is_terminal and not quiet and not verbose
         self._live = Live(console=console, refresh_per_second=8, transient=True) if live else None
         self._lines: list[Iteration] = []
-        self._doing = "simulating at the guess"
+        self._doing = "finding a start"
 
     def __enter__(self) -> Progress:
         if not self.quiet:
@@ -108,9 +121,11 @@ def _cells(line: Iteration) -> list[str]:
 
 def summary(finished: Run, folder: Path) -> RenderableType:
     """The answer of a run on one screen."""
-    solution = finished.solution
-    style = "green" if solution.status.converged else "red"
+    solution, trust = finished.solution, finished.trust
+    style = COLOURS[trust.verdict]
     parts: list[RenderableType] = [Text(solution.message, style=style)]
+    parts.append(Text(f"Verdict: {trust.verdict}", style=f"bold {style}"))
+    parts += [Text(f"  {reason}", style=style) for reason in trust.reasons]
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
@@ -133,7 +148,7 @@ def parameter_table(finished: Run) -> Table:
     table = Table("", "value", "±", "95 % interval", "guess", box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"
-    guesses = {item.name: _guess(item) for item in finished.problem.parameters.items}
+    guesses = {item.name: _guess(item) for item in finished.started_from.items}
     for name, estimate in finished.estimates.items():
         table.add_row(*_estimate_cells(name, estimate), guesses.get(name, ""))
     return table
@@ -157,28 +172,70 @@ def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
 
 
 def _nuisance(finished: Run) -> list[Text]:
-    """One line for each experiment that has nuisance parameters; offsets by their length."""
+    """One line for each experiment that has nuisance parameters, with their priors."""
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
-        segment, nuisance, name = part.segment, part.segment.nuisance, part.segment.experiment.name
-        values, said = part.phi * nuisance.scales, []
-        offsets = values[nuisance.places("offset")].reshape(-1, 3)
-        if len(offsets):
-            lengths = np.linalg.norm(offsets, axis=1)
-            worst = segment.experiment.markers.names[int(lengths.argmax())]
-            said.append(
-                f"markers sit off their places by up to {1e3 * lengths.max():.2g} mm ({worst})"
-            )
-        said += [f"{1e3 * values[k]:.2g} ms time shift" for k in nuisance.places("time")]
-        for kind, what in (("turn", "turn of the pose"), ("tilt", "tilt of gravity")):
-            if len(places := nuisance.places(kind)):
-                degrees = np.degrees(np.linalg.norm(values[places]))
-                said.append(f"{degrees:.2g}° {what}")
-        if len(places := nuisance.places("shift")):
-            said.append(f"{1e3 * np.linalg.norm(values[places]):.2g} mm shift of the pose")
+        name = part.segment.experiment.name
+        said = _places(finished.places[name]) + _lengths(part) + _clock(part)
         if said:
-            lines.append(Text(f"nuisance parameters of '{name}': {', '.join(said)}"))
+            lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
     return lines
+
+
+def _places(places: Mapping[str, Place]) -> list[str]:
+    """How far places are from those given, and how well those not given are known."""
+    moved = {
+        n: place.moved_m or 0.0 for n, place in places.items() if place.prior_m and place.given
+    }
+    unknown, said = [place for place in places.values() if not place.given], []
+    if moved:
+        worst = max(moved, key=moved.__getitem__)
+        said.append(
+            f"markers sit off their places by up to {_short(1e3 * moved[worst])} mm ({worst}; "
+            f"prior {_short(1e3 * places[worst].prior_m)})"
+        )
+    if unknown:
+        count = f"{len(unknown)} marker" + ("s" if len(unknown) > 1 else "")
+        errors = [
+            float(place.std_error_m.max()) for place in unknown if place.std_error_m is not None
+        ]
+        known = f", found to ±{_short(1e3 * max(errors))} mm" if len(errors) == len(unknown) else ""
+        said.append(f"{count} without a place{known} (prior {_short(1e3 * unknown[0].prior_m)})")
+    return said
+
+
+def _lengths(part: Part) -> list[str]:
+    """Vectors of nuisance parameters by their lengths."""
+    nuisance = part.segment.nuisance
+    values, said = part.phi * nuisance.scales, []
+    for kind, what, unit in VECTORS:
+        if len(here := nuisance.places(kind)):
+            size = 1e3 if unit == " mm" else 180 / np.pi
+            # Several markers have one each: the longest counts.
+            lengths = np.linalg.norm(values[here].reshape(-1, min(3, len(here))), axis=1)
+            length, prior = float(lengths.max()), float(nuisance.scales[here[0]])
+            said.append(f"{what} {_short(size * length)}{unit} (prior {_short(size * prior)})")
+    return said
+
+
+def _clock(part: Part) -> list[str]:
+    """The time shift in words."""
+    nuisance, said = part.segment.nuisance, []
+    low, high = nuisance.limits(part.segment.chart.samples)
+    for k in nuisance.places("time"):
+        phi, prior = float(part.phi[k]), 1e3 * float(nuisance.scales[k])
+        when = "later" if phi > 0 else "earlier"
+        limit = "" if low[k] + 1e-3 < phi < high[k] - 1e-3 else ", the most that is allowed"
+        said.append(
+            f"markers seen {_short(abs(phi) * prior)} ms {when} than their times say{limit} "
+            f"(prior {_short(prior)})"
+        )
+    return said
+
+
+def _short(value: float) -> str:
+    """Two digits, and no powers of ten for the sizes of bodies."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def _residuals(finished: Run) -> list[Text]:
@@ -190,7 +247,8 @@ def _residuals(finished: Run) -> list[Text]:
 def _verdict(finished: Run) -> list[Text]:
     solution = finished.solution
     lines = [
-        f"markers: {solution.rms_m * 1e3:.3f} mm RMS; dynamics violated by at most "
+        f"markers: {solution.rms_m * 1e3:.3f} mm RMS, {finished.noise_rms_m * 1e3:.3f} mm from "
+        "noise alone; dynamics violated by at most "
         f"{solution.max_violation_n:.1e} N ({solution.max_violation_relative:.1e} of the largest "
         "force)"
     ]
@@ -212,10 +270,6 @@ def _verdict(finished: Run) -> list[Text]:
 
 def check_table(findings: Findings) -> RenderableType:
     """The findings of a check on one screen, warnings last."""
-    good = findings.derivatives_agree
-    verdict = "The problem is valid and the derivatives agree." if good else (
-        "The derivatives do not agree with differences at the guess."
-    )  # fmt: skip
     return Group(
         *map(_body_section, findings.bodies),
         *_motion_section(findings),
@@ -224,8 +278,17 @@ def check_table(findings: Findings) -> RenderableType:
         Text(""),
         *_sentences("note", findings.notes, "default"),
         *_sentences("warning", findings.warnings, "yellow"),
-        Text(verdict, style="green" if good else "red"),
+        _check_verdict(findings),
     )
+
+
+def _check_verdict(findings: Findings) -> Text:
+    if not findings.derivatives_agree:
+        return Text("The derivatives do not agree with differences at the guess.", style="red")
+    if findings.causes:
+        likeliest = findings.causes[0].sentence
+        return Text(f"The derivatives agree, but the description looks wrong: {likeliest}", "red")
+    return Text("The problem is valid and the derivatives agree.", style="green")
 
 
 def _section(title: str, rows: dict[str, str]) -> RenderableType:
@@ -301,6 +364,8 @@ def _measurements_section(findings: Findings) -> RenderableType:
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+    for hold in findings.holds[:SHOWN_RECORDINGS]:
+        rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
     rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
     return _section("Measurements", rows)
 

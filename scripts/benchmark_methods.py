@@ -34,7 +34,7 @@ from collocation_sysid import (
     Parameters,
     simulate,
 )
-from collocation_sysid.experiment import place_markers
+from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.simulation import with_markers
@@ -100,7 +100,8 @@ def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) ->
     placement = place_markers(places, body.nodes_m, body, "vertex")
     markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
-    experiment = Experiment(body, t_s, [Grasp(held, poses)], markers, name="swing")
+    grasp, ideal = Grasp(held, poses), Nuisance.none()
+    experiment = Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
     tracks = simulate(experiment, TRUTH, "midpoint").markers_m
     tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
     return with_markers(experiment, tracks)

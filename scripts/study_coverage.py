@@ -38,7 +38,7 @@ from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import (
     ErrorsOption,
-    Noise,
+    NoiseOption,
     Uncertainty,
     uncertainty_of,
 )
@@ -50,11 +50,12 @@ OFFSET_M, SHIFT_S, PHI = 0.002, 0.003, 0.85
 QUANTITIES = (*TRUTH, "young_pa", "poisson")
 COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν", "own")
 # Noise and errors as `uncertainty_of` takes them.
-KINDS: tuple[tuple[Noise, ErrorsOption], ...] = (
+KINDS: tuple[tuple[NoiseOption, ErrorsOption], ...] = (
     ("given", "auto"),
     ("estimated", "auto"),
     ("given", "independent"),
     ("estimated", "independent"),
+    ("auto", "auto"),
 )
 ACCEPTED = (0.91, 0.98)
 
@@ -68,11 +69,11 @@ class Case:
     nuisance: Nuisance
 
 
-OWN = Nuisance(marker_offset_m=OFFSET_M, time_shift_s=SHIFT_S)
+OWN = Nuisance.none(marker_offset_m=OFFSET_M, time_shift_s=SHIFT_S)
 CASES = (
-    Case("white", 0.0, Nuisance()),
+    Case("white", 0.0, Nuisance.none()),
     Case("white, nuisance parameters", 0.0, OWN),
-    Case(f"AR(1) {PHI}", PHI, Nuisance()),
+    Case(f"AR(1) {PHI}", PHI, Nuisance.none()),
     Case(f"AR(1) {PHI}, nuisance parameters", PHI, OWN),
 )
 
@@ -128,6 +129,7 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     rng = np.random.default_rng(seed)
     collocation, phi = twin(experiment, x, case, sigma_m, rng)
     solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
+    collocation = solution.collocation
     q = solution.z[: collocation.nq]
     fit = linearised_fit(collocation, solution.z)
     found = [uncertainty_of(fit, collocation.parameters, q, *kind) for kind in KINDS]
@@ -170,8 +172,10 @@ def twin(
 ) -> tuple[Collocation, Array]:
     """The identification of one twin, from the truth, and its nuisance parameters φ."""
     experiment = replace(experiment, nuisance=case.nuisance)
-    (segment,) = collocation_of(experiment).segments
-    phi = rng.standard_normal(segment.nuisance.size)
+    collocation = collocation_of(experiment)
+    drawn = rng.standard_normal(collocation.nphi)
+    followed, p = collocation.following(np.append(collocation.parameters.guess_q, drawn))
+    (segment,), phi = followed.segments, p[collocation.nq :]
     tracks = segment.observation.predicted(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
     return collocation_of(with_markers(experiment, tracks + noise)), phi

@@ -59,6 +59,7 @@ gamma_m_1_s = { guess = 0.5, lower = 1e-3, upper = 100.0 }
 
 [[experiment]]
 name = "swing"
+nuisance = "none"
 grasp = { nodes = { box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }, poses = "motion.csv" }
 gravity_m_s2 = [0.0, 0.0, -9.81]
 

@@ -48,6 +48,7 @@ REFERENCES = "{ low = [0.0, 0.0, 0.0], mid = [0.03, 0.02, 0.03], side = [0.06, 0
 EXPERIMENT = f"""
 [[experiment]]
 name = "swing"
+nuisance = "none"
 grasp = {GRASP}
 
 [experiment.markers]

@@ -42,6 +42,7 @@ def as_theta(given: Parameters | Mapping[str, float]) -> np.ndarray:
 
 
 GRAVITY_M_S2 = (0.0, 0.0, -9.81)
+IDEAL = Nuisance.none()
 EDGE_M = 0.1
 
 
@@ -94,6 +95,7 @@ def hung_cube(steps: int = 10, divisions: tuple[int, ...] = (2, 2, 2), **changes
     body, t_s = box(divisions=divisions), times(steps)
     grasp = Grasp(nodes_where(body, 2, EDGE_M), smooth_poses(t_s))
     markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
+    changes = {"nuisance": IDEAL} | changes
     return Experiment(body, t_s, [grasp], markers, name="hung cube", **changes)
 
 
@@ -102,7 +104,9 @@ def released_cube(steps: int = 10) -> Experiment:
     body, t_s = box(), times(steps)
     grasp = Grasp(nodes_where(body, 2, EDGE_M), PoseSequence.fixed())
     markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
-    return Experiment(body, t_s, [grasp], markers, name="released cube", start="undeformed")
+    return Experiment(
+        body, t_s, [grasp], markers, name="released cube", start="undeformed", nuisance=IDEAL
+    )
 
 
 def bar_in_two_hands(steps: int = 10) -> Experiment:
@@ -112,7 +116,7 @@ def bar_in_two_hands(steps: int = 10) -> Experiment:
     moving = Grasp(nodes_where(body, 0, 0.15), smooth_poses(t_s))
     inside = np.flatnonzero((body.nodes_m[:, 0] > 0.01) & (body.nodes_m[:, 0] < 0.14))
     markers = vertex_markers(body, inside, t_s)
-    return Experiment(body, t_s, [still, moving], markers, name="bar in two hands")
+    return Experiment(body, t_s, [still, moving], markers, name="bar in two hands", nuisance=IDEAL)
 
 
 def cube_with_gaps(steps: int = 12) -> Experiment:
@@ -124,7 +128,9 @@ def cube_with_gaps(steps: int = 12) -> Experiment:
     tracks = np.zeros_like(markers.positions_m)
     tracks[rng.random(tracks.shape[:2]) < 0.25] = np.nan
     unmeasured = replace(markers, positions_m=tracks)
-    return Experiment(hung.body, hung.t_s, hung.grasps, unmeasured, name="cube with gaps")
+    return Experiment(
+        hung.body, hung.t_s, hung.grasps, unmeasured, name="cube with gaps", nuisance=IDEAL
+    )
 
 
 def quadratic_bar(steps: int = 10) -> Experiment:
@@ -133,7 +139,7 @@ def quadratic_bar(steps: int = 10) -> Experiment:
     grasp = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
     points = np.vstack([body.nodes_m[-4:], [[0.13, 0.01, 0.02], [0.14, 0.03, 0.04]]])
     markers = point_markers(body, points, t_s)
-    return Experiment(body, t_s, [grasp], markers, name="quadratic bar")
+    return Experiment(body, t_s, [grasp], markers, name="quadratic bar", nuisance=IDEAL)
 
 
 def bar_let_go(steps: int = 10) -> Experiment:
@@ -154,12 +160,29 @@ def cube_with_nuisance(steps: int = 10) -> Experiment:
     """The hung cube with everything estimated that an experiment may not know of itself."""
     nuisance = Nuisance(
         marker_offset_m=0.002,
+        camera_offset_m=0.001,
         time_shift_s=0.003,
         pose_turn_rad=0.02,
         pose_shift_m=0.002,
         gravity_rad=0.03,
+        hand_eye_m=0.002,
+        hand_eye_rad=0.02,
     )
     return replace(hung_cube(steps), name="cube with nuisance", nuisance=nuisance)
+
+
+def bar_with_nuisance(steps: int = 8) -> Experiment:
+    """The bar that one hand lets go of, of quadratic elements, off in its grasps and its places."""
+    body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), "tet10"), times(steps)
+    still = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
+    moving = Grasp(nodes_where(body, 0, 0.15), smooth_poses(t_s), until_s=3 * t_s[1])
+    points = np.array([[0.13, 0.01, 0.02], [0.09, 0.05, 0.04], [0.12, 0.03, 0.0]])
+    markers = point_markers(body, points, t_s)
+    exact_first = replace(markers, places_sigma_m=np.array([0.0, np.nan, 0.004]), on_surface=True)
+    nuisance = Nuisance.none(marker_offset_m=0.003, hand_eye_m=0.002, hand_eye_rad=0.02)
+    return Experiment(
+        body, t_s, [still, moving], exact_first, name="bar with nuisance", nuisance=nuisance
+    )
 
 
 SMALL_EXPERIMENTS = {
@@ -170,6 +193,7 @@ SMALL_EXPERIMENTS = {
     "quadratic-bar": quadratic_bar,
     "bar-let-go": bar_let_go,
     "cube-with-nuisance": cube_with_nuisance,
+    "bar-with-nuisance": bar_with_nuisance,
 }
 
 

@@ -21,7 +21,7 @@ LAYERS = (
     {"methods"},
     {"statistics"},
     {"problem"},
-    {"check", "rollout", "run"},
+    {"check", "earlier", "rollout", "verdict", "run"},
     {"output", "synthesis"},
     {"terminal", "method_tables"},
     {"study"},

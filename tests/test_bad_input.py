@@ -71,12 +71,6 @@ def points_with_nan() -> np.ndarray:
     return points
 
 
-def slower_markers(folder: Path) -> None:
-    head, *rows = (folder / MARKERS).read_text().splitlines()
-    slowed = [f"{0.015 * k:g},{row.split(',', 1)[1]}" for k, row in enumerate(rows[:5])]
-    (folder / MARKERS).write_text("\n".join([head, *slowed]))
-
-
 def raised_markers(folder: Path) -> None:
     head, *rows = (folder / MARKERS).read_text().splitlines()
     table = np.array([row.split(",") for row in rows], dtype=float)
@@ -287,7 +281,7 @@ PARAMETERS = [
         edit=replace_text("lambda_pa  ", "young_pa"),
     ),
     bad(
-        "guess-and-fixed", "parameters.mu_pa", "found guess and fixed", "exactly one",
+        "guess-and-fixed", "parameters.mu_pa", "found guess and fixed", "one of them, or none",
         options=settings("parameters.mu_pa.fixed=300"),
     ),
     bad(
@@ -408,12 +402,25 @@ MARKER_FILES = [
     ),
     bad("nothing-seen", "no marker sample", "window_s", edit=blank_markers),
     bad(
-        "rates-differ", POSES, MARKERS, "100 Hz", "66.6667 Hz", "resample_hz",
-        edit=slower_markers,
+        "poses-end-at-once", POSES, MARKERS, "0 s to 0.01 s", "0 s to 0.08 s", "share 2", "clock",
+        edit=keep_lines(POSES, 3),
     ),
     bad(
-        "poses-end-early", POSES, MARKERS, "0.05 s", "0 s to 0.04 s", "window_s",
-        edit=keep_lines(POSES, 6),
+        "gripper-to-body-without-poses", "grasp", "found gripper_to_body without poses",
+        edit=replace_text(
+            'poses = "swing_motion.csv"', "gripper_to_body = { position_m = [0, 0, 0.1] }"
+        ),
+    ),
+    bad(
+        "gripper-to-body-with-markers", "found gripper_to_body and markers", "undeformed body",
+        edit=replace_text(
+            'poses = "swing_motion.csv"',
+            "gripper_to_body = {}, markers = { a = [0, 0, 0], b = [1, 0, 0], c = [0, 1, 0] }",
+        ),
+    ),
+    bad(
+        "gripper-to-body-not-unit", "gripper_to_body", "norm 1.41421", "order x, y, z, w",
+        options=settings("experiment.0.grasp.gripper_to_body={ quaternion_xyzw = [1, 0, 0, 1] }"),
     ),
     bad(
         "window-outside", "window_s = [5, 6]", "0 s to 0.08 s",

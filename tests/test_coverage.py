@@ -14,11 +14,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_coverage import CASES, KINDS, Outcome, run
 
-TWINS = 30  # of each case; two cases have the same noise
+TWINS = 15  # of each case; two cases have the same noise
 SIGMA_M = 1e-3
 # What chance leaves out in one of a thousand tests.
 RARE = 1e-3
 NOISES = {"white": CASES[:2], "autoregressive": CASES[2:]}
+AUTO = KINDS.index(("auto", "auto"))
 ROBUST, TEXTBOOK = KINDS.index(("estimated", "auto")), KINDS.index(("estimated", "independent"))
 FEWEST = float(binom.ppf(RARE / 2, 2 * TWINS, 0.95)) / (2 * TWINS)
 
@@ -53,9 +54,10 @@ def test_every_twin_is_solved(noise):
     assert all(outcome.converged for outcome in outcomes(noise))
 
 
+@pytest.mark.parametrize("kind", [ROBUST, AUTO])
 @pytest.mark.parametrize("noise", NOISES)
-def test_intervals_hold_the_truth(noise):
-    assert (held(noise, ROBUST) >= FEWEST).all()
+def test_intervals_hold_the_truth(noise, kind):
+    assert (held(noise, kind) >= FEWEST).all()
 
 
 @pytest.mark.parametrize("noise", NOISES)

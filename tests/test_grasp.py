@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from collocation_sysid.experiment import Grasp, PoseSequence, held_nodes
 POINTS = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.3]])
 
 
-def turning_poses(interpolation: Any = "linear", m=5, dt=0.1):
+def turning_poses(interpolation: Any = "smooth", m=5, dt=0.1):
     """A quarter turn about z in all, while moving along x at 1 m/s."""
     t = dt * np.arange(float(m))
     quaternions = Rotation.from_rotvec(np.outer(np.linspace(0, np.pi / 2, m), [0, 0, 1])).as_quat()
@@ -34,7 +35,7 @@ def test_linear_is_slerp_in_rotation_and_linear_in_position():
     t = np.array([0.0, 0.1, 0.25, 0.3])
     turns = Rotation.random(4, rng=rng)
     positions = rng.normal(size=(4, 3))
-    poses = PoseSequence(t, positions, turns.as_quat())
+    poses = PoseSequence(t, positions, turns.as_quat(), "linear")
     asked = np.linspace(0.0, 0.3, 37)
     rotations, translations = poses.at(asked)
     np.testing.assert_allclose(rotations, Slerp(t, turns)(asked).as_matrix(), atol=1e-13)
@@ -42,6 +43,136 @@ def test_linear_is_slerp_in_rotation_and_linear_in_position():
         np.testing.assert_allclose(
             translations[:, axis], np.interp(asked, t, positions[:, axis]), atol=1e-14
         )
+
+
+def waving(t_s):
+    """An analytic motion that neither starts nor ends at rest."""
+    rates = np.array([9.0, 7.0, 11.0])
+    positions_m = 0.05 * np.sin(np.outer(t_s, rates) + np.array([0.3, 1.5, 1.0]))
+    phases = np.array([0.2, 1.6, 0.5])
+    turns = Rotation.from_rotvec(0.7 * np.sin(np.outer(t_s, rates[::-1]) + phases))
+    return positions_m, turns
+
+
+def carried(poses, t_s):
+    return poses.carry(POINTS, t_s)
+
+
+def truly_carried(t_s):
+    positions_m, turns = waving(t_s)
+    return np.stack([turns.apply(point) + positions_m for point in POINTS], axis=1)
+
+
+def acceleration(motion, t_s, step_s=1e-3):
+    """By central differences, as an integrator sees it."""
+    return (motion(t_s + step_s) - 2 * motion(t_s) + motion(t_s - step_s)) / step_s**2
+
+
+def recorded(rate_hz, interpolation: Any = "smooth"):
+    t_s = np.arange(rate_hz + 1) / rate_hz
+    positions_m, turns = waving(t_s)
+    return PoseSequence(t_s, positions_m, turns.as_quat(), interpolation)
+
+
+def test_smooth_converges_with_the_fourth_order_in_position_and_the_second_in_acceleration():
+    asked = np.linspace(0.005, 0.995, 1501)  # up to the ends
+
+    def errors(rate_hz):
+        def motion(t_s):
+            return carried(recorded(rate_hz), t_s)
+
+        off = acceleration(motion, asked) - acceleration(truly_carried, asked)
+        return np.abs(motion(asked) - truly_carried(asked)).max(), np.sqrt(np.mean(off**2))
+
+    coarse, fine = np.array(errors(50)), np.array(errors(100))
+    orders = np.log2(coarse / fine)
+    assert orders[0] > 3.8
+    assert 1.7 < orders[1] < 3.0
+
+
+def test_poses_at_50_hz_give_accelerations_that_linear_interpolation_does_not():
+    asked = np.linspace(0.005, 0.995, 1501)
+    true = acceleration(truly_carried, asked)
+
+    def off(interpolation):
+        poses = recorded(50, interpolation)
+        found = acceleration(lambda t_s: carried(poses, t_s), asked, 1e-3)
+        return np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2))
+
+    assert off("smooth") < 0.005
+    assert off("smooth") < 0.1 * off("linear")
+
+
+def test_smooth_is_the_same_motion_in_any_frame():
+    poses, asked = recorded(20), np.linspace(0.0, 1.0, 57)
+    camera, body = Rotation.random(2, rng=3)
+    turned = PoseSequence(
+        poses.t_s,
+        camera.apply(poses.positions_m.copy()),
+        (camera * Rotation.from_quat(poses.quaternions_xyzw) * body).as_quat(),
+    )
+    rotations, positions_m = poses.at(asked)
+    found, moved_m = turned.at(asked)
+    np.testing.assert_allclose(
+        found, (camera * Rotation.from_matrix(rotations) * body).as_matrix(), atol=1e-13
+    )
+    np.testing.assert_allclose(moved_m, camera.apply(positions_m), atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_poses_are_interpolated_as_far_as_they_allow(count):
+    poses = turning_poses("smooth", m=count)
+    asked = np.linspace(0.0, poses.t_s[-1], 11)
+    rotations, positions_m = poses.at(asked)
+    angle = np.pi / 2 * (asked / poses.t_s[-1] if count > 1 else 0.0 * asked)
+    np.testing.assert_allclose(positions_m[:, 0], asked, atol=1e-14)
+    found = Rotation.from_matrix(rotations).as_rotvec()[:, 2]
+    np.testing.assert_allclose(found, angle, atol=1e-12 if count < 3 else 1e-2)
+
+
+def test_smooth_does_not_overshoot_a_jump():
+    t_s = 0.1 * np.arange(12)
+    later = t_s > 0.55
+    turns = Rotation.from_rotvec(np.outer(later, [0, 0, 1.0]))
+    poses = PoseSequence(t_s, np.outer(later, [0.2, 0, 0]), turns.as_quat())
+    np.testing.assert_allclose(poses.jumps_s, [0.5])
+    asked = np.linspace(0.0, 1.1, 331)
+    rotations, positions_m = poses.at(asked)
+    angles = Rotation.from_matrix(rotations).as_rotvec()[:, 2]
+    still = (asked <= 0.5) | (asked >= 0.6)
+    np.testing.assert_allclose(positions_m[still, 0], 0.2 * (asked[still] > 0.55), atol=1e-15)
+    np.testing.assert_allclose(angles[still], 1.0 * (asked[still] > 0.55), atol=1e-14)
+    assert 0 <= positions_m[:, 0].min() <= positions_m[:, 0].max() <= 0.2
+    np.testing.assert_allclose(positions_m[asked == 0.55, 0], 0.1)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 20, 50, 200])
+def test_a_motion_that_samples_resolve_has_no_jumps(rate_hz):
+    assert recorded(rate_hz).jumps_s.size == 0
+    t_s = np.arange(rate_hz + 1) / rate_hz
+    started = np.outer(np.maximum(t_s - 0.5, 0.0), [1.0, 0, 0])  # at full speed from rest
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    assert PoseSequence(t_s, started, upright).jumps_s.size == 0
+
+
+def test_after_moves_by_the_matrix_first():
+    gripper = recorded(20)
+    of_body = np.eye(4)
+    of_body[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
+    of_body[:3, 3] = 0.1, -0.2, 0.05
+    body = gripper.after(of_body)
+    in_gripper = POINTS @ of_body[:3, :3].T + of_body[:3, 3]
+    np.testing.assert_allclose(
+        body.carry(POINTS, gripper.t_s), gripper.carry(in_gripper, gripper.t_s), atol=1e-14
+    )
+    held = replace(gripper, interpolation="hold").after(np.eye(4))
+    assert held.interpolation == "hold"
+    np.testing.assert_allclose(held.positions_m, gripper.positions_m)
+
+
+def test_a_matrix_that_is_no_rigid_motion_is_refused():
+    with pytest.raises(InputError, match="mirrors: its determinant"):
+        recorded(20).after(np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
 def test_hold_keeps_the_latest_sample():
@@ -77,16 +208,17 @@ def test_a_single_pose_holds_for_all_time():
     np.testing.assert_allclose(poses.carry(POINTS, [0.0, 5.0])[1], expected, atol=1e-15)
 
 
-def test_half_a_sample_beyond_the_ends_continues_the_motion():
-    poses = turning_poses()
+@pytest.mark.parametrize(("interpolation", "off"), [("linear", 1e-12), ("smooth", 1e-3)])
+def test_half_a_sample_beyond_the_ends_continues_the_motion(interpolation, off):
+    poses = turning_poses(interpolation)
     rotations, translations = poses.at([-0.05, 0.45])
     np.testing.assert_allclose(translations[:, 0], [-0.05, 0.45])
     angles = Rotation.from_matrix(rotations).as_rotvec()[:, 2]
-    np.testing.assert_allclose(angles, [-np.pi / 16, np.pi / 2 + np.pi / 16])
+    np.testing.assert_allclose(angles, [-np.pi / 16, np.pi / 2 + np.pi / 16], atol=off)
 
 
 @pytest.mark.parametrize("time", [-0.06, 0.46, np.nan])
-@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+@pytest.mark.parametrize("interpolation", ["smooth", "linear", "hold"])
 def test_times_outside_the_sequence_are_refused(time, interpolation):
     with pytest.raises(InputError, match=r"poses run from 0 s to 0\.4 s"):
         turning_poses(interpolation).at([0.2, time])
@@ -144,7 +276,7 @@ def test_shapes_must_agree(t_s, positions, quaternions):
 
 
 def test_an_unknown_interpolation_is_refused():
-    with pytest.raises(InputError, match="'cubic'"):
+    with pytest.raises(InputError, match="'cubic'; expected one of smooth, linear, hold"):
         turning_poses("cubic")
 
 

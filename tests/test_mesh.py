@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.quadratic import EDGES
 from collocation_sysid.fem.selection import Named
@@ -333,7 +335,7 @@ def test_physical_groups_are_cells_and_nodes_by_name_and_dimension(tmp_path, ver
     np.testing.assert_array_equal(mesh.select(Named("skin")), [1, 2, 3, 4])
     # A group of faces has nodes only, though its tag is the one of a group of cells.
     np.testing.assert_array_equal(mesh.select(Named("floor")), [0, 1, 2])
-    with pytest.raises(InputError, match='no cell array "floor"; it has "core", "skin"'):
+    with pytest.raises(InputError, match='no cell array or group "floor"; it has "core", "skin"'):
         Named("floor").resolve_cells(mesh)
 
 
@@ -342,6 +344,64 @@ def test_groups_without_a_name_are_called_by_their_tag(tmp_path, version):
     (tmp_path / "two.msh").write_text(MSH_FILES[version])
     mesh = TetMesh.read(tmp_path / "two.msh")
     np.testing.assert_array_equal(mesh.select(Named("physical_5")), [2, 3, 4])
+
+
+def write_clamped(path: Path, file_format: str, names: dict[str, tuple[int, int]]) -> TetMesh:
+    """A bar whose end face is in a group of triangles, with a node in front that no cell has."""
+    bar = box_mesh((0.1, 0.04, 0.03), (3, 2, 2))
+    at_end = np.isclose(bar.points_m[bar.surface][:, :, 0], 0.0).all(axis=1)
+    cells = [bar.surface[at_end] + 1, bar.tetrahedra + 1]
+    tags = [np.full(len(block), 7) for block in cells]
+    entities = np.full((1 + len(bar.points_m), 2), (3, 1))
+    entities[cells[0].ravel()] = 2, 1
+    mesh = meshio.Mesh(
+        np.insert(bar.points_m, 0, 9.0, axis=0),
+        list(zip(("triangle", "tetra"), cells, strict=True)),
+        point_data={"gmsh:dim_tags": entities},
+        cell_data={"gmsh:physical": tags, "gmsh:geometrical": [np.ones_like(t) for t in tags]},
+        field_data={name: np.array(key) for name, key in names.items()},
+    )
+    meshio.write(path, mesh, file_format, binary=False)
+    return bar
+
+
+@pytest.mark.parametrize("file_format", ["gmsh22", "gmsh"])  # 2.2 and 4.1
+def test_a_group_of_faces_can_be_clamped(tmp_path, file_format):
+    file = tmp_path / "bar.msh"
+    bar = write_clamped(file, file_format, {"clamp": (7, 2), "foam": (7, 3)})
+    mesh = TetMesh.read(file)
+    expected = np.flatnonzero(np.isclose(mesh.points_m[:, 0], 0.0))
+    assert len(expected) == 9
+    assert mesh.file_node_count == len(bar.points_m) + 1
+    np.testing.assert_array_equal(mesh.select(Named("clamp")), expected)
+    assert len(mesh.select(Named("foam"))) == len(bar.points_m)
+    body = Body(mesh, density_kg_m3=30.0, element="tet10")
+    at_end = np.flatnonzero(np.isclose(body.nodes_m[:, 0], 0.0))
+    np.testing.assert_array_equal(body.select(Named("clamp")), at_end)
+    message = 'no point array or group "clmp"; it has "clamp", "foam"; did you mean \'clamp\'?'
+    with pytest.raises(InputError, match=re.escape(message)):
+        mesh.select(Named("clmp"))
+
+
+@pytest.mark.parametrize("file_format", ["gmsh22", "gmsh"])
+def test_groups_of_two_dimensions_with_one_tag_and_no_name_are_told_apart(tmp_path, file_format):
+    write_clamped(tmp_path / "bar.msh", file_format, {})
+    mesh = TetMesh.read(tmp_path / "bar.msh")
+    assert len(mesh.select(Named("physical_7_surface"))) == 9
+    assert len(mesh.select(Named("physical_7_volume"))) == len(mesh.points_m)
+    with pytest.raises(InputError, match='it has "physical_7_surface", "physical_7_volume"'):
+        mesh.select(Named("physical_7"))
+
+
+def test_a_cell_of_several_groups_is_in_all_of_them(tmp_path):
+    entity = "1 0 0 0 1 1 1 {} 1 1\n"
+    assert entity.format("1 1") in MSH_FILES["4.1"]
+    both = MSH_FILES["4.1"].replace(entity.format("1 1"), entity.format("2 1 2"))
+    (tmp_path / "two.msh").write_text(both)
+    mesh = TetMesh.read(tmp_path / "two.msh")
+    np.testing.assert_array_equal(Named("core").resolve_cells(mesh), [0])
+    np.testing.assert_array_equal(Named("skin").resolve_cells(mesh), [0, 1])
+    np.testing.assert_array_equal(mesh.select(Named("skin")), np.arange(5))
 
 
 def test_a_file_without_tetrahedra_tells_what_it_holds(tmp_path):

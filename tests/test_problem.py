@@ -12,21 +12,22 @@ import meshio
 import numpy as np
 import pytest
 from problem_files import (
-    AT_TRUTH,
     GRASP,
     REFERENCES,
     SIZE_M,
     both,
     contents,
+    keep_lines,
     remove,
     replace_cell,
     replace_text,
     write,
 )
+from scipy.spatial.transform import Rotation
 
 from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import read_markers, read_poses
+from collocation_sysid.experiment import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.fem.materials import MATERIALS, neo_hookean
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.collocation import Collocation
@@ -223,7 +224,7 @@ def test_a_second_hand_without_poses_stays_where_it_is(tiny):
 
 
 def test_poses_are_interpolated_or_held_as_asked(tiny):
-    assert experiment_of(tiny).grasps[0].poses.interpolation == "linear"
+    assert experiment_of(tiny).grasps[0].poses.interpolation == "smooth"
     held = experiment_of(tiny, "experiment.0.grasp.interpolation=hold")
     assert held.grasps[0].poses.interpolation == "hold"
 
@@ -231,30 +232,38 @@ def test_poses_are_interpolated_or_held_as_asked(tiny):
 # Markers ------------------------------------------------------------------------------------------
 
 
-def test_markers_without_a_reference_are_placed_by_their_first_sample(tiny):
-    known = experiment_of(tiny).markers
+def test_places_of_markers_without_a_reference_start_from_their_first_sample(tiny):
     replace_text(f"reference_m = {REFERENCES}", "")(tiny)
-    found = experiment_of(tiny, *AT_TRUTH).markers
-    rng = np.random.default_rng(0)
-    shape = rng.normal(size=(known.placement.node_count, 3))
-    np.testing.assert_allclose(found.observe(shape), known.observe(shape), atol=1e-6)
+    experiment = experiment_of(tiny)
+    markers, nodes_m = experiment.markers, experiment.body.nodes_m
+    assert not markers.located.any()
+    np.testing.assert_allclose(experiment.place_sigma_m, np.linalg.norm(SIZE_M))
+    # The first pose is that of the undeformed body, and this marker is inside.
+    np.testing.assert_allclose(markers.observe(nodes_m)[1], markers.positions_m[0, 1], atol=1e-9)
 
 
 def test_some_markers_may_have_a_reference_and_others_not(tiny):
     known = experiment_of(tiny).markers
     replace_text("mid = [0.03, 0.02, 0.03], ", "")(tiny)
-    found = experiment_of(tiny, *AT_TRUTH).markers
+    experiment = experiment_of(tiny)
+    found = experiment.markers
     assert found.names == known.names
-    shape = np.eye(36, 3)
-    np.testing.assert_allclose(found.observe(shape), known.observe(shape), atol=1e-6)
+    assert found.located.tolist() == [True, False, True]
+    assert (experiment.place_sigma_m > 0).tolist() == [False, True, False]
+    shape, given = np.random.default_rng(0).normal(size=(36, 3)), [0, 2]
+    np.testing.assert_allclose(found.observe(shape)[given], known.observe(shape)[given])
 
 
 def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
     replace_text(f"reference_m = {REFERENCES}", "")(tiny)
     replace_cell(MARKERS, 2, 1, "")(tiny)
-    markers = experiment_of(tiny, *AT_TRUTH).markers
+    experiment = experiment_of(tiny)
+    markers = experiment.markers
     assert markers.missing.tolist() == [1, 0, 0]
-    assert markers.placement.distance_m[0] < 2e-3
+    start_m = markers.observe(experiment.body.nodes_m)[0]
+    (turn,), (shift_m,) = experiment.grasps[0].poses.at(experiment.t_s[1:2])
+    back_m = turn.T @ (markers.positions_m[1, 0] - shift_m)
+    assert np.linalg.norm(start_m - back_m) < 5e-3
 
 
 def test_markers_are_chosen_by_name_and_weighted_by_sigma(tiny):
@@ -307,8 +316,48 @@ def test_material_beyond_vector_code_is_noted(tiny, monkeypatch):
 def test_resampling_above_the_measured_rate_is_noted(tiny):
     problem = load(tiny, "experiment.0.resample_hz=200")
     assert len(problem.experiments[0].t_s) == 17
+    interpolated, above = problem.notes
+    assert "recorded at 100 Hz, were interpolated (smooth)" in interpolated
+    assert "resample_hz is above the markers' own rate" in above
+
+
+def test_a_recording_is_cut_to_what_its_poses_cover_and_says_so(tiny):
+    keep_lines(POSES, 7)(tiny)
+    problem = load(tiny)
+    np.testing.assert_allclose(problem.experiments[0].t_s, 0.01 * np.arange(6))
     (note,) = problem.notes
-    assert "resample_hz is above the markers' own rate" in note
+    assert note.startswith("experiment 'swing': the markers were cut to the time of the poses by")
+    assert "0.03 s at the end, 3 of 9 samples" in note
+
+
+def test_poses_of_another_rate_need_no_resampling(tiny):
+    expected = experiment_of(tiny)
+    poses = read_poses(tiny / POSES)
+    t_s = np.linspace(0.0, 0.08, 12)
+    rotations, positions_m = poses.at(t_s)
+    slower = PoseSequence(t_s, positions_m, Rotation.from_matrix(rotations).as_quat())
+    write_poses_csv(tiny / POSES, slower)
+    problem = load(tiny)
+    (experiment,) = problem.experiments
+    (note,) = problem.notes
+    assert "recorded at 137.5 Hz, were interpolated (smooth) at the markers' times, 100 Hz" in note
+    np.testing.assert_array_equal(experiment.t_s, expected.t_s)
+    np.testing.assert_array_equal(experiment.markers.positions_m, expected.markers.positions_m)
+    held = [e.held_positions(e.t_s) for e in (experiment, expected)]
+    np.testing.assert_allclose(*held, atol=1e-5)
+
+
+def test_poses_of_the_gripper_carry_the_body_that_it_holds(tiny):
+    expected = experiment_of(tiny)
+    of_body = np.eye(4)
+    of_body[:3, :3] = Rotation.from_quat([0.5, -0.5, 0.5, 0.5]).as_matrix()
+    of_body[:3, 3] = 0.02, -0.3, 0.1
+    poses = read_poses(tiny / POSES)
+    write_poses_csv(tiny / POSES, poses.after(np.linalg.inv(of_body)))  # what the gripper did
+    of_gripper = "{ position_m = [0.02, -0.3, 0.1], quaternion_xyzw = [0.5, -0.5, 0.5, 0.5] }"
+    found = experiment_of(tiny, f"experiment.0.grasp.gripper_to_body={of_gripper}")
+    held = [e.held_positions(e.t_s) for e in (found, expected)]
+    np.testing.assert_allclose(*held, atol=1e-9)
 
 
 def test_poses_may_be_faster_than_markers(tiny):
@@ -403,6 +452,8 @@ marker_offsets = { prior_m = 0.003 }
 time_shift = { prior_s = 0.01 }
 pose = { prior_rad = 0.02 }
 gravity = { prior_rad = 0.03 }
+hand_eye = "none"
+camera_offsets = { prior_m = 0.001 }
 """
 
 
@@ -410,7 +461,7 @@ gravity = { prior_rad = 0.03 }
 def loaded(tiny: Path) -> Path:
     """The tiny problem with loads and nuisance parameters."""
     file = tiny / "problem.toml"
-    file.write_text(file.read_text() + LOADS)
+    file.write_text(file.read_text().replace('nuisance = "none"\n', "") + LOADS)
     (tiny / "push.csv").write_text("t_s,fx_n,fy_n,fz_n\n0.0,0,0,0\n0.05,0,0,0.2\n")
     return tiny
 
@@ -430,6 +481,8 @@ def test_nuisance_is_read(loaded):
     unknown = experiment_of(loaded).nuisance
     assert (unknown.marker_offset_m, unknown.time_shift_s) == (0.003, 0.01)
     assert (unknown.pose_turn_rad, unknown.pose_shift_m, unknown.gravity_rad) == (0.02, None, 0.03)
+    assert (unknown.hand_eye_m, unknown.hand_eye_rad) == (None, None)
+    assert unknown.camera_offset_m == 0.001
 
 
 def test_a_grasp_may_hold_for_a_while(tiny):

@@ -78,9 +78,21 @@ def test_an_experiment_can_be_replaced_in_part():
     assert replace(swing, name="other").markers is swing.markers
 
 
-def test_markers_need_their_places():
-    with pytest.raises(cs.InputError, match=r"neither places_m nor a placement; expected places_m"):
-        seen(times(3), places_m=None)
+def test_markers_without_places_start_where_the_first_samples_are():
+    t_s = times(10)
+    tracks = np.tile([(0.01, 0.02, 0.0), (0.1, 0.05, 0.03)], (11, 1, 1))
+    somewhere = cs.Markers(t_s, tracks, 1e-3)
+    swing = cs.Experiment(box(), t_s, [cs.Grasp(TOP, lifted(t_s))], somewhere)
+    np.testing.assert_allclose(swing.markers.observe(box().nodes_m), tracks[0], atol=1e-12)
+    assert not swing.markers.located.any()
+    assert (swing.place_sigma_m > EDGE_M).all()
+
+
+def test_markers_have_places_or_a_placement():
+    swing = swung(box())
+    places, placement = [(0.0, 0.0, 0.0)] * 2, swing.markers.placement
+    with pytest.raises(cs.InputError, match=r"places_m and a placement; expected one of them"):
+        seen(times(3), places_m=places, placement=placement)
 
 
 def test_a_marker_far_from_the_body_is_refused():

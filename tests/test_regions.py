@@ -319,7 +319,7 @@ def test_cells_are_told_in_any_of_these_ways(slab, how):
         (Box([5, 5, 5], [6, 6, 6]), "selects none of the 12 cells"),
         (Ball([0, 0, 9], 0.1), "selects none of the 12 cells"),
         (Indices([3, 12]), "cell 12 does not exist; the mesh has 12 tetrahedra, numbered 0 to 11"),
-        (Named("third"), 'no cell array "third"; it has "second", "tag"'),
+        (Named("third"), 'no cell array or group "third"; it has "second", "tag"'),
         (Named("tag"), 'cell array "tag" holds 2; a selection needs only 0 and 1'),
         (np.zeros(12, bool), "mask .12,. that is true somewhere"),
         (np.ones(7, bool), "expected cell numbers, or a mask .12,."),

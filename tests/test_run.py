@@ -18,7 +18,14 @@ from collocation_sysid.rollout import Rollout
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.profiling import profile_of
 
-NUISANCE = "\n[experiment.nuisance]\nmarker_offsets = { prior_m = 0.003 }\n"
+NUISANCE = """
+[experiment.nuisance]
+camera_offsets = { prior_m = 0.003 }
+marker_offsets = "none"
+time_shift = "none"
+gravity = "none"
+hand_eye = "none"
+"""
 REDUCED = settings("solver.method=reduced-space")
 OFFSET_M = np.array([0.002, -0.001, 0.0015])
 
@@ -47,7 +54,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _with_nuisance(text: str) -> str:
     """Offsets are estimated in both experiments."""
-    head, *experiments = text.split("\n[[experiment]]\n")
+    head, *experiments = text.replace('nuisance = "none"\n', "").split("\n[[experiment]]\n")
     return "\n[[experiment]]\n".join([head, *(part + NUISANCE for part in experiments)])
 
 
@@ -62,7 +69,7 @@ def finished(two: Path):
 
 def test_nuisance_is_reported_with_unit_prior_and_error(finished):
     nuisance = result(finished)["nuisance"]["swing"]
-    first = [nuisance[f"offset of low, {axis} [m]"] for axis in "xyz"]
+    first = [nuisance[f"camera offset of low, {axis} [m]"] for axis in "xyz"]
     for found, truth in zip(first, OFFSET_M, strict=True):
         assert found["prior"] == 0.003
         assert 0 < found["std_error"] < 2e-4
@@ -73,7 +80,7 @@ def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(fi
     rollout = finished.rollouts["turn"]
     assert isinstance(rollout, Rollout)
     assert rollout.rms_m < 5e-4  # the offset alone is 2.7 mm of one in three markers
-    found = [rollout.nuisance[f"turn: offset of low, {axis} [m]"] for axis in "xyz"]
+    found = [rollout.nuisance[f"turn: camera offset of low, {axis} [m]"] for axis in "xyz"]
     np.testing.assert_allclose(found, OFFSET_M, atol=3e-4)
 
 
@@ -137,8 +144,8 @@ def test_the_terminal_shows_nuisance_verdicts_and_residuals(two, tmp_path, monke
         "solve", two / "problem.toml", *REDUCED, *sigma, "--out", tmp_path / "run"
     )
     assert outcome.code == 0
-    assert "nuisance parameters of 'swing': markers sit off their places by up to" in outcome.out
-    assert "mm (low)" in outcome.out
+    assert "estimated beside them of 'swing': " in outcome.out
+    assert "mm (prior 3)" in outcome.out
     assert "the data fix" in outcome.out
     assert "residuals: swing/" in outcome.out
     stored = json.loads((tmp_path / "run" / "result.json").read_text())

@@ -56,7 +56,7 @@ def test_a_named_array_selects_where_it_is_true(values):
 
 def test_an_unknown_name_lists_the_names_there_are(box):
     mesh = TetMesh(CORNERS, [[0, 1, 2, 3]], {"grip": [1, 0, 0, 0], "tip": [0, 0, 0, 1]})
-    with pytest.raises(InputError, match='no point array "grp"; it has "grip", "tip"'):
+    with pytest.raises(InputError, match='no point array or group "grp"; it has "grip", "tip"'):
         mesh.select(Named("grp"))
     with pytest.raises(InputError, match="it has none"):
         box.select(Named("grip"))

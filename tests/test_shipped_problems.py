@@ -130,7 +130,7 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
     (experiment,) = problem.experiments
     collocation = replace(
         noisy_run().solution.collocation,
-        experiments=[experiment if offsets else replace(experiment, nuisance=Nuisance())],
+        experiments=[experiment if offsets else replace(experiment, nuisance=Nuisance.none())],
         huber=problem.huber if huber else None,
     )
     return ReducedSpace()(collocation)

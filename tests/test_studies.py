@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
+import study_faults
 import study_methods
 import study_mismatch
 import study_noise
@@ -150,3 +152,40 @@ def test_noise_is_summed_up_over_converged_runs():
 
 def test_tables_are_markdown():
     assert markdown(("a", *HEADS[:1]), [("x", "1")]) == "| a | λ |\n| --- | ---: |\n| x | 1 |"
+
+
+# Faults -------------------------------------------------------------------------------------------
+
+
+def test_a_twin_with_noisy_poses_is_identified_and_listed():
+    found = study_faults.run("poses 0.1 mm, 0.06°, judged", (0, 1))
+    assert found.converged
+    assert found.held.sum() >= 3
+    (line,) = cells(f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}")
+    assert line[0] == "poses"
+    assert float(line[7]) == pytest.approx(100 * found.relative[0], rel=0.05)
+    assert line[-1] == "0"
+
+
+def test_faults_are_as_large_as_they_are_called():
+    rng, measured = np.random.default_rng(0), study_faults.measured()
+    before = measured.markers.positions_m
+    late, stated = study_faults.FAULTS["clock 2 ms late"](measured, rng)
+    speed = np.gradient(before, measured.timestep_s, axis=0)
+    change = late.markers.positions_m - stated.markers.positions_m
+    assert np.abs(change + 0.002 * speed).max() < 0.1 * np.abs(change).max()
+    actual, noisy = study_faults.FAULTS["poses 0.5 mm, 0.3°, given"](measured, rng)
+    shaken, smooth = noisy.grasps[0].poses, actual.grasps[0].poses
+    assert (shaken.positions_m - smooth.positions_m).std() == pytest.approx(5e-4, rel=0.2)
+    assert noisy.grasps[0].sigma_rad == pytest.approx(np.radians(0.3))
+    moved, _ = study_faults.FAULTS["places 1 mm"](measured, rng)
+    offsets = moved.markers.positions_m - before
+    assert np.linalg.norm(offsets, axis=2).mean() == pytest.approx(1.6e-3, rel=0.4)
+
+
+@pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
+def test_shares_beyond_chance_are_starred(count, shown):
+    outcome = study_faults.Outcome(True, np.ones(6), np.ones(6), np.ones(6), correlated=False)
+    missed = replace(outcome, held=np.zeros(6))
+    row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
+    assert cells(f"a\nb\n{row}")[0][1] == shown

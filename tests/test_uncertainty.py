@@ -165,7 +165,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
         columns.append((ahead - behind) / (2 * step))
     matrix = np.stack(columns, axis=1)
     expected = np.linalg.inv(matrix.T @ matrix)
-    found = covariance(collocation, z, errors="independent").covariance
+    found = covariance(collocation, z, noise="given", errors="independent").covariance
     deviations = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(deviations, deviations),
                                expected / np.outer(deviations, deviations), atol=1e-4)  # fmt: skip

@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..methods.method import Method
 from ..methods.reduced_space import ReducedSpace
+from ..methods.scan import started
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
+from ..statistics.cause import Cause
 from .cost import Cost, cost_notes, cost_warnings, costs
 from .derivatives import SAMPLES, derivative_errors, first_samples, shortened
+from .description import description_causes
 from .elements import ElementShape
+from .hold import Hold, hold_warnings, holds_of
 from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
 from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
 from .shape import BodyFinding, body_finding
@@ -31,6 +35,7 @@ __all__ = [
     "Cost",
     "ElementShape",
     "Findings",
+    "Hold",
     "MarkerFinding",
     "ModeFinding",
     "Motion",
@@ -62,6 +67,9 @@ class Findings:
     costs : tuple of Cost, one for each method of which they are known
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
+    holds : tuple of Hold, one for each grasp
+    causes : tuple of Cause
+        What is likely described wrongly; their sentences are the first warnings.
     notes, warnings : tuple of str
     """
 
@@ -83,6 +91,8 @@ class Findings:
     costs: tuple[Cost, ...]
     jacobian_error: float
     hessian_error: float
+    holds: tuple[Hold, ...]
+    causes: tuple[Cause, ...]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -97,8 +107,19 @@ class Findings:
 
 
 def check_problem(problem: Problem) -> Findings:
-    """Validate a loaded problem further and measure it."""
-    collocation = problem.collocation()
+    """Validate a loaded problem further and measure it.
+
+    Where parameters have no guess, a scan finds where a solve would start.
+
+    Raises
+    ------
+    InputError
+        Where no start is found.
+    """
+    collocation, scan = problem.collocation(), None
+    if problem.parameters.unguessed:
+        collocation, scan = started(collocation)
+        problem = replace(problem, parameters=collocation.parameters)
     guesses = problem.parameters.guesses
     z, start_notes = initial_variables(collocation)
     short = shortened(problem, SAMPLES).collocation()
@@ -115,14 +136,19 @@ def check_problem(problem: Problem) -> Findings:
         motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
         for s in collocation.segments
     )
-    warnings = _body_warnings(bodies)
+    causes, holds = description_causes(problem), _holds(problem, bodies)
+    warnings = [cause.sentence for cause in causes] + _body_warnings(bodies)
+    for hold in holds:
+        warnings += hold_warnings(hold)
     for motion in motions:
         warnings += motion_warnings(motion)
     for recording in recordings:
         body = next(each for each in bodies if recording.experiment in each.experiments)
         warnings += recording_warnings(recording, body.edges_m[1], body.diagonal_m)
     warnings += cost_warnings(chosen, found_costs) if chosen else []
-    notes = [*problem.notes, *start_notes]
+    said = {cause.sentence for cause in causes}
+    known = [note for note in problem.notes if note not in said]
+    notes = [*known, *([scan.sentence] if scan else []), *start_notes]
     for motion in motions:
         notes += motion_notes(motion)
     notes += cost_notes(chosen, found_costs) if chosen else []
@@ -145,6 +171,8 @@ def check_problem(problem: Problem) -> Findings:
         costs=found_costs,
         jacobian_error=jacobian_error,
         hessian_error=hessian_error,
+        holds=holds,
+        causes=causes,
         notes=tuple(notes),
         warnings=tuple(warnings),
     )
@@ -166,6 +194,11 @@ def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
         names = tuple(e.name for e in problem.experiments if e.body is body)
         found.append(body_finding(body, body.theta(problem.parameters.guesses), names))
     return tuple(found)
+
+
+def _holds(problem: Problem, bodies: tuple[BodyFinding, ...]) -> tuple[Hold, ...]:
+    edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
+    return tuple(hold for e in problem.experiments for hold in holds_of(e, edges_m[e.name]))
 
 
 def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:

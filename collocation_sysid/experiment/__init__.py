@@ -1,6 +1,6 @@
 """What is done to a body and measured on it: grasps, markers, files, and the experiment."""
 
-from .alignment import align
+from .alignment import Aligned, align
 from .clock import sample_interval_s
 from .experiment import Experiment
 from .force_files import read_forces
@@ -15,6 +15,7 @@ from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
 from .writers import write_markers_csv, write_poses_csv
 
 __all__ = [
+    "Aligned",
     "Experiment",
     "Force",
     "Grasp",

@@ -86,3 +86,12 @@ def rounding_s(t_s: Array) -> float:
         if np.allclose(t_s, np.round(t_s, decimals), rtol=1e-13, atol=1e-13):
             return min(10.0**-decimals, _ROUNDING_LIMIT * mean_s)
     return 0.0
+
+
+def unrounded_s(t_s: Array) -> Array:
+    """Return even times where rounding to the printed decimals explains all unevenness.
+
+    Other times are returned as they are.
+    """
+    even = even_times_s(t_s)
+    return even if np.abs(t_s - even).max() <= rounding_s(t_s) else t_s

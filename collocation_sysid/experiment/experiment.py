@@ -26,7 +26,7 @@ Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
 EARTH_M_S2 = (0.0, 0.0, -9.81)
-NOTHING_ELSE = Nuisance()
+AS_IN_A_LABORATORY = Nuisance()
 
 # Held nodes count as collinear when they deviate from a line by less than this part of its length.
 _COLLINEAR = 1e-6
@@ -65,7 +65,8 @@ class Experiment:
     forces : sequence of Force
         On the nodes besides gravity.
     nuisance : Nuisance
-        What else is to be estimated about this recording alone.
+        What else is to be estimated about this recording alone: by default what a careful
+        laboratory does not know better; `Nuisance.none` for ideal data.
 
     Raises
     ------
@@ -104,7 +105,7 @@ class Experiment:
         validation: bool = False,
         masses: Iterable[PointMass] = (),
         forces: Iterable[Force] = (),
-        nuisance: Nuisance = NOTHING_ELSE,
+        nuisance: Nuisance = AS_IN_A_LABORATORY,
     ) -> None:
         n = len(body.nodes_m)
         try:
@@ -113,7 +114,7 @@ class Experiment:
                 body=body,
                 t_s=times,
                 grasps=tuple(grasp.on(body, times) for grasp in grasps),
-                markers=markers.on(body),
+                markers=markers,
                 gravity_m_s2=read_only_floats(gravity_m_s2, (3,), "gravity_m_s2"),
                 name=name,
                 start=start,
@@ -126,6 +127,7 @@ class Experiment:
                 nuisance=nuisance,
             )
             self._check_time()
+            vars(self)["markers"] = markers.on(body, self._carried_back)
             self._check_nodes()
             self._check_start()
         except InputError as error:
@@ -204,14 +206,36 @@ class Experiment:
         That is the first grasp that holds throughout, else the first. Without a grasp the body
         stays where it is undeformed.
         """
+        return self._carry_rigidly(self.body.nodes_m, t_s)
+
+    def _carry_rigidly(self, points_m: Array, t_s: ArrayLike) -> Array:
         if not self.grasps:
-            return np.repeat(self.body.nodes_m[None], np.size(t_s), axis=0)
+            return np.repeat(points_m[None], np.size(t_s), axis=0)
         throughout = [grasp for grasp in self.grasps if grasp.holds(self.t_s).all()]
         poses = (throughout or self.grasps)[0].poses
         times = np.asarray(t_s, dtype=np.float64)
         if len(poses.t_s) > 1 and not throughout:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
-        return poses.carry(self.body.nodes_m, times)
+        return poses.carry(points_m, times)
+
+    def _carried_back(self, points_m: Array, t_s: Array) -> Array:
+        """Where points (M, 3) seen at `t_s` (M,) sit on the body if it was carried rigidly."""
+        origin_axes = np.vstack([np.zeros(3), np.eye(3)])
+        carried = self._carry_rigidly(origin_axes, t_s)  # (M, 4, 3)
+        turned = carried[:, 1:] - carried[:, :1]  # rows are the images of the axes
+        return np.einsum("mij,mj->mi", turned, points_m - carried[:, 0])
+
+    @property
+    def place_sigma_m(self) -> Array:
+        """(M,) standard deviation of each marker's place, zero where it is exact."""
+        markers = self.markers
+        usual = self.nuisance.marker_offset_m or 0.0
+        given = np.full(len(markers.names), usual)
+        if markers.places_sigma_m is not None:
+            own = markers.places_sigma_m
+            given = np.where(np.isfinite(own), own, usual)
+        body_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+        return np.where(markers.located, given, body_m)
 
     def _check_time(self) -> None:
         if len(self.t_s) < 3:

@@ -33,12 +33,17 @@ class Grasp:
         Where they are held; an experiment takes matrices as the poses at its times.
     from_s, until_s : float
         First and last time at which they are held; throughout by default.
+    sigma_m, sigma_rad : float, optional
+        Standard deviations of the noise of each pose, which widen the error bars; judged by how
+        rough the poses are where they are not given.
     """
 
     nodes: Index
     poses: PoseSequence
     from_s: float
     until_s: float
+    sigma_m: float | None
+    sigma_rad: float | None
 
     def __init__(
         self,
@@ -46,13 +51,25 @@ class Grasp:
         poses: PoseSequence | ArrayLike,
         from_s: float = -np.inf,
         until_s: float = np.inf,
+        sigma_m: float | None = None,
+        sigma_rad: float | None = None,
     ) -> None:
         if not from_s <= until_s:
             raise InputError(
                 f"a grasp holds from {from_s:g} s until {until_s:g} s; expected from_s <= until_s"
             )
         held = some_nodes(nodes, "the grasp")
-        vars(self).update(nodes=held, poses=poses, from_s=from_s, until_s=until_s)
+        for name, value in (("sigma_m", sigma_m), ("sigma_rad", sigma_rad)):
+            if value is not None and not value >= 0:
+                raise InputError(f"{name} of a grasp is {value:g}; expected 0 or more")
+        vars(self).update(
+            nodes=held,
+            poses=poses,
+            from_s=from_s,
+            until_s=until_s,
+            sigma_m=sigma_m,
+            sigma_rad=sigma_rad,
+        )
 
     def on(self, body: Body, t_s: Array) -> Grasp:
         """The same grasp with the nodes of a body, and matrices as the poses at `t_s`."""

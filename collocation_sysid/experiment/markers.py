@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
 from ..arrays import Array, Index
 from ..errors import InputError
 from .arrays import read_only_floats, read_only_tracks
-from .placement import Placement, place_markers
+from .placement import Attachment, Placement, Shape, place_markers
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["Markers", "Placement", "place_markers"]
 
 SHOWN = 4
+
+CarriedBack = Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +41,23 @@ class Markers:
         M distinct names; m1, m2, … by default.
     places_m : (M, 3) array, optional
         Where the markers sit on the undeformed body; the experiment makes the placement of it.
+        NaN where that is not known: the first sample tells where to start, and the place is
+        estimated with a prior as wide as the body. So are all without places and placement.
     placement : Placement, optional
         Weights of the nodes, one row per marker, in place of `places_m`.
+    places_sigma_m : (M,) array or float, optional
+        Standard deviation of the places given, zero for exact ones; that of the experiment's
+        nuisance by default.
+    on_surface : bool
+        Places that are estimated stay on the surface: two coordinates in place of three.
+    attach, max_distance_m
+        See `place_markers`.
 
     Raises
     ------
     InputError
-        If shapes disagree, names repeat, a sigma is not positive, or not exactly one of places
-        and placement is given.
+        If shapes disagree, names repeat, a sigma is not positive, or both places and placement
+        are given.
     """
 
     t_s: Array
@@ -56,6 +66,11 @@ class Markers:
     names: tuple[str, ...]
     places_m: Array | None
     placement: Placement
+    places_sigma_m: Array | None
+    on_surface: bool
+    located: NDArray[np.bool_]
+    attach: Attachment
+    max_distance_m: float | None
 
     def __init__(
         self,
@@ -65,20 +80,30 @@ class Markers:
         names: Sequence[str] | None = None,
         places_m: ArrayLike | None = None,
         placement: Placement | None = None,
+        places_sigma_m: ArrayLike | None = None,
+        on_surface: bool = False,
+        located: ArrayLike | None = None,
+        attach: Attachment = "auto",
+        max_distance_m: float | None = None,
     ) -> None:
         times = read_only_floats(t_s, (None,), "t_s of the markers")
         tracks = read_only_tracks(positions_m, (len(times), None, 3), "marker positions")
         m = tracks.shape[1]
-        if (places_m is None) == (placement is None):
-            found = "neither places_m nor" if placement is None else "places_m and"
+        if places_m is not None and placement is not None:
             raise InputError(
-                f"the markers have {found} a placement; expected places_m, where they sit on the "
-                "undeformed body in metres, or a placement that place_markers made"
+                "the markers have places_m and a placement; expected one of them, or neither "
+                "where the places are to be estimated"
             )
-        if places_m is not None:
-            places_m = read_only_floats(places_m, (m, 3), "places_m", finite=False)
-        elif placement is not None and len(placement.nodes) != m:
+        if placement is not None and len(placement.nodes) != m:
             raise InputError(f"{len(placement.nodes)} places on the body for {m} markers")
+        if placement is None:
+            places_m = np.full((m, 3), np.nan) if places_m is None else places_m
+            places_m = read_only_floats(places_m, (m, 3), "places_m", finite=False)
+            located = np.isfinite(places_m).all(axis=1)
+        known = np.ones(m, dtype=bool) if located is None else np.asarray(located, dtype=bool)
+        if places_sigma_m is not None:
+            each = np.broadcast_to(places_sigma_m, m)
+            places_sigma_m = read_only_floats(each, (m,), "places_sigma_m", finite=False)
         labels = tuple(f"m{k}" for k in range(1, m + 1)) if names is None else tuple(names)
         vars(self).update(
             t_s=times,
@@ -87,6 +112,11 @@ class Markers:
             names=labels,
             places_m=places_m,
             placement=placement,
+            places_sigma_m=places_sigma_m,
+            on_surface=on_surface,
+            located=known,
+            attach=attach,
+            max_distance_m=max_distance_m,
         )
 
     def __repr__(self) -> str:
@@ -95,12 +125,49 @@ class Markers:
         gaps = f", {missing} missing" if missing else ""
         return f"Markers({', '.join(shown)}: {self.samples} samples{gaps})"
 
-    def on(self, body: Body) -> Markers:
-        """The same markers with their placement on a body."""
+    def on(self, body: Body, carried_back: CarriedBack | None = None) -> Markers:
+        """The same markers with their placement on a body.
+
+        Parameters
+        ----------
+        body : Body
+        carried_back : callable, optional
+            From points (M, 3) and times (M,) to where they would be on the undeformed body, if a
+            grasp carried it rigidly. Markers whose place is not known start from there.
+
+        Raises
+        ------
+        InputError
+            If a marker is too far from the body, or was never seen and has no place.
+        """
         if self.places_m is None:
             return self
-        placement = place_markers(self.places_m, body.nodes_m, body, names=self.names)
+        known, places = self.located, self.places_m.copy()
+        if not known.all():
+            shape = Shape(body.nodes_m, body)
+            points_m, times_s = self.first_samples
+            back = points_m if carried_back is None else carried_back(points_m, times_s)
+            for m in np.flatnonzero(~known).tolist():
+                self._require_seen(m)
+                nodes, weights = shape.nearest(back[m])
+                places[m] = weights @ body.nodes_m[nodes]
+        placement = place_markers(
+            places, body.nodes_m, body, self.attach, self.max_distance_m, self.names
+        )
         return replace(self, places_m=None, placement=placement)
+
+    def _require_seen(self, m: int) -> None:
+        if not self.present[:, m].any():
+            raise InputError(
+                f"marker '{self.names[m]}' is never seen and has no place on the body; give its "
+                "reference_m, or leave it out"
+            )
+
+    @cached_property
+    def first_samples(self) -> tuple[Array, Array]:
+        """(M, 3) first present sample of every marker, NaN where there is none, and its time."""
+        rows = self.present.argmax(axis=0)
+        return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
@@ -122,21 +189,6 @@ class Markers:
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         around = nodes_m[..., self.placement.nodes, :]
         return np.einsum("mk,...mkd->...md", self.placement.weights, around)
-
-    @cached_property
-    def operator(self) -> sparse.csr_array:
-        """`observe` at one timestep as a (3M, 3n) matrix.
-
-        Row 3 m + axis is a coordinate of marker m, column 3 node + axis one of a node.
-        """
-        m, npe = self.placement.nodes.shape
-        marker = np.repeat(np.arange(m), npe)
-        per_node = sparse.csr_array(
-            (self.placement.weights.ravel(), (marker, self.placement.nodes.ravel())),
-            shape=(m, self.placement.node_count),
-        )
-        per_node.eliminate_zeros()
-        return sparse.csr_array(sparse.kron(per_node, sparse.eye_array(3), format="csr"))
 
 
 def _distinct(names: tuple[str, ...], count: int) -> tuple[str, ...]:

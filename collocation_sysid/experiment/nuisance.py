@@ -4,36 +4,57 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
+
 from ..errors import InputError
+
+DEGREE = float(np.pi / 180)
 
 
 @dataclass(frozen=True)
 class Nuisance:
     """Standard deviations of an experiment's nuisance parameters; None where not estimated.
 
-    Every one has a normal prior around zero with its deviation.
+    Every one has a normal prior around zero with its deviation. The defaults are those of a
+    careful laboratory; `none` is for ideal data.
 
     Attributes
     ----------
     marker_offset_m : float or None
-        A constant vector by which each marker sits off its place.
+        How far markers sit off the places given for them, each coordinate. An error of a place
+        turns with the body. Markers have deviations of their own in `Markers`.
     time_shift_s : float or None
         How much later than their times say the markers were seen, on the clock of the grasps.
-    pose_turn_rad, pose_shift_m : float or None
-        A small rigid motion, constant in time, by which grasps and body are off in the frame of
-        the markers. It turns the body against gravity.
     gravity_rad : float or None
         Tilt of gravity's direction about two axes across it.
+    hand_eye_m, hand_eye_rad : float or None
+        A small rigid motion, constant in time, by which the undeformed body is off in the grasp:
+        x = U_t H X. It is taken as none where the start is not an equilibrium: the state that is
+        given then tells where the body is.
+    pose_shift_m, pose_turn_rad : float or None
+        A small rigid motion, constant in time, by which grasps and body are off in the frame of
+        the markers, such as that of cameras. It turns the body against gravity.
+    camera_offset_m : float or None
+        A constant vector by which the cameras see each marker off.
     """
 
-    marker_offset_m: float | None = None
-    time_shift_s: float | None = None
-    pose_turn_rad: float | None = None
+    marker_offset_m: float | None = 1e-3
+    time_shift_s: float | None = 5e-3
+    gravity_rad: float | None = DEGREE
+    hand_eye_m: float | None = 1e-3
+    hand_eye_rad: float | None = 0.5 * DEGREE
     pose_shift_m: float | None = None
-    gravity_rad: float | None = None
+    pose_turn_rad: float | None = None
+    camera_offset_m: float | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None and not value > 0:
                 raise InputError(f"{field.name} is {value:g}; expected a deviation above 0")
+
+    @classmethod
+    def none(cls, **deviations: float | None) -> Nuisance:
+        """Nothing is estimated but what is named."""
+        nothing: dict[str, float | None] = {field.name: None for field in fields(cls)}
+        return cls(**(nothing | deviations))

@@ -108,7 +108,7 @@ def place_markers(
             f"marker '{labels[lost[0]]}' has no position from which to find its place on the body; "
             "give its reference_m"
         )
-    shape = _Shape(nodes_m, body)
+    shape = Shape(nodes_m, body)
     snap_m = {"auto": VERTEX_SNAP * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[attach]
     limit_m = shape.mean_edge_m if max_distance_m is None else max_distance_m
 
@@ -133,7 +133,7 @@ def place_markers(
     return Placement(nodes, weights, distance, len(nodes_m))
 
 
-class _Shape:
+class Shape:
     """The body in one configuration, prepared for locating points."""
 
     def __init__(self, nodes_m: Array, body: Body) -> None:
@@ -158,20 +158,45 @@ class _Shape:
 
     def embed(self, point: Array) -> tuple[Index, Array, float]:
         """Nodes, weights and distance to the surface of a marker inside or outside the body."""
-        depth = self._barycentric(point, slice(None)).min(axis=1)
-        cell = int(np.argmax(depth))
-        distance = 0.0
-        if depth[cell] < -_INSIDE_TOLERANCE:
-            to_faces = _distance_to_triangles(point, self.triangles)
-            distance = float(to_faces.min())
-            # Where an edge or corner is nearest, extrapolate from the element that must the least.
-            nearest = self.face_owner[to_faces <= distance + 1e-9 * self.mean_edge_m]
-            cell = int(nearest[np.argmax(depth[nearest])])
+        cell, distance = self.cell_of(point)
         return self.body.cells[cell], self._weights(point, cell), distance
 
-    def _barycentric(self, point: Array, cells: slice | Index) -> Array:
-        rest = np.einsum("ei,eij->ej", point - self.origin[cells], self.inverse[cells])
+    def cell_of(self, point: Array) -> tuple[int, float]:
+        """The element that holds a point (3,), or is nearest to it, and the distance between."""
+        depth = self.barycentric(point, slice(None)).min(axis=1)
+        cell = int(np.argmax(depth))
+        if depth[cell] >= -_INSIDE_TOLERANCE:
+            return cell, 0.0
+        to_faces = _distance_to_triangles(point, self.triangles)
+        distance = float(to_faces.min())
+        # Where an edge or corner is nearest, extrapolate from the element that must the least.
+        nearest = self.face_owner[to_faces <= distance + 1e-9 * self.mean_edge_m]
+        return int(nearest[np.argmax(depth[nearest])]), distance
+
+    def nearest(self, point: Array) -> tuple[Index, Array]:
+        """Nodes and weights of the point of the body that is nearest to a point (3,)."""
+        nodes, weights, distance = self.embed(point)
+        if distance == 0.0:
+            return nodes, weights
+        nodes, weights, _ = self.embed(self.on_surface(point)[0])
+        return nodes, weights
+
+    def on_surface(self, point: Array) -> tuple[Array, Array]:
+        """The nearest point of the surface, and two directions (3, 2) in its face."""
+        face = int(np.argmin(_distance_to_triangles(point, self.triangles)))
+        corners = self.triangles[face]
+        along = np.asarray(np.linalg.qr((corners[1:] - corners[0]).T)[0], dtype=np.float64)
+        return _nearest_in_triangle(point, corners), along
+
+    def barycentric(self, points: Array, cells: slice | Index) -> Array:
+        """Barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in cells (k,)."""
+        rest = np.einsum("ei,eij->ej", points - self.origin[cells], self.inverse[cells])
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
+
+    def gradients(self, cells: Index) -> Array:
+        """Their derivatives (k, 4, 3) by the point."""
+        rest = np.asarray(np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64)
+        return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _weights(self, point: Array, cell: int) -> Array:
         """Shape functions at the point.
@@ -180,7 +205,7 @@ class _Shape:
         curved a quadratic element they are corrected until the element maps them to the point.
         """
         one = np.array([cell])
-        local = self._barycentric(point, one)
+        local = self.barycentric(point, one)
         best, best_miss = self.body.element.shape_functions(local)[0], np.inf
         for _ in range(_EMBEDDING_ITERATIONS):
             weights = self.body.element.shape_functions(local)[0]
@@ -191,6 +216,21 @@ class _Shape:
             step = miss @ self.inverse[cell]
             local = local + np.concatenate([[-step.sum()], step])
         return best
+
+
+def _nearest_in_triangle(point: Array, corners: Array) -> Array:
+    """The point of a triangle (3, 3) that is nearest to a point (3,)."""
+    a, edges = corners[0], (corners[1:] - corners[0]).T
+    share = np.linalg.lstsq(edges, point - a, rcond=None)[0]
+    if (share >= 0).all() and share.sum() <= 1:
+        return np.asarray(a + edges @ share, dtype=np.float64)
+    ends = [(corners[i], corners[j]) for i, j in combinations(range(3), 2)]
+    feet = [
+        p + np.clip((point - p) @ (q - p) / ((q - p) @ (q - p)), 0.0, 1.0) * (q - p)
+        for p, q in ends
+    ]
+    nearest = int(np.argmin([np.linalg.norm(point - foot) for foot in feet]))
+    return np.asarray(feet[nearest], dtype=np.float64)
 
 
 def _boundary_faces(corners: Index) -> tuple[Index, Index]:

@@ -1,25 +1,27 @@
 """Rigid motions over time, as they carry what a robot holds.
 
-A pose maps undeformed to current positions, x = R X + p. Between the samples of a sequence it is
-either interpolated (linear in position, SLERP in rotation) or held (zero-order hold).
+A pose maps undeformed to current positions, x = R X + p. Between the samples of a sequence the
+motion is smooth (splines with continuous accelerations), linear, or held (zero-order hold).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import PPoly
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..errors import InputError
 from .arrays import read_only_floats
 from .clock import TIME_TOLERANCE_S, first_time_fault
+from .splines import jumps, smooth_spline
 
-Interpolation = Literal["linear", "hold"]
+Interpolation = Literal["smooth", "linear", "hold"]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
@@ -40,8 +42,10 @@ class PoseSequence:
     quaternions_xyzw : (m, 4) array
         R, scalar last as in SciPy. Norms within 1e-3 of one are normalised; signs are made
         continuous in time.
-    interpolation : {"linear", "hold"}
-        Between samples: linear in position with SLERP in rotation, or the latest sample.
+    interpolation : {"smooth", "linear", "hold"}
+        Between samples: cubic splines of the position and of the quaternion, which is then
+        normalised; linear in position with SLERP in rotation; or the latest sample. Across a jump
+        (see `splines`) and between two poses alone "smooth" is linear.
 
     Raises
     ------
@@ -53,7 +57,7 @@ class PoseSequence:
     t_s: Array
     positions_m: Array
     quaternions_xyzw: Array
-    interpolation: Interpolation = "linear"
+    interpolation: Interpolation = "smooth"
 
     def __post_init__(self) -> None:
         t_s = read_only_floats(self.t_s, (None,), "t_s of the poses", finite=False)
@@ -65,8 +69,9 @@ class PoseSequence:
             self.quaternions_xyzw, (m, 4), "quaternions_xyzw", finite=False
         )
         if self.interpolation not in get_args(Interpolation):
+            expected = ", ".join(get_args(Interpolation))
             raise InputError(
-                f"interpolation of poses is {self.interpolation!r}; expected 'linear' or 'hold'"
+                f"interpolation of poses is {self.interpolation!r}; expected one of {expected}"
             )
         if fault := first_pose_fault(t_s, positions, quaternions):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
@@ -81,7 +86,7 @@ class PoseSequence:
 
     @classmethod
     def from_matrices(
-        cls, t_s: ArrayLike, matrices: ArrayLike, interpolation: Interpolation = "linear"
+        cls, t_s: ArrayLike, matrices: ArrayLike, interpolation: Interpolation = "smooth"
     ) -> PoseSequence:
         """Poses from 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) in metres, at the times `t_s` (m,).
 
@@ -97,11 +102,30 @@ class PoseSequence:
         quaternions = Rotation.from_matrix(given[:, :3, :3]).as_quat()
         return cls(times, given[:, :3, 3], quaternions, interpolation)
 
+    def after(self, matrix: ArrayLike) -> PoseSequence:
+        """Return the poses that move by a 4×4 matrix [[R, p], [0, 1]] first, then as these do.
+
+        Where these are poses U_t of a gripper and the matrix G says where the undeformed body is
+        in the gripper's frame, the result is the body's: x = U_t G X.
+
+        Raises
+        ------
+        InputError
+            If the matrix is no rigid motion.
+        """
+        first = PoseSequence.from_matrices([0.0], np.asarray(matrix)[None])
+        rotations, positions_m = self._rotations, self.positions_m
+        return replace(
+            self,
+            positions_m=positions_m + rotations.as_matrix() @ first.positions_m[0],
+            quaternions_xyzw=(rotations * first._rotations[0]).as_quat(),
+        )
+
     def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return the poses at the times `t_s` (k,).
 
-        Up to half a sample before the first and after the last pose is allowed: "linear" continues
-        the motion of the end interval there, "hold" repeats the end pose.
+        Up to half a sample before the first and after the last pose is allowed: "smooth" and
+        "linear" continue the motion of the end interval there, "hold" repeats the end pose.
 
         Returns
         -------
@@ -123,10 +147,16 @@ class PoseSequence:
             snap_s = _HOLD_SNAP * np.diff(self.t_s).min() + TIME_TOLERANCE_S
             k = np.maximum(np.searchsorted(self.t_s, times + snap_s, side="right") - 1, 0)
             return self._rotations.as_matrix()[k], self.positions_m[k]
+        if self.interpolation == "smooth" and len(self.t_s) > 2:
+            turned = Rotation.from_quat(self._quaternion_spline(times))
+            return turned.as_matrix(), self._position_spline(times)
+        return self._linear_at(times)
+
+    def _linear_at(self, times: Array) -> tuple[Array, Array]:
         k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
         fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
         step_m = self.positions_m[k + 1] - self.positions_m[k]
-        turn = Rotation.from_rotvec(fraction * self._turns[k])
+        turn = Rotation.from_rotvec(fraction * self.turns[k])
         rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
         return rotations, self.positions_m[k] + fraction * step_m
 
@@ -137,11 +167,27 @@ class PoseSequence:
         return np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
 
     @cached_property
+    def jumps_s(self) -> Array:
+        """Times of the samples after which the position or the rotation jumps."""
+        of_position = jumps(self.t_s, self.positions_m)
+        of_rotation = jumps(self.t_s, self.quaternions_xyzw)
+        return self.t_s[np.union1d(of_position, of_rotation)]
+
+    @cached_property
+    def _position_spline(self) -> PPoly:
+        return smooth_spline(self.t_s, self.positions_m)
+
+    @cached_property
+    def _quaternion_spline(self) -> PPoly:
+        # Normalised it keeps its smoothness and its order, and no frame of reference is special.
+        return smooth_spline(self.t_s, self.quaternions_xyzw)
+
+    @cached_property
     def _rotations(self) -> Rotation:
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
-    def _turns(self) -> Array:
+    def turns(self) -> Array:
         """Rotation vector from each sample to the next, in the frame of the earlier one."""
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 

@@ -53,8 +53,8 @@ class RigidFit:
     def poses(self, t_s: ArrayLike) -> PoseSequence:
         """Return the poses at the times `t_s` (T,) of the frames.
 
-        Missing frames between others are interpolated, linear in position and SLERP in rotation;
-        those before the first and after the last pose are left out.
+        Missing frames between others are interpolated smoothly; those before the first and after
+        the last pose are left out.
 
         Raises
         ------

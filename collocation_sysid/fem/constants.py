@@ -41,6 +41,8 @@ class Constant:
         Whether the constant is a positive number whose logarithm is estimated, or any number.
     typical : float or None
         What a linear one may change by in a step, where its guess does not tell.
+    usual : float or None
+        Value in a soft foam or rubber, where there is no guess; moduli follow the stiffness.
     below : float
         Values are less than this.
     """
@@ -51,6 +53,7 @@ class Constant:
     bounds: tuple[float, float] = (1e-6, 1e9)
     scale: Scale = "log"
     typical: float | None = None
+    usual: float | None = None
     below: float = float("inf")
 
     @property
@@ -64,15 +67,17 @@ LAMBDA = Constant("lambda_pa", "λ", "first Lamé parameter", STIFFNESS)
 MU = Constant("mu_pa", "μ", "shear modulus", STIFFNESS)
 KAPPA = Constant("kappa_pa", "κ", "bulk modulus", (1.0, 1e10))
 YOUNG = Constant("young_pa", "E", "Young's modulus", STIFFNESS)
-POISSON = Constant("poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, below=0.5)
-GAMMA_R = Constant("gamma_r_s", "γ_r", "stiffness-proportional damping", (1e-7, 10.0))
-GAMMA_M = Constant("gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4))
+POISSON = Constant("poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 0.1, 0.3, 0.5)
+GAMMA_R = Constant("gamma_r_s", "γ_r", "stiffness-proportional damping", (1e-7, 10.0), usual=3e-3)
+GAMMA_M = Constant("gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4), usual=0.3)
 C10 = Constant("c10_pa", "C₁₀", "half the shear modulus, or a share of it", STIFFNESS)
 C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", STIFFNESS)
 C20 = Constant("c20_pa", "C₂₀", "factor of (Ī₁ − 3)²", (-1e9, 1e9), "linear")
 C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "linear")
-GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4))
-CHAIN_STRETCH = Constant("chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0))
+GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), usual=50.0)
+CHAIN_STRETCH = Constant(
+    "chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0), usual=5.0
+)
 
 # The constants that have a symbol, by name: what tables and pictures look up.
 KNOWN: Mapping[str, Constant] = {
@@ -115,6 +120,31 @@ def symbol_of(name: str) -> str:
 def constant_named(name: str) -> Constant:
     """The known constant of this name, or one of which nothing but the name is known."""
     return KNOWN.get(bare(name), Constant(bare(name)))
+
+
+def is_modulus(name: str) -> bool:
+    """Whether a constant scales with the stiffness of its material."""
+    return unit_of(name) == "Pa"
+
+
+def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:
+    """A sensible value of a constant in a material of given stiffness; None where none is known.
+
+    A modulus that is not known by name has the size of the shear modulus.
+    """
+    if not is_modulus(name):
+        return constant_named(name).usual
+    shear = young_pa / (2 * (1 + poisson))
+    shares = {
+        "lambda_pa": 2 * poisson / (1 - 2 * poisson),
+        "kappa_pa": 2 * (1 + poisson) / (3 * (1 - 2 * poisson)),
+        "young_pa": 2 * (1 + poisson),
+        "c10_pa": 0.5,
+        "c01_pa": 0.1,
+        "c20_pa": 0.0,
+        "c30_pa": 0.0,
+    }
+    return shear * shares.get(bare(name), 1.0)
 
 
 def _without_unit(name: str) -> str:

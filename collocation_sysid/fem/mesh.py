@@ -110,8 +110,8 @@ class TetMesh:
         on edges. Slightly curved sides are straightened and noted.
 
         Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`; cell
-        arrays, cell sets and physical groups of the tetrahedra become `cell_arrays`, and those
-        groups' nodes `point_arrays` too.
+        arrays, cell sets and physical groups of the tetrahedra become `cell_arrays`. The nodes of
+        sets and groups, also of those of triangles, lines or points, become `point_arrays` too.
 
         Parameters
         ----------

@@ -40,7 +40,8 @@ def read_tetrahedra(
     tetrahedra : (E, 4)
         E > 0.
     point_arrays : dict of name to (n, ...) array
-        The file's point data, and its point sets and physical groups as booleans.
+        The file's point data, and as booleans its point sets and the nodes of its cell sets and
+        physical groups, whatever the dimension of their cells.
     cell_arrays : dict of name to (E, ...) array
         The same of the tetrahedra.
     notes : tuple of str
@@ -65,13 +66,14 @@ def read_tetrahedra(
             notes += straightened(points_m, np.concatenate(quadratic))
         except InputError as error:
             raise error.located(path) from None
-    groups = _physical_groups(data)
+    # Where a cell is in several groups, the sets of a .msh file tell all, its tags only the first.
+    groups = {**_physical_groups(data), **_cell_sets(data)}
     nodes = {name: _nodes_of(data, per_block) for name, per_block in groups.items()}
     return (
         points_m,
         np.concatenate([block.data[:, :4] for block in blocks]),
         {**nodes, **_point_sets(data), **data.point_data},
-        _of_tetrahedra(data, {**groups, **_cell_sets(data), **data.cell_data}),
+        _of_tetrahedra(data, {**groups, **data.cell_data}),
         notes,
     )
 
@@ -174,19 +176,27 @@ def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
 
 
 def _physical_groups(data: Any) -> dict[str, list[np.ndarray]]:
-    """Physical groups of a .msh file by name, or "physical_<tag>", as booleans block by block."""
+    """Physical groups of a .msh file by name, as booleans block by block.
+
+    One without a name is "physical_<tag>", and its dimension follows where others have its tag.
+    """
     tags = [np.asarray(block).ravel() for block in data.cell_data.get("gmsh:physical", ())]
     if not tags:
         return {}
     names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
-    groups: dict[str, list[np.ndarray]] = {}
+    found: dict[tuple[int, int], list[np.ndarray]] = {}
     for dimension in range(4):
         here = [np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)]
         for tag in np.unique(np.concatenate(here)):
             if tag > 0:
-                name = names.get((int(tag), dimension), f"physical_{tag}")
-                groups[name] = [block == tag for block in here]
-    return groups
+                found[int(tag), dimension] = [block == tag for block in here]
+    nameless = Counter(tag for tag, dimension in found if (tag, dimension) not in names)
+    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in found.items()}
+
+
+def _called(tag: int, dimension: int, ambiguous: bool) -> str:
+    kind = ("points", "lines", "surface", "volume")[dimension]
+    return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
 
 
 def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, hint_at
 
 if TYPE_CHECKING:
     from .nodes import Mesh, Nodes
@@ -149,8 +149,9 @@ class Indices:
 class Named:
     """Where a point array of the mesh, or for cells a cell array, is true: booleans or 0 and 1.
 
-    A node on an edge is selected when both of the edge's ends are. The physical groups of a .msh
-    file are both: arrays by their names.
+    A node on an edge is selected when both of the edge's ends are. A physical group of a .msh file
+    selects the nodes of its elements, be they points, lines, triangles or tetrahedra, and a group
+    of tetrahedra the cells.
     """
 
     name: str
@@ -169,9 +170,12 @@ class Named:
     def _mask(self, arrays: Mapping[str, np.ndarray], count: int, what: str) -> np.ndarray:
         kind = what.split(" ", 1)[0]
         if self.name not in arrays:
-            names = ", ".join(f'"{name}"' for name in arrays)
+            names = ", ".join(f'"{name}"' for name in arrays if not name.startswith("gmsh:"))
             available = f"it has {names}" if names else "it has none"
-            raise InputError(f"the mesh has no {what}; {available}")
+            hint = hint_at(self.name, arrays)
+            raise InputError(
+                f'the mesh has no {kind} array or group "{self.name}"; {available}{hint}'
+            )
         values = arrays[self.name]
         if values.size != count:
             each = {"point": "node", "cell": "cell"}[kind]

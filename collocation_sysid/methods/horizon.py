@@ -112,17 +112,23 @@ class Horizon:
         SimulationError
             Where it is singular or not finite.
         """
+        tangents = []
+        for k, part in enumerate(self.collocation.parts_at(p, x)):
+            before = known.tangents[k] if known else None
+            tangents.append(self.solvers[k].forward(part.x, part.setting, before))
+        return self.read(p, x, tangents)
+
+    def read(self, p: Array, x: list[Array], tangents: list[Tangent]) -> Point:
+        """A point whose tangents are known, with its markers as the collocation reads them."""
         collocation = self.collocation
         nq = collocation.nq
-        tangents, residuals, slopes = [], [], []
-        for k, part in enumerate(collocation.parts_at(p, x)):
-            before = known.tangents[k] if known else None
-            tangent = self.solvers[k].forward(part.x, part.setting, before)
+        residuals, slopes = [], []
+        for part, tangent in zip(collocation.parts_at(p, x), tangents, strict=True):
             segment, observation = part.segment, part.segment.observation
             residual, here = observation.linearised(
                 part.x + tangent.step,
                 part.phi,
-                observation.at_samples(tangent.by_p),
+                observation.at_samples(tangent.by_p, part.phi),
                 segment.moving,
                 nq,
             )
@@ -131,7 +137,6 @@ class Horizon:
             residual = residual.ravel()
             if collocation.huber is not None:
                 residual, slope = huberised(residual, slope, collocation.huber)
-            tangents.append(tangent)
             residuals.append(residual)
             slopes.append(slope)
         if self.prior is not None:

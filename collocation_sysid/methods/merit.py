@@ -89,7 +89,7 @@ class Unconstrained:
 
     def grasped(self, z: Array) -> Array:
         """The point with all held nodes exactly where their grasps are."""
-        moved = [part.segment.grasped(part.x) for part in self.nlp.parts(z)]
+        moved = [part.segment.grasped(part.x, part.phi) for part in self.nlp.parts(z)]
         there = self.nlp.pack(self.nlp.parameters_of(z), moved)
         there[~self.free] = z[~self.free]
         return there if self.is_upright(there) else z
@@ -98,8 +98,9 @@ class Unconstrained:
         """Multipliers of the given collocation's rows from those of all rows."""
         if self.nlp is self.given:
             return explicit
-        rows = ((s, explicit[s.rows].reshape(-1, s.dofs)) for s in self.nlp.segments)
-        return np.concatenate([each[:, segment.free_dofs].ravel() for segment, each in rows])
+        pairs = zip(self.given.segments, self.nlp.segments, strict=True)
+        rows = ((given, explicit[s.rows].reshape(-1, s.dofs)) for given, s in pairs)
+        return np.concatenate([each[:, given.row_dofs].ravel() for given, each in rows])
 
 
 @dataclass(frozen=True, eq=False)

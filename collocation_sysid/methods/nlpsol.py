@@ -99,7 +99,8 @@ def solve(
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
         z, multipliers = monitor.best or (start, np.zeros(collocation.constraints))
-    iterations = count or max(0, len(recorder.history) - 1)
+    # A solver that never began leaves its count as memory had it.
+    iterations = 0 if status is Status.REFUSED else count or max(0, len(recorder.history) - 1)
     return Outcome(status, said, z, multipliers, iterations, functions.calls)
 
 

@@ -22,6 +22,8 @@ class Options:
     """Base of the methods: a value that is not of its field's type is an `InputError`."""
 
     name: ClassVar[str]
+    # Whether it can only start from parameters with which everything can be simulated.
+    needs_whole_start: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for name, adapter in _adapters(type(self)).items():

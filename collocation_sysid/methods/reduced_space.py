@@ -90,6 +90,7 @@ class ReducedSpace(Options):
         recorder = Recorder(self.name, collocation, watch)
         search = Search(self, recorder, start)
         status, message = recorder.search(search.run)
+        collocation = recorder.collocation
         z = completed(collocation, search.p, search.x)
         rows = [segment.grid_rows for segment in collocation.segments]
         reached = search.x is not None and [len(x) for x in search.x] == rows

@@ -9,7 +9,6 @@ from scipy.optimize import lsq_linear
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..fem.constants import unit_of
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
 from .ladder import FEWEST, part_of
@@ -18,6 +17,7 @@ from .secant import updated, with_curvature
 from .solution import Iteration, Status
 
 if TYPE_CHECKING:
+    from ..nlp.collocation import Collocation
     from .reduced_space import ReducedSpace
 
 # A trial's infeasibility may be this share of its step's length, or this share of an edge of
@@ -38,8 +38,8 @@ SHRINK, SMALLEST_TRUST = 0.25, 1e-10
 SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
 # Steps shorter than this tell about the curvature at the answer.
 LOCAL = 0.1
-# Doublings of the moduli where not even the first rows can be simulated at the guess.
-STIFFENINGS = 10
+# Estimates of places may change the elements they are read in so often.
+REREADINGS = 40
 
 
 class Search:
@@ -52,13 +52,13 @@ class Search:
         self.trust = options.trust
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
+        self.rereadings = 0
         self.reach = collocation.reach_p
         self.p, self.x = collocation.guess_p, None
         if start is not None:
             start = np.clip(start, *collocation.bounds())
             self.p = collocation.parameters_of(start)
-            self.x = [part.segment.grasped(part.x) for part in collocation.parts(start)]
-        self.first = self.p
+            self.x = [part.segment.grasped(part.x, part.phi) for part in collocation.parts(start)]
         self.point: Point | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
@@ -120,41 +120,17 @@ class Search:
                     reached, failure = afresh, failure_afresh
             if failure is None:
                 self.x = reached
+                self._place(rung, first=known is None)
                 return
             rows = [len(x) for x in reached]
             fewest = min(FEWEST, *rung.rows)
-            if known is None and min(rows) < fewest:
-                self._stiffen(failure)
-                continue
-            if sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
+            nothing = known is None and min(rows) < fewest
+            if nothing or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
                 raise failure
             furthest = sum(rows)
             self.x = reached
+            self._place(rung, first=known is None)
             self._descend(self._horizon(rows, last=False), last=False)
-
-    def _stiffen(self, failure: SimulationError) -> None:
-        """Double the moduli of the guess.
-
-        Raises
-        ------
-        SimulationError
-            The failure, where they cannot be raised further.
-        """
-        names = [item.name for item in self.collocation.parameters.free]
-        moduli = np.array(
-            [unit_of(i.name) == "Pa" and i.scale == "log" for i in self.collocation.parameters.free]
-        )
-        q, upper = self.p[: len(names)], self.upper[: len(names)]
-        stiffer = np.minimum(q + np.log(2) * moduli, upper)
-        factor = float(np.exp(np.max(stiffer - self.first[: len(names)], initial=0.0)))
-        if np.allclose(stiffer, q) or factor > 1.01 * 2**STIFFENINGS:
-            raise failure
-        self.p = np.concatenate([stiffer, self.p[len(names) :]])
-        note = (
-            f"the body cannot be simulated at the guess ({failure}); "
-            f"started from moduli {factor:.3g} times as stiff"
-        )
-        self.recorder.notes[:] = [note]
 
     # One rung ---------------------------------------------------------------------------------
 
@@ -163,7 +139,7 @@ class Search:
         assert self.x is not None
         tolerance = self.options.tolerance
         self.trust = self.options.trust
-        point = self._accepted(rung.evaluate(self.p, self.x, self.point))
+        point = self._accepted(rung, rung.evaluate(self.p, self.x, self.point))
         rejections, curvature = 0, np.zeros((len(point.p), len(point.p)))
         previous = np.inf
         while True:
@@ -189,7 +165,7 @@ class Search:
             if trial is not None and self._is_better(point, step, trial):
                 if last and length <= LOCAL:
                     curvature = self._curvature(curvature, point, trial)
-                point, rejections, previous = self._accepted(trial), 0, length
+                point, rejections, previous = self._accepted(rung, trial), 0, length
                 continue
             if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
@@ -261,7 +237,7 @@ class Search:
         refined = self._try(rung, point, np.zeros(len(point.p)))
         if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
             return self._restored(rung, point)
-        return self._accepted(refined)
+        return self._accepted(rung, refined)
 
     def _restored(self, rung: Horizon, point: Point) -> Point:
         """The point with a simulated trajectory, where that exists."""
@@ -273,7 +249,7 @@ class Search:
             restored = rung.evaluate(point.p, x)
         except SimulationError:
             return point
-        return self._accepted(restored) if restored.finite else point
+        return self._accepted(rung, restored) if restored.finite else point
 
     def _are_feasible(self, x: list[Array], p: Array) -> bool:
         """Whether trajectories satisfy the equations of motion well within the tolerance."""
@@ -282,8 +258,29 @@ class Search:
             for part in self.collocation.parts_at(p, x)
         )
 
-    def _accepted(self, point: Point) -> Point:
-        self.point = point
+    # Where recordings are read ----------------------------------------------------------------
+
+    def _place(self, rung: Horizon, first: bool) -> None:
+        """Start unknown places where the first samples lie on what was simulated first."""
+        if first and self.x is not None:
+            self._read_in(rung, *self.collocation.placed(self.p, self.x))
+
+    def _read_in(self, rung: Horizon, collocation: Collocation, p: Array) -> None:
+        self.collocation = rung.collocation = self.recorder.collocation = collocation
+        self.lower, self.upper = collocation.bounds_p
+        self.p = p
+
+    def _follow(self, rung: Horizon, point: Point) -> Point:
+        """The point read where its estimates are."""
+        collocation, p = self.collocation.following(point.p)
+        if collocation is self.collocation or self.rereadings >= REREADINGS:
+            return point
+        self.rereadings += 1
+        self._read_in(rung, collocation, p)
+        return rung.read(p, point.x, point.tangents)
+
+    def _accepted(self, rung: Horizon, point: Point) -> Point:
+        self.point = point = self._follow(rung, point)
         self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
         self._record(point.p, point.x, point.loss, point)
         return point

@@ -62,6 +62,7 @@ class Shooting(Options):
     """
 
     name: ClassVar[str] = "shooting"
+    needs_whole_start: ClassVar[bool] = True
 
     gradient: Literal["forward", "adjoint"] = "forward"
     tolerance: Positive = 1e-8

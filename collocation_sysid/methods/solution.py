@@ -13,6 +13,7 @@ import numpy as np
 from ..arrays import Array
 from ..nlp.collocation import Collocation, Violation
 from ..nlp.stopwatch import Stopwatch
+from .scan import Scan
 
 
 class Status(Enum):
@@ -56,7 +57,7 @@ _SENTENCES = {
     "guess or linear solver may help.",
     Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
     Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
-    "damped parameters, or use interior-point, which needs no simulation.",
+    "damped parameters or without a guess, or use interior-point, which needs no simulation.",
     Status.REFUSED: "The solver refused the problem or one of its options.",
 }
 
@@ -111,6 +112,8 @@ class Solution:
     evaluations : int
         How often the method asked for residuals or derivatives of whole trajectories; a sweep
         and a simulation count as one.
+    scan : Scan or None
+        The scan of the stiffness that it started from, if there was one.
     """
 
     status: Status
@@ -124,6 +127,7 @@ class Solution:
     timing: Timing
     notes: Sequence[str] = field(default=())
     evaluations: int = 0
+    scan: Scan | None = None
 
     @property
     def q(self) -> Array:
@@ -156,6 +160,16 @@ class Solution:
     def rms_m(self) -> float:
         """Root mean square distance of markers from their measurements."""
         return self.collocation.rms_m(self.z)
+
+    @cached_property
+    def rms_by_experiment_m(self) -> dict[str, float]:
+        """The same of each fitted experiment."""
+        found = {}
+        for segment, readings in zip(self.collocation.segments, self.readings_m, strict=True):
+            markers = segment.experiment.markers
+            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
+            found[segment.experiment.name] = float(np.sqrt(squares.mean()))
+        return found
 
     @cached_property
     def max_violation_n(self) -> float:

@@ -16,6 +16,21 @@ from ..nlp.segment import Segment
 from ..nlp.stopwatch import Stopwatch
 
 
+def placed_at_guess(collocation: Collocation) -> Collocation:
+    """The problem with unknown places started from the shape that the guess gives the body."""
+    if all(segment.experiment.markers.located.all() for segment in collocation.segments):
+        return collocation
+    p, positions = collocation.guess_p, []
+    for segment in collocation.segments:
+        experiment, theta = segment.experiment, segment.constants.theta(p[: segment.nq])
+        try:
+            x, _ = start_state(experiment, theta, Solver(experiment))
+        except SimulationError:
+            x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
+        positions.append(x[None])
+    return collocation.placed(p, positions)[0]
+
+
 def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     """Variables z at the guess, and notes on how they were found.
 
@@ -103,4 +118,4 @@ def carried_rigidly(segment: Segment, theta: Array) -> Array:
         shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
         carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
         x = carried.reshape(len(t_s), -1)
-    return segment.grasped(x)
+    return segment.grasped(x, segment.guess_phi)

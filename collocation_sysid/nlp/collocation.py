@@ -25,8 +25,9 @@ c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -35,6 +36,7 @@ import scipy.sparse as sp
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
+from .charts import Chart
 from .parameters import Parameters
 from .schemes import Scheme
 from .segment import First, Segment
@@ -107,6 +109,8 @@ class Collocation:
         Grasped nodes as constraint rows instead of bounds.
     huber : float, optional
         Huber's loss beyond this many standard deviations, see `Observation`.
+    charts : mapping of experiment name to Chart
+        Where recordings are read, see `charts`; by default where their markers start.
 
     Raises
     ------
@@ -120,6 +124,7 @@ class Collocation:
     substeps: int = 1
     explicit_grasps: bool = False
     huber: float | None = None
+    charts: Mapping[str, Chart] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if all(experiment.validation for experiment in self.experiments):
@@ -139,7 +144,8 @@ class Collocation:
         found, first = [], First(self.nq, self.nq, 0)
         for experiment in self.experiments:
             if not experiment.validation:
-                found.append(Segment(experiment, *options, first))
+                chart = self.charts.get(experiment.name) or Chart.of(experiment)
+                found.append(Segment(experiment, *options, first, chart))
                 first = found[-1].after
         return tuple(found)
 
@@ -219,13 +225,52 @@ class Collocation:
     def bounds_p(self) -> tuple[Array, Array]:
         """Lower and upper bounds of p."""
         lower, upper = self.parameters.bounds_q
-        limits = np.concatenate([segment.nuisance.limits for segment in self.segments])
-        return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
+        limits = [segment.nuisance.limits(segment.chart.samples) for segment in self.segments]
+        low, high = (np.concatenate(side) for side in zip(*limits, strict=True))
+        return np.concatenate([lower, low]), np.concatenate([upper, high])
+
+    # Where recordings are read ----------------------------------------------------------------
+
+    def following(self, p: Array) -> tuple[Collocation, Array]:
+        """The problem read where the estimates p are, and p in it; itself if they left no chart."""
+        found = [s.following(p[s.places[self.nq :]]) for s in self.segments]
+        if all(chart is s.chart for (chart, _), s in zip(found, self.segments, strict=True)):
+            return self, p
+        return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])
+
+    def placed(self, p: Array, positions: Sequence[Array]) -> tuple[Collocation, Array]:
+        """The problem with unknown places where first samples lie on the first rows of positions.
+
+        That is where a solve starts; p has these places.
+        """
+        if all(segment.experiment.markers.located.all() for segment in self.segments):
+            return self, p
+        found = [part.segment.placed(part.phi, part.x) for part in self.parts_at(p, positions)]
+        return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])
+
+    def placed_at(self, places_m: Sequence[Array]) -> Collocation:
+        """The problem read about places (M, 3) of each experiment's markers."""
+        charts = [s.chart.about(m) for s, m in zip(self.segments, places_m, strict=True)]
+        segments = [s.with_chart(c) for s, c in zip(self.segments, charts, strict=True)]
+        return self._read_in(charts, self.guess_p, [s.guess_phi for s in segments])[0]
+
+    def _read_in(
+        self, charts: Sequence[Chart], p: Array, phis: Sequence[Array]
+    ) -> tuple[Collocation, Array]:
+        other, moved = copy(self), p.copy()
+        segments = [s.with_chart(c) for s, c in zip(self.segments, charts, strict=True)]
+        for segment, phi in zip(segments, phis, strict=True):
+            moved[segment.places[self.nq :]] = phi
+        by_name = {s.experiment.name: s.chart for s in segments}
+        vars(other).update(charts=by_name, segments=tuple(segments))
+        for stale in ("hessian_structure", "hessian_diagonals"):
+            vars(other).pop(stale, None)
+        return other, moved
 
     @property
     def guess_p(self) -> Array:
-        """The guess of p; φ is zero."""
-        return np.concatenate([self.parameters.guess_q, np.zeros(self.nphi)])
+        """The guess of p; φ is zero, or where the charts are."""
+        return np.concatenate([self.parameters.guess_q, *(s.guess_phi for s in self.segments)])
 
     @property
     def reach_p(self) -> Array:

@@ -1,19 +1,25 @@
-"""Nuisance parameters φ of an experiment: marker offsets, a time shift, corrections of the frame.
+"""Nuisance parameters φ of an experiment: places, clock, gravity, the body in its grasp, cameras.
 
 Every φ is a number of prior standard deviations, so that its prior is φ² in the loss. In their
 order, those that the experiment's `Nuisance` names:
 
 =====================  ====================================================================
-offset of each marker  b_m, three a marker [m]
+place of each marker   X_m on the undeformed body, two or three a marker [m], see `charts`
+camera offset          b_m of each marker, three [m]
 time shift             τ [s]
 turn of the pose       a (3), Cayley's parameters times two: to third order a rotation vector
 shift of the pose      d (3) [m]
 tilt of gravity        two angles about axes across it [rad]
+turn in the grasp      a_h (3), likewise, about axes of the undeformed body
+shift in the grasp     d_h (3) [m]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
 c being the middle of the undeformed body in its first pose. In the body's frame that changes
 nothing but what the markers read, and the direction of gravity, which becomes R(a)ᵀ g.
+
+In the grasp the undeformed body is off by H X = R(a_h) (X − c_h) + c_h + d_h, c_h being the middle
+of the grasped nodes: they are held at U_t H X.
 """
 
 from __future__ import annotations
@@ -27,66 +33,77 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
+from ..experiment.grasp import held_nodes
 
-# A time shift stays within this many samples: markers are read between neighbouring samples.
+# Samples are read between neighbours, up to this many away from the chart's.
 LARGEST_SHIFT_SAMPLES = 2.0
-KINDS = ("offset", "time", "turn", "shift", "tilt")
+# A time shift may be this share of the recording.
+LARGEST_SHIFT_SHARE = 0.25
+# A place may move this many edges of the mesh in a step.
+EDGES_A_STEP = 2.0
+KINDS = (
+    "place",
+    "offset",
+    "time",
+    "turn",
+    "shift",
+    "tilt",
+    "grasp-turn",
+    "grasp-shift",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class NuisanceMap:
-    """φ of one experiment: what each is, and the gravity it makes.
+    """φ of one experiment: what each is, and the gravity and grasps it makes.
 
     Attributes
     ----------
-    names : (k,) with units, such as "swing: offset of tip, x [m]"
+    names : (k,) with units, such as "swing: place of tip, x [m]"
     kinds : (k,) of `KINDS`
     scales : (k,) prior standard deviations, in the names' units
-    limits : (k,) largest |φ|
+    reach : (k,) φ that a step may move at a time: what enters linearly needs no trust region
+    interval_s : float, between samples
+    duration_s : float
     gravity_m_s2 : (3,) as stated
     pivot_m : (3,) c
+    grasp_pivot_m : (3,) c_h
     """
 
     names: tuple[str, ...]
     kinds: tuple[str, ...]
     scales: Array
-    limits: Array
+    reach: Array
+    interval_s: float
+    duration_s: float
     gravity_m_s2: Array
     pivot_m: Array
+    grasp_pivot_m: Array
 
     @classmethod
     def of(cls, experiment: Experiment) -> NuisanceMap:
         """What the experiment wants estimated."""
-        wanted, entries = experiment.nuisance, []
-        if wanted.marker_offset_m:
-            entries += [
-                ("offset", f"offset of {marker}, {axis} [m]", wanted.marker_offset_m)
-                for marker in experiment.markers.names
-                for axis in "xyz"
-            ]
-        if wanted.time_shift_s:
-            entries.append(("time", "time shift [s]", wanted.time_shift_s))
-        if wanted.pose_turn_rad:
-            entries += [
-                ("turn", f"turn of the pose, {axis} [rad]", wanted.pose_turn_rad) for axis in "xyz"
-            ]
-        if wanted.pose_shift_m:
-            entries += [
-                ("shift", f"shift of the pose, {axis} [m]", wanted.pose_shift_m) for axis in "xyz"
-            ]
-        if wanted.gravity_rad:
-            entries += [
-                ("tilt", f"tilt of gravity, {side} [rad]", wanted.gravity_rad)
-                for side in ("first", "second")
-            ]
+        entries = _entries(experiment)
         kinds, labels, scales = zip(*entries, strict=True) if entries else ((), (), ())
         scales = np.array(scales, dtype=float)
-        limits = np.full(len(scales), np.inf)
-        late = np.array([kind == "time" for kind in kinds], dtype=bool)
-        limits[late] = LARGEST_SHIFT_SAMPLES * experiment.timestep_s / scales[late]
-        names = tuple(f"{experiment.name}: {label}" for label in labels)
-        pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
-        return cls(names, tuple(kinds), scales, limits, np.array(experiment.gravity_m_s2), pivot)
+        body = experiment.body
+        edge_m = float(body.mesh.quality().edge_mean_m)
+        linear = np.isin(kinds, ("offset", "shift"))
+        reach = np.where(linear, 1e3, 1.0)
+        of_place = np.array([kind == "place" for kind in kinds], dtype=bool)
+        reach[of_place] = np.minimum(1e3, EDGES_A_STEP * edge_m / scales[of_place])
+        held = held_nodes(experiment.grasps)
+        return cls(
+            tuple(f"{experiment.name}: {label}" for label in labels),
+            tuple(kinds),
+            scales,
+            reach,
+            experiment.timestep_s,
+            experiment.duration_s,
+            np.array(experiment.gravity_m_s2),
+            experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
+            body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
+        )
 
     @property
     def size(self) -> int:
@@ -99,14 +116,77 @@ class NuisanceMap:
 
     @cached_property
     def moving(self) -> NDArray[np.int64]:
-        """Positions in φ of what changes the motion: those that turn gravity."""
-        return self.places("turn", "tilt")
+        """Positions in φ of what changes the motion: what turns gravity, or moves the grasps."""
+        return self.places("turn", "tilt", "grasp-turn", "grasp-shift")
 
-    @property
-    def reach(self) -> Array:
-        """(k,) φ that a step may move at a time: what enters linearly needs no trust region."""
-        linear = np.isin(self.kinds, ("offset", "shift"))
-        return np.where(linear, 1e3, 1.0) if self.size else np.ones(0)
+    @cached_property
+    def moves_grasps(self) -> bool:
+        """Whether the body may be off in its grasps."""
+        return len(self.of_grasps) > 0
+
+    def limits(self, samples: int) -> tuple[Array, Array]:
+        """Lowest and highest φ (k,), where samples are read about this many whole ones away."""
+        low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        for k in self.places("time"):
+            about, unit = samples * self.interval_s, self.scales[k]
+            around = LARGEST_SHIFT_SAMPLES * self.interval_s
+            furthest = max(around, LARGEST_SHIFT_SHARE * self.duration_s)
+            low[k] = max(about - around, -furthest) / unit
+            high[k] = min(about + around, furthest) / unit
+        return low, high
+
+    @cached_property
+    def of_grasps(self) -> NDArray[np.int64]:
+        """Positions in φ of what moves the body in its grasps."""
+        return self.places("grasp-turn", "grasp-shift")
+
+    def carried(self, points_m: Array, phi: Array) -> tuple[Array, Array]:
+        """H X of points (m, 3), and its derivatives (m, 3, h) by φ of `of_grasps`."""
+        own = np.repeat(phi[self.of_grasps, None], len(points_m), axis=1)
+        value, first = self._carried.map(len(points_m))(own, points_m.T)
+        slopes = first.full().reshape(3, len(points_m), -1).transpose(1, 0, 2)
+        return value.full().T, slopes
+
+    def carried_curvature(self, points_m: Array, phi: Array) -> Array:
+        """Second derivatives (m, 3, h, h) of H X by φ of `of_grasps`."""
+        own, count = phi[self.of_grasps], len(points_m)
+        second = self._carried_curvature.map(count)(
+            np.repeat(own[:, None], count, axis=1), points_m.T
+        )
+        shaped = [h.full().reshape(len(own), count, -1).transpose(1, 0, 2) for h in second]
+        return np.stack(shaped, axis=1)
+
+    @cached_property
+    def _carried(self) -> ca.Function:
+        phi, point, moved = self._moved
+        first = ca.densify(ca.jacobian(moved, phi))
+        return ca.Function("carried", [phi, point], [moved, first])
+
+    @cached_property
+    def _carried_curvature(self) -> ca.Function:
+        phi, point, moved = self._moved
+        second = [ca.densify(ca.hessian(moved[i], phi)[0]) for i in range(3)]
+        return ca.Function("carried_curvature", [phi, point], second)
+
+    @cached_property
+    def _moved(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """φ of the grasps, X, and H X."""
+        phi, point = ca.SX.sym("phi", len(self.of_grasps)), ca.SX.sym("X", 3)
+        kinds, moved = [self.kinds[k] for k in self.of_grasps], point
+        values = phi * self.scales[self.of_grasps]
+        if turn := [k for k, kind in enumerate(kinds) if kind == "grasp-turn"]:
+            pivot = ca.DM(self.grasp_pivot_m)
+            moved = rotation(values[turn]) @ (point - pivot) + pivot
+        if shift := [k for k, kind in enumerate(kinds) if kind == "grasp-shift"]:
+            moved = moved + values[shift]
+        return phi, point, moved
+
+    def in_grasp(self, phi: Array) -> Array:
+        """H as a 4×4 matrix [[R, p], [0, 1]]."""
+        images, _ = self.carried(np.vstack([np.zeros(3), np.eye(3)]), phi)
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack([(images[1:] - images[0]).T, images[0]])
+        return matrix
 
     def gravity(self, phi: Array) -> tuple[Array, Array, Array]:
         """Gravity (3,) in the body's frame, and its derivatives by φ: (3, k) and (3, k, k)."""
@@ -135,6 +215,32 @@ class NuisanceMap:
         across = np.linalg.svd(down[None])[2][1:]
         tilted = down + ca.mtimes(ca.DM(across.T), angles)
         return ca.SX(size * tilted / ca.norm_2(tilted))
+
+
+def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
+    """Kind, label and deviation of every φ."""
+    wanted, markers, entries = experiment.nuisance, experiment.markers, []
+    axes = ("first", "second") if markers.on_surface else tuple("xyz")
+    for marker, sigma_m in zip(markers.names, experiment.place_sigma_m, strict=True):
+        if sigma_m > 0:
+            entries += [("place", f"place of {marker}, {axis} [m]", sigma_m) for axis in axes]
+
+    def add(kind: str, what: str, unit: str, sides: str, deviation: float | None) -> None:
+        if deviation:
+            entries.extend((kind, f"{what}, {s} [{unit}]", deviation) for s in sides.split())
+
+    for marker in markers.names:
+        add("offset", f"camera offset of {marker}", "m", "x y z", wanted.camera_offset_m)
+    if wanted.time_shift_s:
+        entries.append(("time", "time shift [s]", wanted.time_shift_s))
+    add("turn", "turn of the pose", "rad", "x y z", wanted.pose_turn_rad)
+    add("shift", "shift of the pose", "m", "x y z", wanted.pose_shift_m)
+    if np.any(experiment.gravity_m_s2):
+        add("tilt", "tilt of gravity", "rad", "first second", wanted.gravity_rad)
+    if experiment.grasps and experiment.start == "equilibrium":
+        add("grasp-turn", "turn in the grasp", "rad", "x y z", wanted.hand_eye_rad)
+        add("grasp-shift", "shift in the grasp", "m", "x y z", wanted.hand_eye_m)
+    return entries
 
 
 def rotation(turn: ca.SX) -> ca.SX:

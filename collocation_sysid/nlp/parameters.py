@@ -18,7 +18,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, hint_at
 from ..fem.body import Body
-from ..fem.constants import Scale, bare, constant_named
+from ..fem.constants import Scale, bare, constant_named, is_modulus, usual_value
 from ..fem.moduli import ENGINEERING, engineering
 
 
@@ -28,7 +28,8 @@ class Unknown:
 
     Attributes
     ----------
-    guess : float
+    guess : float, optional
+        Where the search starts; found by a scan of the stiffness by default.
     lower, upper : float, optional
         Bounds.
     prior : (mean, deviation), optional
@@ -40,7 +41,7 @@ class Unknown:
         What a linear parameter may change by in a step; its guess where its constant tells none.
     """
 
-    guess: float
+    guess: float | None = None
     lower: float | None = None
     upper: float | None = None
     prior: tuple[float, float] | None = None
@@ -70,7 +71,8 @@ class Parameter:
     ----------
     name : str
         With its unit, and the region in front if it has one.
-    guess : float
+    guess : float or None
+        None where a scan is to find it.
     lower, upper : float
         Bounds; positive for a logarithm.
     fixed : bool
@@ -80,13 +82,14 @@ class Parameter:
         parameter ((value − mean) / deviation)².
     scale : {"log", "linear"}
     unit : float
-        What a linear parameter changes by where its q changes by one.
+        What a linear parameter changes by where its q changes by one; NaN until the scan of the
+        stiffness tells.
     tied : Tied or None
         Follows another parameter; guess and bounds then do not count.
     """
 
     name: str
-    guess: float
+    guess: float | None
     lower: float = 0.0
     upper: float = np.inf
     fixed: bool = False
@@ -109,7 +112,7 @@ class Parameter:
                 None,
                 self.name,
             )
-        if not self.lower <= self.guess <= self.upper:
+        if self.guess is not None and not self.lower <= self.guess <= self.upper:
             raise InputError(
                 f"guess = {self.guess:g}, expected a value within [{self.lower:g}, {self.upper:g}]",
                 None,
@@ -125,10 +128,11 @@ class Parameter:
 
     def _check_fixed(self) -> None:
         least = constant_named(self.name).least
-        if not (np.isfinite(self.guess) and self.guess >= least):
+        value = np.nan if self.guess is None else self.guess
+        if not (np.isfinite(value) and value >= least):
             expected = "a number" if least < 0 else "a number >= 0"
-            raise InputError(f"fixed = {self.guess:g}, expected {expected}", None, self.name)
-        self._refuse_beyond(self.guess, "fixed")
+            raise InputError(f"fixed = {value:g}, expected {expected}", None, self.name)
+        self._refuse_beyond(value, "fixed")
 
     def _refuse_beyond(self, value: float, what: str) -> None:
         if not value < (limit := constant_named(self.name).below):
@@ -156,7 +160,8 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
     Raises
     ------
     InputError
-        For a guess out of bounds, or a linear parameter without a size.
+        For a guess out of bounds, a linear parameter without a size, or one that has no guess
+        and of which no usual value is known.
     """
     constant = constant_named(name)
     if isinstance(given, Tied):
@@ -169,10 +174,20 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
         low = -high
     if scale == "log" and low <= 0:
         low = 1e-9 * high
-    typical = given.typical or constant.typical or abs(given.guess)
-    if scale == "linear" and not typical > 0:
+    if given.guess is None and given.prior is None and usual_value(name, 1.0) is None:
         raise InputError(
-            "guess = 0 of a linear parameter does not tell its size; expected typical, what it "
+            "no guess is given and no usual value is known of it; expected guess = a value",
+            None,
+            name,
+        )
+    # The size of a modulus without a guess follows from the scan.
+    size = np.nan if is_modulus(name) else 0.0
+    size = size if given.guess is None else abs(given.guess)
+    typical = given.typical or constant.typical or size
+    if scale == "linear" and typical == 0:
+        found = "no guess" if given.guess is None else "guess = 0"
+        raise InputError(
+            f"{found} of a linear parameter does not tell its size; expected typical, what it "
             "may change by in a step",
             None,
             name,
@@ -180,7 +195,7 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
     try:
         return Parameter(
             name,
-            float(given.guess),
+            None if given.guess is None else float(given.guess),
             low if given.lower is None else float(given.lower),
             high if given.upper is None else float(given.upper),
             prior=given.prior,
@@ -240,9 +255,20 @@ class Parameters:
         return tuple(item for item in self.items if not item.fixed and item.tied is None)
 
     @property
+    def unguessed(self) -> tuple[str, ...]:
+        """Names of those that are estimated without a guess."""
+        return tuple(item.name for item in self.free if item.guess is None)
+
+    @property
     def guess_q(self) -> Array:
-        """(nq,) coordinates of the guesses."""
-        return np.array([item.q(item.guess) for item in self.free])
+        """(nq,) coordinates of the guesses.
+
+        Raises
+        ------
+        InputError
+            Where there is none.
+        """
+        return np.array([item.q(_guess(item)) for item in self.free])
 
     @property
     def bounds_q(self) -> tuple[Array, Array]:
@@ -254,7 +280,7 @@ class Parameters:
 
     def expressions(self, q: ca.SX) -> dict[str, ca.SX]:
         """Every parameter as an expression in q, by name."""
-        found = {item.name: ca.SX(item.guess) for item in self.items}
+        found = {item.name: ca.SX(item.guess or 0.0) for item in self.items}
         for k, item in enumerate(self.free):
             found[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
         for item in self.items:
@@ -264,7 +290,7 @@ class Parameters:
 
     def values(self, q: Sequence[float] | Array) -> dict[str, float]:
         """Every parameter at q, by name."""
-        found = {item.name: float(item.guess) for item in self.items}
+        found = {item.name: float(item.guess or 0.0) for item in self.items}
         for item, coordinate in zip(self.free, q, strict=True):
             found[item.name] = item.value(float(coordinate))
         for item in self.items:
@@ -274,7 +300,7 @@ class Parameters:
 
     @property
     def guesses(self) -> dict[str, float]:
-        """Every parameter at its guess, by name."""
+        """Every parameter at its guess, by name; an `InputError` where one has none."""
         return self.values(self.guess_q)
 
     def prior(self, q: Array) -> tuple[Array, Array]:
@@ -344,12 +370,23 @@ class Parameters:
                 raise InputError("fixed = 0, expected a stiffness above 0", None, item.name)
 
 
+def _guess(item: Parameter) -> float:
+    if item.guess is None:
+        raise InputError(
+            "there is no guess of it; expected guess = a value here (solve and check find one)",
+            None,
+            item.name,
+        )
+    return item.guess
+
+
 def _stated(item: Parameter) -> str:
     if item.tied is not None:
         return f"{item.name} = {item.tied.ratio:g} × {item.tied.to}"
     if item.fixed:
         return f"{item.name} = {item.guess:g}"
-    return f"{item.name} from {item.guess:g} in [{item.lower:g}, {item.upper:g}]"
+    start = "" if item.guess is None else f" from {item.guess:g}"
+    return f"{item.name}{start} in [{item.lower:g}, {item.upper:g}]"
 
 
 class ThetaMap:

@@ -19,7 +19,9 @@ from ..experiment.experiment import Experiment
 from ..fem.body import Body
 from ..fem.pattern import dofs_of
 from .block_band import Block, BlockBand, Term
+from .charts import Chart
 from .dynamics import Dynamics
+from .held import Grasping, Held
 from .hessian_layout import HessianLayout
 from .nuisance import NuisanceMap
 from .observation import Observation
@@ -30,6 +32,8 @@ from .schemes import Scheme
 from .setting import Setting
 
 T = TypeVar("T", bound=np.generic)
+
+CHARTED = ("observation", "hessian_layout")
 
 
 @dataclass(frozen=True)
@@ -54,8 +58,10 @@ class Segment:
         See `Collocation`.
     explicit_grasps : bool
         Grasped nodes get rows of their own instead of bounds. Those that are held only for a
-        while always do.
+        while always do, and so do all where the body may be off in its grasps.
     first : First
+    chart : Chart
+        Where the recording is read.
     """
 
     experiment: Experiment
@@ -65,6 +71,7 @@ class Segment:
     explicit_grasps: bool
     huber: float | None
     first: First
+    chart: Chart
 
     @property
     def body(self) -> Body:
@@ -93,9 +100,57 @@ class Segment:
             self.experiment.markers,
             np.arange(len(self.experiment.t_s)) * self.substeps,
             self.nuisance,
+            self.chart,
             self.huber,
             from_rest=not self.dynamics.start_velocity_m_s.any(),
         )
+
+    def with_chart(self, chart: Chart) -> Segment:
+        """The same, read elsewhere."""
+        other = replace(self, chart=chart)
+        # Nothing but how the markers are read depends on the chart.
+        kept = {k: v for k, v in vars(self).items() if k not in CHARTED}
+        vars(other).update(kept | {"chart": chart})
+        return other
+
+    def following(self, phi: Array) -> tuple[Chart, Array]:
+        """A chart where the estimates are, and φ in it; those given where they have not left."""
+        nuisance, places = self.nuisance, self.observation.place_places
+        late = phi[nuisance.places("time")] * nuisance.scales[nuisance.places("time")]
+        shift = float(late.sum()) / self.experiment.timestep_s
+        chart, of_places = self.chart.following(np.append(phi, 0.0)[places], shift)
+        return chart, self._with_places(phi, of_places)
+
+    def placed(self, phi: Array, x: Array) -> tuple[Chart, Array]:
+        """The chart, and φ in it, with unknown places on the body's first rows x (rows, 3n)."""
+        markers, rows = self.experiment.markers, self.observation.grid_rows
+        points_m, _ = markers.first_samples
+        first = rows[markers.present.argmax(axis=0)]
+        places_m = self.places_m(phi)
+        unknown = ~markers.located & (first < len(x)) & markers.present.any(axis=0)
+        for row in np.unique(first[unknown]):
+            here = np.flatnonzero(unknown & (first == row))
+            places_m[here] = self.chart.at_markers(x[row].reshape(-1, 3), points_m[here])
+        if not unknown.any():
+            return self.chart, phi
+        chart = self.chart.about(places_m)
+        return chart, self._with_places(phi, chart.centre)
+
+    def places_m(self, phi: Array) -> Array:
+        """(M, 3) places of the markers on the undeformed body."""
+        return self.chart.places_m(np.append(phi, 0.0)[self.observation.place_places])
+
+    @property
+    def guess_phi(self) -> Array:
+        """(k,) φ in the middle of the chart."""
+        phi, late = np.zeros(self.nuisance.size), self.nuisance.places("time")
+        phi[late] = self.chart.samples * self.experiment.timestep_s / self.nuisance.scales[late]
+        return self._with_places(phi, self.chart.centre)
+
+    def _with_places(self, phi: Array, of_places: Array) -> Array:
+        moved, here = phi.copy(), self.chart.estimated
+        moved[self.observation.place_places[here]] = of_places[here]
+        return moved
 
     # Sizes and places -------------------------------------------------------------------------
 
@@ -122,7 +177,12 @@ class Segment:
     @cached_property
     def row_dofs(self) -> Index:
         """(rows_per_time,) the dof of each row of a grid time."""
-        return np.arange(self.dofs) if self.explicit_grasps else self.free_dofs
+        return np.arange(self.dofs) if self.grasps_have_rows else self.free_dofs
+
+    @property
+    def grasps_have_rows(self) -> bool:
+        """Whether held dofs have rows of their own."""
+        return self.explicit_grasps or self.nuisance.moves_grasps
 
     @property
     def rows_per_time(self) -> int:
@@ -172,13 +232,15 @@ class Segment:
     # Grasps and scales ------------------------------------------------------------------------
 
     @cached_property
-    def _grasp_positions(self) -> Array:
-        return self.experiment.grasped(self.dynamics.t_s)[1].reshape(self.grid_rows, -1)
+    def grasping(self) -> Grasping:
+        """Where the grasps are."""
+        return Grasping(self.experiment, self.nuisance, self.dynamics.t_s)
 
-    @cached_property
-    def held_positions(self) -> Array:
-        """(N, held) where the grasps are."""
-        return self._grasp_positions[:, self.held_dofs]
+    def _goals(self, held: Held) -> Array:
+        """(N, 3n) goals of the grasped dofs, NaN elsewhere."""
+        goals = np.full((self.grid_rows, self.dofs), np.nan)
+        goals[:, held.dofs] = held.positions_m
+        return goals
 
     @cached_property
     def length_m(self) -> float:
@@ -210,8 +272,9 @@ class Segment:
         """(N, 3n) lower and upper bounds in metres; equal where a value is given."""
         lower = np.full((self.grid_rows, self.dofs), -np.inf)
         upper = np.full((self.grid_rows, self.dofs), np.inf)
-        if not self.explicit_grasps:
-            lower[:, self.held_dofs] = upper[:, self.held_dofs] = self.held_positions
+        if not self.grasps_have_rows:
+            goals = self._goals(self.grasping.at(np.zeros(self.nuisance.size)))
+            lower[:, self.held_dofs] = upper[:, self.held_dofs] = goals[:, self.held_dofs]
         start = self.start_positions()
         if start is not None:
             lower[0] = upper[0] = start
@@ -235,33 +298,36 @@ class Segment:
             dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
-        return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi)
+        held = self.grasping.at(phi)
+        return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi, held)
 
     def corrected(self, phi: Array) -> Experiment:
-        """The experiment in the body's frame: gravity turned by φ."""
+        """The experiment in the body's frame: gravity turned, and the body moved in its grasps."""
         if not len(self.nuisance.moving):
             return self.experiment
-        return replace(self.experiment, gravity_m_s2=self.nuisance.gravity(phi)[0])
+        grasps = self.experiment.grasps
+        if self.nuisance.moves_grasps:
+            motion = self.nuisance.in_grasp(phi)
+            grasps = tuple(replace(g, poses=g.poses.after(motion)) for g in grasps)
+        gravity = self.nuisance.gravity(phi)[0]
+        return replace(self.experiment, gravity_m_s2=gravity, grasps=grasps)
 
-    def grasped(self, x: Array) -> Array:
+    def grasped(self, x: Array, phi: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
-        x = x.copy()
-        x[:, self.held_dofs] = self.held_positions
-        x[self.dynamics.taken] = self._grasp_positions[self.dynamics.taken]
-        return x
+        goals = self._goals(self.grasping.at(phi))
+        return np.where(np.isnan(goals), x, goals)
 
     # Values ---------------------------------------------------------------------------------
 
     def constraint_values(self, x: Array, setting: Setting) -> Array:
         """(constraints,) scaled rows at x (N, 3n) in metres."""
-        return self._rows(x, setting.dynamics.residual(x, setting.theta))
+        return self._rows(x, setting.dynamics.residual(x, setting.theta), setting)
 
-    def _rows(self, x: Array, residual: Array) -> Array:
+    def _rows(self, x: Array, residual: Array, setting: Setting) -> Array:
         rows = residual / self.force_n
-        if self.explicit_grasps:
-            rows[:, self.held_dofs] = (x[:, self.held_dofs] - self.held_positions) / self.length_m
-        taken = self.dynamics.taken
-        rows[taken] = (x[taken] - self._grasp_positions[taken]) / self.length_m
+        goals = self._goals(setting.held)
+        grasped = ~np.isnan(goals)
+        rows[grasped] = (x[grasped] - goals[grasped]) / self.length_m
         return self.of_rows(rows)
 
     def of_rows(self, values: NDArray[T]) -> NDArray[T]:
@@ -302,7 +368,7 @@ class Segment:
                 for j, a, b in self.dynamics.block_terms(lag)
             ]
             kept = whole.copy() if terms else whole & (rows == columns)
-            if lag == 0 and self.explicit_grasps:
+            if lag == 0 and self.grasps_have_rows:
                 kept |= ~free[rows] & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
             blocks.append(Block(lag, row_place[rows[kept]], columns[kept], source[kept], terms))
@@ -323,7 +389,7 @@ class Segment:
             positions.append(places.ravel())
             values.append((coefficient[rows, None] * mass[rows]).ravel())
         grasps = [np.zeros(0, dtype=np.int64)]
-        if self.explicit_grasps:
+        if self.grasps_have_rows:
             rows = np.arange(first, self.grid_rows)
             grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
         return np.concatenate(positions), np.concatenate(values), np.concatenate(grasps)
@@ -367,8 +433,10 @@ class Segment:
         by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p)) / self.force_n
         dynamics.without_taken(by_p)
         by_p[:, self.held_dofs] = 0
+        if setting.held.moves:
+            by_p[:, setting.held.dofs, self.nq :] -= setting.held.by_phi / self.length_m
         by_p = by_p[dynamics.first_row :, self.row_dofs]
-        rows = self._rows(x, dynamics.assemble_residual(x, forces.force))
+        rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
     @cached_property
@@ -465,6 +533,14 @@ class Segment:
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
         )
+        if setting.held.moves:
+            of_goals = np.zeros((self.grid_rows, self.dofs))
+            of_goals[first:, self.row_dofs] = -by_time / self.length_m
+            grasped = ~np.isnan(setting.held.positions_m)
+            of_goals = np.where(grasped, of_goals[:, setting.held.dofs], 0.0)
+            by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
+                phi, of_goals
+            )
         by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
         theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)

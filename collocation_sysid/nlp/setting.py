@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Array
 from .dynamics import Dynamics
+from .held import Held
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +20,10 @@ class Setting:
     theta : (k,) constants of the body
     theta_q, theta_qq : (k, nq) and (k, nq, nq) derivatives of θ
     dynamics : Dynamics under that gravity
-    gravity_phi, gravity_phi_phi : (3, m) and (3, m, m) derivatives of gravity by the φ that turn it
+    gravity_phi, gravity_phi_phi : (3, m) and (3, m, m) derivatives of gravity by the φ that move
+        the body
+    held : Held
+        Where the grasps are.
     """
 
     theta: Array
@@ -28,6 +32,7 @@ class Setting:
     dynamics: Dynamics
     gravity_phi: Array
     gravity_phi_phi: Array
+    held: Held
 
     def force_slopes(self, by_theta: Array, weighed_kg: Array) -> Array:
         """∂F/∂(q, φ) of total forces, (…, 3n, nq + m).

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .factorisation import Choice, Factor, Factoriser
@@ -119,6 +120,16 @@ class BlockSolver:
         kept = (place[full_rows] >= 0) & (place[full_columns] >= 0)
         self._source = source[kept]
         # Sorted by column; the matrices are symmetric, so that serves for rows as well.
+        held = np.full(self.body.pattern.size, -1)
+        held[segment.grasping.dofs] = np.arange(len(segment.grasping.dofs))
+        beside = (place[full_rows] >= 0) & (held[full_columns] >= 0)
+        shape = (len(self.free), len(segment.grasping.dofs))
+        numbers, places = np.arange(1, beside.sum() + 1), (place[full_rows], held[full_columns])
+        self._held = sp.csr_array((numbers, (places[0][beside], places[1][beside])), shape=shape)
+        # Its data are their own numbers, in the order that compressing them gave.
+        order = np.asarray(self._held.data, dtype=np.int64) - 1
+        self._held_source = source[beside][order]
+        self._held = self._held.astype(float)
         counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
         indptr = np.concatenate([[0], np.cumsum(counts)])
         self._matrix = sp.csr_array(
@@ -148,6 +159,7 @@ class BlockSolver:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
         inertia = self.dynamics.inertia(x)
+        given = GivenMotion.of(self, setting, x)
         for step in self._steps(x, setting.theta, first=done):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
@@ -156,7 +168,9 @@ class BlockSolver:
             right[:, 0] = residual
             force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
-                columns[step.t, self.free] = march.advance(step, right, force)
+                columns[step.t, self.free] = march.advance(step, right, force, given)
+        if given is not None:
+            columns[done:, given.held_dofs] = given.of_held[done:]
         return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite, march.memory)
 
     def sensitivities(self, x: Array, setting: Setting) -> Iterator[Array]:
@@ -169,10 +183,31 @@ class BlockSolver:
         """
         shape = (x.shape[1], len(self.segment.moving))
         march = _Forward(self, setting, (len(self.free), shape[1]))
+        given = GivenMotion.of(self, setting)
         yield from np.zeros((self.dynamics.first_row, *shape))
         for step in self._steps(x, setting.theta):
-            row = np.zeros(shape)
-            row[self.free] = march.advance(step, np.zeros(march.shape), march.force_slopes(step))
+            row, right = np.zeros(shape), np.zeros(march.shape)
+            row[self.free] = march.advance(step, right, march.force_slopes(step), given)
+            if given is not None:
+                row[given.held_dofs] = given.of_held[step.t]
+            yield row
+
+    def response(self, x: Array, setting: Setting, moved: Array) -> Iterator[Array]:
+        """How every row of x, (3n, c), follows grasped dofs that move by `moved` (N, g, c).
+
+        Raises
+        ------
+        SimulationError
+            Where a timestep's equations are singular or not finite.
+        """
+        count = moved.shape[2]
+        given = GivenMotion.along(self, setting.held.dofs, moved)
+        march = _Forward(self, setting, (len(self.free), count))
+        yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
+        for step in self._steps(x, setting.theta):
+            row, nothing = np.zeros((x.shape[1], count)), np.zeros((2, *march.shape))
+            row[self.free] = march.advance(step, nothing[0], nothing[1], given)
+            row[given.held_dofs] = given.of_held[step.t]
             yield row
 
     @one_blas_thread()
@@ -241,6 +276,11 @@ class BlockSolver:
         self._matrix.data = lower[self._source]
         return self._matrix @ columns
 
+    def apply_held(self, lower: Array, columns: Array) -> Array:
+        """Product (free, …) of its columns of grasped dofs, with `columns` (g, …)."""
+        self._held.data = lower[self._held_source]
+        return self._held @ columns
+
     def _steps(
         self, x: Array, theta: Array, backward: bool = False, first: int = 0
     ) -> Iterator[_Step]:
@@ -289,6 +329,83 @@ class BlockSolver:
             ) from error
 
 
+@dataclass(frozen=True, eq=False)
+class GivenMotion:
+    """Columns Y of grasped dofs, which are given: the way to their goals, and ∂goal/∂φ.
+
+    Attributes
+    ----------
+    held_dofs : (h,) dofs held throughout
+    of_held : (N, h, columns)
+    of_evaluations : (N, g, columns) and over time, Σ_i p_i Y_{t−i} and Σ_i q_i Y_{t−i} of grasped
+        dofs; of those held for a while the past is in the rows before
+    taken : (N, g) bool, those held for a while
+    places : (g,) where they are among the free dofs; −1 for those held throughout
+    columns : (N, g, columns)
+    """
+
+    held_dofs: Index
+    of_held: Array
+    of_evaluations: tuple[Array, Array]
+    taken: NDArray[np.bool_]
+    places: Index
+    columns: Array
+
+    @classmethod
+    def of(
+        cls, solver: BlockSolver, setting: Setting, x: Array | None = None
+    ) -> GivenMotion | None:
+        """Those of a setting, with the way from x (N, 3n) in front; None where all is zero."""
+        held, dynamics = setting.held, solver.dynamics
+        if not held.moves:
+            return None
+        rows, shared = dynamics.rows, setting.theta_q.shape[1]
+        goals = held.positions_m[:rows]
+        columns = np.zeros((*goals.shape, shared + held.by_phi.shape[2]))
+        columns[..., shared:] = held.by_phi[:rows]
+        if x is not None:
+            way = np.nan_to_num(goals - x[:, held.dofs])
+            columns = np.concatenate([way[..., None], columns], axis=2)
+        return cls.along(solver, held.dofs, columns)
+
+    @classmethod
+    def along(cls, solver: BlockSolver, dofs: Index, columns: Array) -> GivenMotion:
+        """Those of dofs (g,) that move by `columns` (N, g, c)."""
+        dynamics = solver.dynamics
+        taken = dynamics.taken[:, dofs]
+        passing = np.isin(dofs, solver.free)
+        throughout = np.where(passing[:, None], 0.0, columns)
+        now = np.where((taken & passing)[..., None], columns, 0.0)
+        p, q = dynamics.tables.p, dynamics.tables.q / dynamics.step_s
+        evaluated = [
+            dynamics.combine(table, throughout) + table[:, :1, None] * now for table in (p, q)
+        ]
+        return cls(
+            held_dofs=dofs[~passing],
+            of_held=columns[:, ~passing],
+            of_evaluations=(evaluated[0], evaluated[1]),
+            taken=taken & passing,
+            places=np.where(passing, np.searchsorted(solver.free, dofs), -1),
+            columns=columns,
+        )
+
+    def force(self, solver: BlockSolver, step: _Step) -> Array:
+        """What their motion adds to F' (free, columns)."""
+        position, velocity = (each[step.t] for each in self.of_evaluations)
+        # What is only parameters of other kinds does not move them.
+        moved = np.flatnonzero(position.any(axis=0) | velocity.any(axis=0))
+        force = np.zeros((len(solver.free), position.shape[1]))
+        if len(moved):
+            force[:, moved] = solver.apply_held(step.by_position, position[:, moved])
+            force[:, moved] += solver.apply_held(step.by_velocity, velocity[:, moved])
+        return force
+
+    def place_taken(self, t: int, solution: Array) -> None:
+        """Put those held for a while into Y_t (free, columns), in place."""
+        here = self.taken[t]
+        solution[self.places[here]] = self.columns[t, here]
+
+
 class _Forward:
     """Substitution row by row; remembers the last few rows."""
 
@@ -332,19 +449,25 @@ class _Forward:
         weighed = self.setting.dynamics.weighed_kg[step.t]
         return self.setting.force_slopes(step.by_theta, weighed)[self.solver.free]
 
-    def advance(self, step: _Step, right: Array, force: Array) -> Array:
-        """Y_t from R_t and F_R, each (free, columns)."""
+    def advance(
+        self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None
+    ) -> Array:
+        """Y_t from R_t and F_R, each (free, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
         row = Row.of(solver.dynamics, t)
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)
         force += self._of_past(step, row)
+        if given is not None:
+            force += given.force(solver, step)
         solver.without_taken(t, right)
         solver.without_taken(t, force)
         solution = step.factor.solve(right + w[0] * force)
         if self.weighs_past:
             self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
+        if given is not None:
+            given.place_taken(t, solution)
         self.past.appendleft(solution)
         return solution
 

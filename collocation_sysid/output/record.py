@@ -15,9 +15,7 @@ import casadi
 import numpy as np
 
 from ..arrays import Array
-from ..check.motion import motion_of
-from ..errors import SimulationError
-from ..experiment import Experiment
+from ..methods.scan import Scan
 from ..methods.solution import Solution
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
@@ -61,7 +59,7 @@ def _write_pictures(finished: Run, seen: Sequence[Replay], place: Path) -> None:
     free = [item.name for item in solution.collocation.parameters.free]
     found = finished.uncertainty
     confidence = Confidence.of(found) if found is not None else None
-    pictures = album(seen, solution.history, free, confidence)
+    pictures = album(seen, solution.history, free, confidence, scan=_scan(solution.scan))
     pictures["jacobian"] = jacobian_sparsity(solution.collocation, solution.z)
     save_pictures(place, pictures)
 
@@ -106,22 +104,22 @@ def replays(finished: Run) -> list[Replay]:
             rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
         fit = fitted.get(experiment.name)
         if fit is not None or rolled_out is not None:
-            found.append(Replay.of(experiment, fit, rolled_out, _natural_hz(experiment, solution)))
+            motion = finished.motions.get(experiment.name)
+            natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
+            found.append(
+                Replay.of(
+                    experiment, fit, rolled_out, natural, _places_m(finished, experiment.name)
+                )
+            )
     return found
 
 
-def _natural_hz(experiment: Experiment, solution: Solution) -> Array | None:
-    """Natural frequencies with the answer; a method that failed has none worth the search."""
-    if not solution.status.converged:
-        return None
-    scheme = as_scheme(solution.collocation.scheme)
-    try:
-        motion = motion_of(
-            experiment, scheme, experiment.timestep_s, experiment.body.theta(solution.parameters)
-        )
-    except SimulationError:
-        return None
-    return np.array([mode.frequency_hz for mode in motion.modes])
+def _places_m(finished: Run, experiment: str) -> Array | None:
+    """(M, 3) of the markers as estimated; None where that failed."""
+    if experiment in finished.places:
+        return np.array([place.position_m for place in finished.places[experiment].values()])
+    rollout = finished.rollouts[experiment]
+    return np.array([*rollout.places_m.values()]) if isinstance(rollout, Rollout) else None
 
 
 def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
@@ -145,13 +143,16 @@ def result(finished: Run) -> dict[str, Any]:
         "status": solution.status.value,
         "converged": solution.status.converged,
         "message": solution.message,
+        "trust": {"verdict": finished.trust.verdict, "reasons": list(finished.trust.reasons)},
         "method": solution.method,
         "title": problem.title,
         "parameters": _parameters(finished),
         "derived": {name: _with_error_bar(finished.estimates[name]) for name in finished.derived},
+        "places": _places(finished),
         "nuisance": _nuisance(finished),
         "uncertainty": _uncertainty(finished),
-        "fit": _fit(solution),
+        "scan": _scan(solution.scan),
+        "fit": _fit(solution) | {"noise_rms_m": finished.noise_rms_m},
         "residuals": [
             {**asdict(diagnosis), "offset_m": diagnosis.offset_m.tolist()}
             for diagnosis in finished.diagnoses
@@ -170,6 +171,7 @@ def result(finished: Run) -> dict[str, Any]:
                     "max_m": r.max_m,
                     "fitted": name in fitted,
                     "nuisance": r.nuisance,
+                    "places_m": r.places_m,
                 }
                 if isinstance(r, Rollout)
                 else {"failed": r, "fitted": name in fitted}
@@ -240,7 +242,7 @@ def _parameters(finished: Run) -> dict[str, Any]:
             "fixed": item.fixed or item.tied is not None,
             **_with_error_bar(finished.estimates[item.name]),
         }
-        for item in finished.problem.parameters.items
+        for item in finished.started_from.items
     }
 
 
@@ -254,20 +256,53 @@ def _with_error_bar(estimate: Estimate) -> dict[str, Any]:
     }
 
 
+def _places(finished: Run) -> dict[str, dict[str, dict[str, Any]]]:
+    return {
+        experiment: {
+            name: {
+                "position_m": place.position_m.tolist(),
+                "std_error_m": None if place.std_error_m is None else place.std_error_m.tolist(),
+                "prior_m": place.prior_m,
+                "given": place.given,
+            }
+            for name, place in places.items()
+        }
+        for experiment, places in finished.places.items()
+    }
+
+
 def _nuisance(finished: Run) -> dict[str, dict[str, Any]]:
-    """The nuisance parameters in their units, with the deviation of their prior."""
+    """Nuisance parameters but the places in their units, with the deviation of their prior."""
     deviations = finished.uncertainty.nuisance if finished.uncertainty is not None else {}
     collocation = finished.solution.collocation
     found = {}
     for part in collocation.parts(finished.solution.z):
         nuisance = part.segment.nuisance
-        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
+        for kind, name, phi, scale in zip(
+            nuisance.kinds, nuisance.names, part.phi, nuisance.scales, strict=True
+        ):
+            if kind == "place":
+                continue
             found.setdefault(part.segment.experiment.name, {})[name.partition(": ")[2]] = {
-                "value": float(value * scale),
+                "value": float(phi * scale),
                 "prior": float(scale),
                 "std_error": deviations[name] * scale if name in deviations else None,
             }
     return found
+
+
+def _scan(scan: Scan | None) -> dict[str, Any] | None:
+    if scan is None:
+        return None
+    return {
+        "reason": scan.reason,
+        "young_pa": scan.young_pa.tolist(),
+        "misfit": scan.misfit.tolist(),
+        "best": scan.best,
+        "samples": scan.samples,
+        "time_s": scan.time_s,
+        "sentence": scan.sentence,
+    }
 
 
 def _uncertainty(finished: Run) -> dict[str, Any] | None:
@@ -278,6 +313,7 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
         "noise": found.noise,
         "errors": found.errors,
         "reduced_chi_squared": found.reduced_chi_squared,
+        "noise_factors": found.level.factors,
         "autocorrelation": found.dependence.lag1,
         "names": list(found.names),
         "correlation": found.correlation.tolist(),
@@ -299,12 +335,10 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
 
 def _fit(solution: Solution) -> dict[str, Any]:
     experiments = {}
-    segments = solution.collocation.segments
-    for segment, readings in zip(segments, solution.readings_m, strict=True):
-        markers = segment.experiment.markers
-        squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
-        experiments[segment.experiment.name] = {
-            "rms_m": float(np.sqrt(squares.mean())),
+    for segment in solution.collocation.segments:
+        name, markers = segment.experiment.name, segment.experiment.markers
+        experiments[name] = {
+            "rms_m": solution.rms_by_experiment_m[name],
             "samples": markers.samples,
             "missing": int(markers.missing.sum()),
         }

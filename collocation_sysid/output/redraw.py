@@ -23,7 +23,8 @@ def redraw(run: str | Path, folder: str | Path) -> list[Path]:
     try:
         history = [_iteration(line) for line in result["history"]]
         free = [name for name, item in result["parameters"].items() if not item["fixed"]]
-        pictures = album(replays, history, free, Confidence.from_result(result))
+        confidence = Confidence.from_result(result)
+        pictures = album(replays, history, free, confidence, scan=result.get("scan"))
     except (ValueError, LookupError, TypeError) as error:
         raise damaged(run, error) from error
     folder.mkdir(parents=True, exist_ok=True)

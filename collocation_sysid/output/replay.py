@@ -42,7 +42,8 @@ class Replay:
     held : (T, n) bool, which nodes are grasped
     up : (3,) unit vector against gravity; z where there is none
     marker_names : (M,) str
-    marker_places_m : (M, 3) where the markers sit on the undeformed body
+    marker_places_m : (M, 3) where the markers sit on the undeformed body, as found
+    given_places_m : (M, 3) the places given, NaN where there was none
     measured_m : (T, M, 3) NaN where missing
     positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
     rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
@@ -60,6 +61,7 @@ class Replay:
     up: Array
     marker_names: Sequence[str]
     marker_places_m: Array
+    given_places_m: Array
     measured_m: Array
     positions_m: Array | None = None
     markers_m: Array | None = None
@@ -74,10 +76,14 @@ class Replay:
         fitted: tuple[Array, Array] | None = None,
         rolled_out: tuple[Array, Array] | None = None,
         natural_hz: Array | None = None,
+        places_m: Array | None = None,
     ) -> Replay:
-        """Gather an experiment with (positions, markers) as fitted, and as rolled out."""
+        """Gather an experiment with (positions, markers) as fitted, and as rolled out.
+
+        Its markers are at `places_m` (M, 3), where they were estimated.
+        """
         body, markers = experiment.body, experiment.markers
-        placement = markers.placement
+        given_m = markers.observe(body.nodes_m)
         pull = np.linalg.norm(experiment.gravity_m_s2)
         return cls(
             experiment.name,
@@ -90,7 +96,8 @@ class Replay:
             experiment.grasped(experiment.t_s)[0],
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
-            np.einsum("mk,mkj->mj", placement.weights, body.nodes_m[placement.nodes]),
+            given_m if places_m is None else places_m,
+            np.where(markers.located[:, None], given_m, np.nan),
             markers.positions_m,
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
@@ -112,6 +119,7 @@ class Replay:
             "residuals_m": None if self.markers_m is None else self.markers_m - self.measured_m,
             "marker_names": np.array(self.marker_names),
             "marker_places_m": self.marker_places_m,
+            "given_places_m": self.given_places_m,
             "rolled_out_m": self.rolled_out_m,
             "rolled_out_positions_m": _single(self.rolled_out_positions_m),
             "held": self.held,
@@ -137,7 +145,7 @@ class Replay:
             If an array is missing.
         """
         prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
-        needed = ("t_s", "held", "up", "marker_places_m", "measured_m")
+        needed = ("t_s", "held", "up", "marker_places_m", "given_places_m", "measured_m")
         optional = (
             "positions_m",
             "markers_m",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,6 +12,7 @@ from ..fem.body import Body
 from ..fem.constants import constant_named
 from ..fem.materials import Material
 from ..fem.mesh import TetMesh
+from ..fem.plausible import oddities
 from ..fem.regions import Region
 from ..nlp.parameters import Parameters, Tied, Unknown
 from .code import load_material
@@ -36,10 +38,12 @@ def read_problem(
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
     body = _located(path, "object", lambda: _load_body(file.object, mesh, folder, allow_code))
     parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))
+    odd = _located(path, "object", lambda: [oddity.sentence for oddity in oddities(body)])
     experiments, notes = [], []
     for section in file.experiment:
         reader = RecordingReader(section, folder, body, parameters, simulation)
-        experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
+        with _blamed_on(odd):
+            experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
         notes += reader.notes
     try:
         return Problem(
@@ -66,6 +70,16 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
         names += [section.markers.file, *(grasp.poses for grasp in section.grasps)]
         names += [force.file for force in section.force]
     return tuple(folder / name for name in names if name is not None)
+
+
+@contextmanager
+def _blamed_on(odd: Sequence[str]) -> Iterator[None]:
+    """Errors that follow from an odd size or density name that first."""
+    try:
+        yield
+    except InputError as error:
+        message = "; ".join([*odd, error.message])
+        raise InputError(message, error.source, error.where) from error
 
 
 def _located(path: Path, table: str, build: Callable[[], T]) -> T:
@@ -134,7 +148,6 @@ def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | fl
         return section.fixed
     if section.tied_to is not None:
         return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
-    assert section.guess is not None  # by the schema
     linear = (section.scale or constant_named(name).scale) == "linear"
     return Unknown(
         section.guess,

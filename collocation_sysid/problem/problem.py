@@ -11,6 +11,7 @@ from ..checked import Positive
 from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
+from ..fem.plausible import oddities
 from ..methods import METHODS
 from ..methods.described import require_method
 from ..methods.method import Method
@@ -18,7 +19,7 @@ from ..methods.options import Options
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
-from ..statistics.uncertainty import ErrorsOption, Noise
+from ..statistics.uncertainty import ErrorsOption, NoiseOption
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,16 @@ class UncertaintyOptions(Options):
 
     Attributes
     ----------
-    noise : {"given", "estimated"}
-        Trust the markers' sigma_m, or scale it by the residuals.
+    noise : {"auto", "given", "estimated"}
+        Trust the markers' sigma_m, or scale it by the residuals; "auto" does the latter where the
+        residuals ask for it.
     errors : {"auto", "independent", "autocorrelated"}
         What to assume of the errors; "auto" tests the residuals.
     profile : tuple of str
         Parameters whose profile likelihood is wanted.
     """
 
-    noise: Noise = "given"
+    noise: NoiseOption = "auto"
     errors: ErrorsOption = "auto"
     profile: tuple[str, ...] = ()
 
@@ -103,7 +105,8 @@ class Problem:
     ------
     InputError
         For experiments of one name, parameters that do not give the constants of the bodies, an
-        unknown scheme or method, or a profile of what is not estimated.
+        unknown scheme or method, a profile of what is not estimated, or a size or density that no
+        body has.
     """
 
     experiments: tuple[Experiment, ...]
@@ -154,7 +157,8 @@ class Problem:
             origin=origin,
         )
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
-        vars(self)["notes"] = tuple(dict.fromkeys((*cleaned, *notes)))
+        odd = (oddity.sentence for body in self.bodies for oddity in oddities(body))
+        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *cleaned, *notes)))
         self._check()
 
     def __repr__(self) -> str:

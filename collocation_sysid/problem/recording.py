@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import InputError, SimulationError, hint_at
+from ..errors import InputError, hint_at
 from ..experiment import (
     Experiment,
     Force,
@@ -19,20 +20,18 @@ from ..experiment import (
     Markers,
     MarkerTable,
     Nuisance,
-    Placement,
     PointMass,
     PoseSequence,
     align,
     held_nodes,
-    place_markers,
     read_forces,
     read_poses,
 )
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
-from ..nlp.newton import Solver
-from ..nlp.parameters import Parameters, theta_of
-from ..nlp.rest import start_state
+from ..methods.scan import usual_constants
+from ..nlp.parameters import Parameters
+from ..statistics.description import doubts
 from .recording_schema import (
     ExperimentSection,
     ForceSection,
@@ -41,7 +40,6 @@ from .recording_schema import (
     MassSection,
     NodesSection,
     NuisanceSection,
-    PosePrior,
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
@@ -49,6 +47,17 @@ Build = Callable[[Markers], Experiment]
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
+
+
+# Fields of `Nuisance`, with the key of their prior, by the keys of the file.
+NUISANCES = {
+    "marker_offsets": {"marker_offset_m": "prior_m"},
+    "time_shift": {"time_shift_s": "prior_s"},
+    "gravity": {"gravity_rad": "prior_rad"},
+    "hand_eye": {"hand_eye_m": "prior_m", "hand_eye_rad": "prior_rad"},
+    "pose": {"pose_shift_m": "prior_m", "pose_turn_rad": "prior_rad"},
+    "camera_offsets": {"camera_offset_m": "prior_m"},
+}
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
@@ -157,6 +166,8 @@ class RecordingReader:
             return PoseSequence.fixed()
         file = existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses"))
         poses = read_poses(file, grasp.quaternion, grasp.length_unit)
+        if grasp.gripper_to_body is not None:
+            poses = poses.after(grasp.gripper_to_body.matrix)
         return replace(poses, interpolation=grasp.interpolation)
 
     def _poses_from_markers(self, grasp: GraspSection, key: str) -> PoseSequence:
@@ -199,7 +210,11 @@ class RecordingReader:
     def _grasp(self, k: int, grasp: GraspSection, poses: PoseSequence) -> Grasp:
         nodes = self._nodes(grasp.nodes, self._grasp_key(k, "nodes"))
         return Grasp(
-            nodes, poses, **grasp.model_dump(include={"from_s", "until_s"}, exclude_none=True)
+            nodes,
+            poses,
+            **grasp.model_dump(
+                include={"from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
+            ),
         )
 
     def _mass(self, k: int, mass: MassSection) -> PointMass:
@@ -248,7 +263,7 @@ class RecordingReader:
     def _fitted(self, table: MarkerTable) -> MarkerTable:
         """The tracks asked for, without the gripper's markers and those of weight 0."""
         markers = self.section.markers
-        for key in ("reference_m", "sigma_m", "weights"):
+        for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             given = getattr(markers, key)
             _refuse_unknown(given if isinstance(given, dict) else (), table.names, f"markers.{key}")
         unweighted = [name for name in table.names if markers.weights.get(name) == 0]
@@ -269,89 +284,70 @@ class RecordingReader:
 
     def _align(
         self, poses: list[PoseSequence], table: MarkerTable
-    ) -> tuple[Array, list[PoseSequence], MarkerTable]:
+    ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
         section = self.section
-        files = [grasp.poses for grasp in section.grasps] or [None]
-        aligned = []
-        t_s, grid = table.t_s, table
-        for sequence, file in zip(poses or [PoseSequence.fixed()], files, strict=True):
-            try:
-                t_s, moved, grid = align(
-                    sequence, table, section.window_s, section.resample_hz, section.every
-                )
-            except InputError as error:
-                named = " and ".join(name for name in (file, section.markers.file) if name)
-                raise InputError(error.message, None, named) from error
-            aligned.append(moved)
-        if section.resample_hz and section.resample_hz > 1.01 / np.median(np.diff(table.t_s)):
-            self.notes.append(
-                f"experiment '{section.name}': resample_hz is above the markers' own rate; "
-                "interpolated samples count as measured, so error bars come out too small"
+        held_s = [
+            (-np.inf if g.from_s is None else g.from_s, np.inf if g.until_s is None else g.until_s)
+            for g in section.grasps
+        ]
+        try:
+            aligned = align(
+                poses, table, section.window_s, section.resample_hz, section.every, held_s
             )
-        return t_s, aligned[: len(poses)], grid
+        except InputError as error:
+            files = [*(grasp.poses for grasp in section.grasps), section.markers.file]
+            named = " and ".join(dict.fromkeys(name for name in files if name))
+            raise InputError(error.message, None, named) from error
+        self._note(*aligned.notes)
+        if section.resample_hz and section.resample_hz > 1.01 / np.median(np.diff(table.t_s)):
+            self._note(
+                "resample_hz is above the markers' own rate; interpolated samples count as "
+                "measured, so error bars come out too small"
+            )
+        return aligned.t_s, aligned.poses, aligned.table
 
     def _place(self, t_s: Array, table: MarkerTable, build: Build) -> Experiment:
-        """Attach the markers: by reference where given, else by their first sample."""
-        spec, names, nodes_m = self.section.markers, table.names, self.body.nodes_m
-        sigma_m = _sigma(spec, names)
-        known = [k for k, name in enumerate(names) if name in spec.reference_m]
-        others = [k for k, name in enumerate(names) if name not in spec.reference_m]
-
-        def place(chosen: list[int], points_m: Array, shape_m: Array) -> Placement:
-            labels = [names[k] for k in chosen]
-            return place_markers(
-                points_m, shape_m, self.body, spec.attach, spec.max_distance_m, labels
-            )
-
-        def with_placement(placement: Placement) -> Experiment:
-            return build(Markers(t_s, table.positions_m, sigma_m, names, placement=placement))
-
-        parts = []
-        if known:
-            references = np.array([spec.reference_m[names[k]] for k in known])
-            parts.append(place(known, references, nodes_m))
-        if others:
-            anywhere = np.repeat(nodes_m[:1], len(names), axis=0)
-            provisional = place_markers(anywhere, nodes_m, self.body, "vertex")
-            start_m = self._start_shape(with_placement(provisional))
-            parts.append(place(others, _first_samples(table)[others], start_m))
-        order = np.argsort(known + others)
-        experiment = with_placement(
-            Placement(
-                np.concatenate([part.nodes for part in parts])[order],
-                np.concatenate([part.weights for part in parts])[order],
-                np.concatenate([part.distance_m for part in parts])[order],
-                len(nodes_m),
-            )
+        """Attach the markers where references are given; the others' places are unknown."""
+        spec, names = self.section.markers, table.names
+        markers = Markers(
+            t_s,
+            table.positions_m,
+            _sigma(spec, names),
+            names,
+            places_m=np.array([spec.reference_m.get(name, [np.nan] * 3) for name in names]),
+            places_sigma_m=_reference_sigma(spec, names),
+            on_surface=spec.places == "surface",
+            attach=spec.attach,
+            max_distance_m=spec.max_distance_m,
         )
+        experiment = build(markers)
         if not self.simulation:
-            _refuse_other_scale(experiment)
+            refuse_other_scale(experiment, usual_constants(self.parameters))
         return experiment
 
-    def _start_shape(self, experiment: Experiment) -> Array:
-        theta = theta_of(self.body, self.parameters)
-        try:
-            x, _ = start_state(experiment, theta, Solver(experiment))
-        except SimulationError:
-            self.notes.append(
-                f"experiment '{self.section.name}': no rest state at the guess; markers without "
-                "reference_m were placed on the undeformed shape"
-            )
-            x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
-        return x.reshape(-1, 3)
+
+def _nuisance(section: NuisanceSection | Literal["none"]) -> Nuisance:
+    """The defaults, with what the table says otherwise."""
+    if section == "none":
+        return Nuisance.none()
+    found: dict[str, float | None] = {}
+    for key, fields in NUISANCES.items():
+        given = getattr(section, key)
+        if given == "none":
+            found |= dict.fromkeys(fields)
+        elif given is not None:
+            found |= {field: getattr(given, prior) for field, prior in fields.items()}
+    return Nuisance(**found)
 
 
-def _nuisance(section: NuisanceSection | None) -> Nuisance:
-    if section is None:
-        return Nuisance()
-    pose = section.pose or PosePrior.model_construct()
-    return Nuisance(
-        marker_offset_m=section.marker_offsets and section.marker_offsets.prior_m,
-        time_shift_s=section.time_shift and section.time_shift.prior_s,
-        pose_turn_rad=pose.prior_rad,
-        pose_shift_m=pose.prior_m,
-        gravity_rad=section.gravity and section.gravity.prior_rad,
-    )
+def _reference_sigma(spec: MarkersSection, names: Sequence[str]) -> Array | None:
+    """(M,) how well the places are known, NaN where that is not said."""
+    given = spec.reference_sigma_m
+    if given is None:
+        return None
+    if not isinstance(given, dict):
+        return np.full(len(names), given)
+    return np.array([given.get(name, np.nan) for name in names])
 
 
 def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> None:
@@ -376,36 +372,41 @@ def _sigma(spec: MarkersSection, names: Sequence[str]) -> Array:
     return np.array([spec.sigma_m[name] for name in names]) / np.sqrt(weight)
 
 
-def _refuse_other_scale(experiment: Experiment) -> None:
+def refuse_other_scale(experiment: Experiment, constants: Mapping[str, float]) -> None:
     """Refuse tracks that cannot be of this body: a unit or a frame is mistaken."""
+    if (message := _other_scale(experiment)) is None:
+        return
+    likeliest = "".join(f"; likely {cause.sentence}" for cause in doubts(experiment, constants)[:1])
+    raise InputError(message + likeliest, None, "markers")
+
+
+def _other_scale(experiment: Experiment) -> str | None:
+    """Why tracks cannot be of this body; None if they can."""
     markers, body_m = experiment.markers, _diagonal(experiment.body.nodes_m)
     k = int(markers.present.sum(axis=1).argmax())
     seen = markers.present[k]
     measured = markers.positions_m[k, seen]
     span_m = _diagonal(measured)
     if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:
-        raise InputError(
+        return (
             f"at t = {experiment.t_s[k]:.6g} s the markers span {span_m:.3g} m, but the body "
-            f"{body_m:.3g} m; check length_unit of the markers and of the object",
-            None,
-            "markers",
+            f"{body_m:.3g} m; check length_unit of the markers and of the object"
         )
     if not experiment.grasps:
-        return
+        return None
     carried = markers.observe(experiment.rigid_positions(experiment.t_s[[k]]))[0, seen]
     miss_m = np.linalg.norm(measured - carried, axis=1)
     worst = int(miss_m.argmax())
     if miss_m[worst] > LARGEST_MISS * body_m:
         name = markers.names[np.flatnonzero(seen)[worst]]
-        raise InputError(
+        return (
             f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
             f"{_triple(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp carries its "
             f"place on the body, {_triple(carried[worst])} m; check length_unit, the marker's "
             "reference_m, that poses and markers share frame and clock, and that the poses map "
-            "undeformed to current positions",
-            None,
-            "markers",
+            "undeformed to current positions"
         )
+    return None
 
 
 def _diagonal(points_m: Array) -> float:
@@ -414,9 +415,3 @@ def _diagonal(points_m: Array) -> float:
 
 def _triple(point: Array) -> str:
     return f"({', '.join(f'{x:.4g}' for x in point)})"
-
-
-def _first_samples(table: MarkerTable) -> Array:
-    """(M, 3) first present sample of every marker, NaN where there is none."""
-    present = np.isfinite(table.positions_m[:, :, 0])
-    return table.positions_m[present.argmax(axis=0), np.arange(len(table.names))]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from scipy.spatial.transform import Rotation
 
+from ..arrays import Array
 from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text, Whole
+from ..experiment.poses import QUATERNION_NORM_TOLERANCE
 from .section import Corner, Section, Unit, Vector, given_keys, require_one
 
 
@@ -22,7 +27,11 @@ class NodesSection(Section):
     indices: list[Whole] | None = Field(
         None, description="List of node numbers as in the mesh file, counted from 0."
     )
-    name: Text | None = Field(None, description="A point array of the mesh, 1 where selected.")
+    name: Text | None = Field(
+        None,
+        description="A point array of the mesh, 1 where selected, or a physical group of elements "
+        "of any dimension.",
+    )
 
     @model_validator(mode="after")
     def _one(self) -> NodesSection:
@@ -43,11 +52,39 @@ Nodes = Annotated[
 ]
 
 
+class TransformSection(Section):
+    """A constant rigid motion."""
+
+    position_m: Vector = Field((0.0, 0.0, 0.0), description="Shift [x, y, z].")
+    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = Field(
+        (0.0, 0.0, 0.0, 1.0), description="Turn before the shift [x, y, z, w]."
+    )
+
+    @model_validator(mode="after")
+    def _unit_norm(self) -> TransformSection:
+        norm = math.hypot(*self.quaternion_xyzw)
+        if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+            raise ValueError(
+                f"found quaternion_xyzw of the norm {norm:.6g}; expected 1 within "
+                f"{QUATERNION_NORM_TOLERANCE:g} (order x, y, z, w)"
+            )
+        return self
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) [[R, p], [0, 1]]."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
+        matrix[:3, 3] = self.position_m
+        return matrix
+
+
 class GraspSection(Section):
     """Nodes held by a gripper, and how it moves."""
 
     nodes: Nodes = Field(
-        description="Selection: a table of box_m, ball_m or indices, or the name of a point array."
+        description="Selection: a table of box_m, ball_m or indices, or the name of a point array "
+        "or physical group."
     )
     poses: Text | None = Field(
         None, description="Poses, CSV or .npz; held where they are without poses or markers."
@@ -69,7 +106,20 @@ class GraspSection(Section):
     max_residual_m: Positive | None = Field(
         None, description="Residual of that fit above which a frame is reported."
     )
-    interpolation: Literal["linear", "hold"] = "linear"
+    gripper_to_body: TransformSection | None = Field(
+        None,
+        description="Place of the undeformed body in the frame that poses tell of, G in "
+        "x = U(t) G X: position_m, quaternion_xyzw.",
+    )
+    interpolation: Literal["smooth", "linear", "hold"] = Field(
+        "smooth", description="Motion between the samples of poses."
+    )
+    sigma_m: NotNegative | None = Field(
+        None, description="Standard deviation of the noise in each position of poses."
+    )
+    sigma_rad: NotNegative | None = Field(
+        None, description="Standard deviation of the noise in each rotation, about each axis [rad]."
+    )
     from_s: Finite | None = Field(None, description="First time at which it holds.")
     until_s: Finite | None = Field(
         None,
@@ -90,8 +140,13 @@ class GraspSection(Section):
     def _one_source_of_poses(self) -> GraspSection:
         if self.poses is not None and self.markers is not None:
             raise ValueError("found poses and markers; expected one of them")
+        if self.gripper_to_body is not None and self.markers is not None:
+            raise ValueError(
+                "found gripper_to_body and markers; expected no gripper_to_body, since the places "
+                "in markers are on the undeformed body already"
+            )
         for owner, keys in (
-            ("poses", given_keys(self, "quaternion", "length_unit")),
+            ("poses", given_keys(self, "quaternion", "length_unit", "gripper_to_body")),
             (
                 "markers",
                 [*given_keys(self, "max_residual_m"), *(["weights"] if self.weights else [])],
@@ -111,6 +166,13 @@ def _sigma_form(value: Any) -> str:
 
 Sigma = Annotated[
     Annotated[Positive, Tag("<for all>")] | Annotated[dict[str, Positive], Tag("<by marker>")],
+    Discriminator(_sigma_form),
+]
+
+
+ReferenceSigma = Annotated[
+    Annotated[NotNegative, Tag("<for all>")]
+    | Annotated[dict[str, NotNegative], Tag("<by marker>")],
     Discriminator(_sigma_form),
 ]
 
@@ -155,7 +217,16 @@ class MarkersSection(Section):
     )
     reference_m: dict[str, Vector] = Field(
         default_factory=dict,
-        description="Place [x, y, z] on the undeformed body for each marker, by name.",
+        description="Place [x, y, z] on the undeformed body for each marker, by name; the others' "
+        "places are estimated.",
+    )
+    reference_sigma_m: ReferenceSigma | None = Field(
+        None,
+        description="Standard deviation of the places in reference_m, for all or by marker name; "
+        "0 for exact ones. That of nuisance.marker_offsets by default.",
+    )
+    places: Literal["free", "surface"] = Field(
+        "free", description="Places that are estimated may be anywhere, or stay on the surface."
     )
     attach: Literal["auto", "vertex", "embedded"] = "auto"
     max_distance_m: Positive | None = Field(
@@ -242,21 +313,66 @@ class PosePrior(Section):
         return self
 
 
-class NuisanceSection(Section):
-    """What is estimated of this recording alone, each with a prior around zero."""
+def _nuisance_form(value: Any) -> str:
+    return "<none>" if isinstance(value, str) else "<table>"
 
-    marker_offsets: LengthPrior | None = Field(
-        None, description="A constant offset of every marker from its place: prior_m."
+
+OffOrLength = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[LengthPrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+OffOrTime = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[TimePrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+OffOrAngle = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[AnglePrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+OffOrPose = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[PosePrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+
+
+class NuisanceSection(Section):
+    """What is estimated of this recording alone, each with a prior around zero.
+
+    The first four are estimated unless they are "none".
+    """
+
+    marker_offsets: OffOrLength | None = Field(
+        None,
+        description="Errors of the places given in reference_m, which turn with the body: prior_m, "
+        "1 mm by default.",
     )
-    time_shift: TimePrior | None = Field(
-        None, description="Delay of the markers' clock against the grasps': prior_s."
+    time_shift: OffOrTime | None = Field(
+        None,
+        description="How much later than their times say markers were seen, on the grasps' clock: "
+        "prior_s, 5 ms by default.",
     )
-    pose: PosePrior | None = Field(
-        None, description="A constant rigid correction of the grasps: prior_rad, prior_m."
+    gravity: OffOrAngle | None = Field(
+        None, description="A tilt of the direction of gravity: prior_rad, 1 degree by default."
     )
-    gravity: AnglePrior | None = Field(
-        None, description="A tilt of the direction of gravity: prior_rad."
+    hand_eye: OffOrPose | None = Field(
+        None,
+        description="A constant motion of the body in its grasps: prior_rad, prior_m; 0.5 degrees "
+        "and 1 mm by default.",
     )
+    pose: OffOrPose | None = Field(
+        None,
+        description="A constant rigid correction of grasps and body in the cameras' frame: "
+        "prior_rad, prior_m.",
+    )
+    camera_offsets: OffOrLength | None = Field(
+        None, description="A constant offset of every marker in the cameras' frame: prior_m."
+    )
+
+
+NuisanceOrNone = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[NuisanceSection, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
 
 
 def _grasp_form(value: Any) -> str:
@@ -285,7 +401,9 @@ class ExperimentSection(Section):
     window_s: tuple[Boundless, Boundless] | None = Field(
         None, description="First and last time to use [start, end]."
     )
-    resample_hz: Positive | None = Field(None, description="Put poses and markers on this rate.")
+    resample_hz: Positive | None = Field(
+        None, description="Put the markers on this rate; their own times by default."
+    )
     every: Annotated[int, Field(strict=True, ge=1)] = Field(
         1, description="Use every so-manieth sample of the markers."
     )
@@ -296,8 +414,9 @@ class ExperimentSection(Section):
     force: list[ForceSection] = Field(
         default_factory=list, description="[[experiment.force]] tables: forces besides gravity."
     )
-    nuisance: NuisanceSection | None = Field(
-        None, description="What is estimated of this recording alone."
+    nuisance: NuisanceOrNone = Field(
+        default_factory=lambda: NuisanceSection.model_construct(),
+        description='What is estimated of this recording alone, as a table; or "none".',
     )
     validation: Flag = Field(False, description="Not fitted, only predicted.")
 

@@ -104,9 +104,11 @@ class PriorSection(Section):
 
 
 class ParameterSection(Section):
-    """One parameter: estimated from a guess within bounds, fixed, or tied to another."""
+    """One parameter: estimated within bounds, fixed, or tied to another; {} is estimated."""
 
-    guess: Finite | None = None
+    guess: Finite | None = Field(
+        None, description="Where the search starts; found by a scan where none is given."
+    )
     lower: Finite | None = None
     upper: Finite | None = None
     fixed: Finite | None = Field(None, description="Value that is not estimated.")
@@ -122,16 +124,17 @@ class ParameterSection(Section):
 
     @model_validator(mode="after")
     def _one_kind(self) -> ParameterSection:
-        require_one(self, "guess", "fixed", "tied_to")
+        if len(given := given_keys(self, "guess", "fixed", "tied_to")) > 1:
+            raise ValueError(f"found {' and '.join(given)}; expected one of them, or none")
         of_kind = {
             "guess": ("lower", "upper", "prior", "scale", "typical"),
             "fixed": (),
             "tied_to": ("ratio",),
         }
-        kind = next(key for key in of_kind if getattr(self, key) is not None)
+        kind = next((key for key in of_kind if getattr(self, key) is not None), "guess")
         others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
         if useless := given_keys(self, *(n for n in type(self).model_fields if n in others)):
-            instead = "guess in its place to estimate the parameter"
+            instead = "guess or nothing in its place to estimate the parameter"
             raise ValueError(
                 f"found {kind} beside {', '.join(useless)}; expected {kind} alone, or {instead}"
             )
@@ -182,8 +185,9 @@ class TranscriptionSection(Section):
 class UncertaintySection(Section):
     """How the error bars are found."""
 
-    noise: Literal["given", "estimated"] = Field(
-        default="given", description="Trust sigma_m, or scale it by the residuals."
+    noise: Literal["auto", "given", "estimated"] = Field(
+        default="auto",
+        description="Trust sigma_m, or scale it by the residuals; auto where they ask for it.",
     )
     errors: Literal["auto", "independent", "autocorrelated"] = Field(
         default="auto", description="What to assume of the errors; auto tests the residuals."
@@ -209,7 +213,8 @@ class ProblemFile(Section):
     title: str = ""
     object: ObjectSection
     parameters: Parameters = Field(
-        description="Names of the model's constants, each with a guess, a fixed value or a tie."
+        description="Names of the model's constants: each {} or a guess to estimate it, a value, "
+        "or a tie."
     )
     experiment: list[ExperimentSection] = Field(
         min_length=1, description="At least one [[experiment]] table, one for each recording."

@@ -25,12 +25,12 @@ element = "tet4"               # or tet10 if it bends or is slender; tet10-p0, p
 # cells = {{ ball_m = [[0, 0, 0.1], 0.02] }}
 # density_kg_m3 = 200.0
 
-[parameters]                   # estimated from a guess within bounds; a number alone is fixed
-young_pa    = {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
-poisson     = {{ guess = 0.3, lower = 0.05, upper = 0.45 }}
+[parameters]                   # {{}} is estimated, a number alone is fixed
+young_pa    = {{}}               # no guess is needed; {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
+poisson     = {{ lower = 0.05, upper = 0.45 }}
 # lambda_pa and mu_pa, or kappa_pa and mu_pa, may stand in place of young_pa and poisson
-gamma_r_s   = {{ guess = 0.01, lower = 1e-5, upper = 1.0 }}
-gamma_m_1_s = {{ guess = 1.0, lower = 1e-3, upper = 100.0 }}
+gamma_r_s   = {{}}
+gamma_m_1_s = {{}}
 
 [[experiment]]                 # one for each recording; all share the parameters
 name = "swing"
@@ -38,13 +38,15 @@ start = "equilibrium"          # at rest in the grasps that hold then; or "undef
 gravity_m_s2 = [0.0, 0.0, -9.81]
 # window_s = [0.5, 2.0]        # use only this span of time
 # every = 2                    # and every second sample
-# resample_hz = 100.0          # if poses and markers have different rates
+# resample_hz = 100.0          # if the markers' times are uneven; poses are always interpolated
 # validation = true            # not fitted, only predicted
 
 [experiment.grasp]             # which nodes the gripper holds, and how it moves
-nodes = {{ box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }}   # or ball_m, indices, a point array's name
+nodes = {{ box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }}   # or ball_m, indices, a group's name
 poses = "poses.csv"            # t_s,x_m,y_m,z_m,qx,qy,qz,qw: undeformed to current position
+# gripper_to_body: position_m and quaternion_xyzw of the body in the gripper, if poses are its
 # markers = {{ base1 = [0, 0, 0], base2 = [0.1, 0, 0], base3 = [0, 0.1, 0] }}  # or from tracks
+# sigma_m = 0.0003             # noise of each pose, and sigma_rad; judged by their roughness if not
 # until_s = 1.2                # let go then; several grasps: a list of such tables
 
 [experiment.markers]
@@ -53,12 +55,16 @@ sigma_m = 0.001                # standard deviation of a coordinate
 # length_unit = "mm"           # where the file does not say
 # labels = {{ "Body:tip" = "tip" }}           # the file's labels, and the names used here
 # reference_m = {{ tip = [0.0, 0.0, 0.2] }}   # places on the undeformed body, where they are known
+# reference_sigma_m = 0.001    # how well they are; the others' are estimated
+# places = "surface"           # places that are estimated stay on the surface; "free" by default
 
-# [experiment.nuisance]        # what is not known of this recording, with its standard deviation
-# marker_offsets = {{ prior_m = 0.003 }}
-# time_shift = {{ prior_s = 0.01 }}
-# pose = {{ prior_rad = 0.02, prior_m = 0.002 }}
-# gravity = {{ prior_rad = 0.02 }}
+# [experiment.nuisance]        # not known of this recording: the defaults; nuisance = "none" above
+# marker_offsets = {{ prior_m = 0.001 }}      # of reference_m without a reference_sigma_m
+# time_shift = {{ prior_s = 0.005 }}          # markers against poses; "none" if one clock has both
+# gravity = {{ prior_rad = 0.01745 }}         # tilt of its direction
+# hand_eye = {{ prior_rad = 0.0087, prior_m = 0.001 }}   # the body in its grasp
+# pose = {{ prior_rad = 0.02, prior_m = 0.002 }}         # cameras off; "none" by default
+# camera_offsets = {{ prior_m = 0.001 }}      # of each marker; "none" by default
 
 # [[experiment.mass]]          # a point mass tied to the body
 # nodes = {{ box_m = [[-1, -1, 0.19], [1, 1, 0.21]] }}
@@ -74,14 +80,14 @@ scheme = "midpoint"            # or "bdf2", "backward-euler"
 substeps = 1                   # grid steps between samples
 
 [solver]
-method = "reduced-space"       # or "interior-point", which needs no simulable guess
+method = "reduced-space"       # or "interior-point", "shooting", ...
 # huber = 3.0                  # samples farther off than this many sigmas count linearly
 
 # [solver.reduced-space]       # options of a method: see `collocation-sysid methods reduced-space`
 # tolerance = 1e-6
 
 # [uncertainty]
-# noise = "estimated"          # sigma_m tells only the markers' relative precision
+# noise = "given"              # trust sigma_m, whatever the residuals say
 # profile = ["poisson"]        # profile likelihood of these parameters
 
 # [rollout]                    # the forward simulation that checks the answer

@@ -28,6 +28,7 @@ from ..arrays import Array
 from .autocovariance import along_time, autocorrelation, autoregression, lagged_products
 from .information import Information
 from .linearised import FitBlock, LinearisedFit
+from .noise import ROUNDING
 
 MAX_ORDER = 4
 # So many samples per coefficient of the autoregression.
@@ -36,8 +37,6 @@ SAMPLES_PER_ORDER = 10
 # They end when nothing changes by more than a share that no error bar shows.
 ROUNDS, SETTLED = 4, 0.01
 SIGNIFICANCE = 0.01
-# Residuals this small, in units of σ, are rounding.
-ROUNDING = 1e-6
 # A smaller autocorrelation changes no error bar by more than 5 %, significant or not.
 NOTICEABLE = 0.05
 

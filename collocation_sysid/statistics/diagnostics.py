@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from ..arrays import Array
+from .information import information
 from .linearised import FitBlock, LinearisedFit
+from .noise import Extra, NoiseLevel, noise_level
 
 SIGNIFICANCE = 0.01
 # A pattern with this share of the residuals' power is worth naming.
@@ -23,6 +25,8 @@ SAME_FREQUENCY = 0.2
 ROUNDING_M = 1e-9
 # Share of the samples beyond Huber's threshold that noise alone may explain.
 MOST_WILD = 0.05
+# White residuals within this factor of σ are as they should be.
+AS_STATED = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +39,12 @@ class MarkerDiagnosis:
     ----------
     experiment, marker : str
     samples : int
+    wild : int
+        Samples beyond Huber's threshold.
     rms_m : float
         Of the distance between fitted and measured marker, wild samples included.
+    noise_factor : float
+        How many times σ its errors are, allowing for what the fit takes out of the residuals.
     offset_m : (3,) mean of h(x) − ŷ
     constant_share : float
         Power of the mean.
@@ -53,7 +61,9 @@ class MarkerDiagnosis:
     experiment: str
     marker: str
     samples: int
+    wild: int
     rms_m: float
+    noise_factor: float
     offset_m: Array
     constant_share: float
     lag1: float
@@ -63,10 +73,18 @@ class MarkerDiagnosis:
     sentence: str
 
 
-def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
-    """Diagnose every marker that was seen, experiment by experiment."""
+def diagnose(fit: LinearisedFit, extra: Extra | None = None) -> tuple[MarkerDiagnosis, ...]:
+    """Diagnose every marker that was seen, experiment by experiment.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+    extra : sequence of (K, T, M, 3), optional
+        Variance that each residual has besides its noise, in units of σ², by experiment.
+    """
+    level = noise_level(fit, information(fit), extra)
     return tuple(
-        _diagnose(block, marker, fit.shared, _estimated(fit, block))
+        _diagnose(block, marker, fit.shared, _estimated(fit, block), level)
         for block in fit.blocks
         for marker in np.flatnonzero(block.present.any(axis=0)).tolist()
     )
@@ -79,7 +97,7 @@ def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
 
 
 def _diagnose(
-    block: FitBlock, marker: int, shared: int, estimated: tuple[bool, bool]
+    block: FitBlock, marker: int, shared: int, estimated: tuple[bool, bool], level: NoiseLevel
 ) -> MarkerDiagnosis:
     present = block.present[:, marker]
     residual = block.residual[:, marker] * block.sigma_m[marker]
@@ -94,7 +112,9 @@ def _diagnose(
         experiment=block.name,
         marker=block.marker_names[marker],
         samples=samples,
+        wild=int(block.wild[:, marker].sum()),
         rms_m=_rms_m(block, marker),
+        noise_factor=level.factors[f"{block.name}/{block.marker_names[marker]}"],
         offset_m=mean,
         constant_share=float(samples * mean @ mean / total),
         lag1=_lag1(varying, present),
@@ -106,11 +126,10 @@ def _diagnose(
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
     said = _suggestion(found, pairs, block.t_s, motion, estimated)
-    wild = int(block.wild[:, marker].sum())
-    if wild > MOST_WILD * samples:
+    if found.wild > MOST_WILD * samples:
         said += (
-            f"; {wild} samples are beyond Huber's threshold: exchanged labels, or reflections "
-            "taken for the marker"
+            f"; {found.wild} samples are beyond Huber's threshold: exchanged labels, or "
+            "reflections taken for the marker"
         )
     return replace(found, sentence=said)
 
@@ -158,7 +177,7 @@ def _suggestion(
     persistent = pairs > 0 and abs(found.lag1) > norm.isf(SIGNIFICANCE / 2) / np.sqrt(3 * pairs)
     shifted = found.constant_share > chi2.isf(SIGNIFICANCE, 3) / (3 * found.samples)
     if not persistent and not shifted:
-        return f"{name}: {size}, white, as noise should be"
+        return f"{name}: {size}, {_white(found)}"
     if found.constant_share > DOMINANT:
         offset = 1e3 * np.linalg.norm(found.offset_m)
         said = (
@@ -180,6 +199,16 @@ def _suggestion(
     else:
         said = "a mixture, little of which is white noise"
     return f"{name}: {size}; {said}"
+
+
+def _white(found: MarkerDiagnosis) -> str:
+    """White residuals, by their size; a few samples may differ from σ by chance."""
+    factor, chance = found.noise_factor, norm.isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
+    if factor > max(AS_STATED, 1 + chance):
+        return f"white, but {factor:.2g} times as large as sigma_m says"
+    if factor < min(1 / AS_STATED, 1 - chance):
+        return f"white, and only {factor:.2g} times as large as sigma_m says"
+    return "white, as noise should be"
 
 
 def _oscillation(found: MarkerDiagnosis, t_s: Array, motion: Array) -> str:

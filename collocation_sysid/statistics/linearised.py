@@ -173,7 +173,7 @@ def linearised_fit(
                 name=segment.experiment.name,
                 t_s=markers.t_s,
                 marker_names=markers.names,
-                present=markers.present,
+                present=segment.observation.present,
                 residual=residual,
                 slope=slope,
                 sigma_m=markers.sigma_m,

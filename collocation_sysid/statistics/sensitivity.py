@@ -46,6 +46,6 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     for part in collocation.parts(z):
         rows = BlockSolver(part.segment).sensitivities(part.x, part.setting)
         sampled = set(part.segment.observation.grid_rows.tolist())
-        operator = part.segment.experiment.markers.operator
+        operator = part.segment.observation.operator(part.phi)
         found.append(np.stack([operator @ row for t, row in enumerate(rows) if t in sampled]))
     return found

@@ -7,20 +7,21 @@ priors, the estimate errs by A⁻¹ Sᵀe, A = SᵀS + PᵀP, and has the covari
 
 of which the block of the shared parameters q is reported: nuisance parameters of single
 experiments widen it by what they could have explained. For independent errors of the σ given it
-is A⁻¹. If σ is to be estimated, Cov(e) = s² I with the residuals' variance s², and intervals are
-Student's. If a test finds the residuals correlated, in time or among markers, Cov(e) is that of
-`autocorrelation`; the output names which of them was used.
+is A⁻¹. If the residuals are larger or smaller than σ says, Cov(e) = s² I with their variance s²,
+and where markers differ each has its own (see `noise`); intervals are Student's then. If a test
+finds the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The
+output names which of them was used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, t
+from scipy.stats import t
 
 from ..arrays import Array
 from ..errors import InputError
@@ -38,12 +39,15 @@ from .estimates import (
 )
 from .information import Information, information
 from .linearised import AT_BOUND, LinearisedFit, linearised_fit
+from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
+from .pose_noise import pose_noise_draws
 from .sensitivity import marker_sensitivities, sensitivities
 
 __all__ = [
     "Errors",
     "Estimate",
     "Noise",
+    "NoiseOption",
     "Uncertainty",
     "covariance",
     "marker_sensitivities",
@@ -51,14 +55,16 @@ __all__ = [
     "uncertainty_of",
 ]
 
-Noise = Literal["given", "estimated"]
+NoiseOption = Literal["auto", "given", "estimated"]
 Errors = Literal["independent", "autocorrelated"]
 ErrorsOption = Literal["auto", "independent", "autocorrelated"]
 
-# Residuals this many times the given sigma, squared, are worth a warning.
-SUSPICIOUS_CHI_SQUARED = 2.0
+# Residuals this many times sigma, or one over it, are worth a word.
+NOTEWORTHY = 1.1
 # With σ given, correlation that widens no error bar by this factor is of no consequence.
 CONSEQUENCE = 1.05
+# Simulations of the residuals that tell how dependent they may be by chance.
+REPLICAS = 39
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +85,12 @@ class Uncertainty:
     derived : by name, the moduli of the other convention
     nuisance : by name, standard deviation of each parameter of a single experiment
         In the unit it is estimated in, that is deviations of its prior; NaN at a bound.
-    noise : {"given", "estimated"}
+    nuisance_covariance : (k, k) of these, in their order
+    noise : {"given", "estimated", "by-marker"}
     errors : {"independent", "autocorrelated"}
         What the error bars are based on.
+    level : NoiseLevel
+        How large the residuals of each marker are.
     dependence : Dependence
         The test of the residuals.
     chi_squared : float
@@ -99,8 +108,10 @@ class Uncertainty:
     estimates: Mapping[str, Estimate]
     derived: Mapping[str, Estimate]
     nuisance: Mapping[str, float]
+    nuisance_covariance: Array
     noise: Noise
     errors: Errors
+    level: NoiseLevel
     dependence: Dependence
     chi_squared: float
     degrees_of_freedom: float
@@ -116,7 +127,7 @@ def covariance(
     collocation: Collocation,
     z: Array,
     marker_z: Sequence[Array] | None = None,
-    noise: Noise = "given",
+    noise: NoiseOption = "auto",
     errors: ErrorsOption = "auto",
 ) -> Uncertainty:
     """Uncertainty of the parameters at a solution.
@@ -139,7 +150,8 @@ def covariance(
     """
     _check(noise, errors)
     fit = linearised_fit(collocation, z, marker_z)
-    return uncertainty_of(fit, collocation.parameters, z[: collocation.nq], noise, errors)
+    q, (extra, _) = z[: collocation.nq], pose_noise_draws(collocation, z)
+    return uncertainty_of(fit, collocation.parameters, q, noise, errors, extra)
 
 
 @one_blas_thread()
@@ -147,8 +159,9 @@ def uncertainty_of(
     fit: LinearisedFit,
     parameters: Parameters,
     q: Array,
-    noise: Noise = "given",
+    noise: NoiseOption = "auto",
     errors: ErrorsOption = "auto",
+    extra: Extra | None = None,
 ) -> Uncertainty:
     """Uncertainty of the parameters from the fit near its answer.
 
@@ -157,12 +170,16 @@ def uncertainty_of(
     fit : LinearisedFit
     parameters : Parameters
     q : (nq,) the estimated parameters in the solver's coordinates at the answer
-    noise : {"given", "estimated"}
-        Trust the markers' σ, or scale it by the residuals. Estimate it when σ is not known; only
-        the ratios between markers matter then.
+    noise : {"auto", "given", "estimated"}
+        "given" trusts the markers' σ, "estimated" scales it by the residuals: then only the ratios
+        between markers matter. "auto" tests the residuals: it scales σ where they are larger or
+        clearly smaller, for each marker by itself where markers differ.
     errors : {"auto", "independent", "autocorrelated"}
         What to assume of the errors; "auto" tests the residuals. The size of correlated errors
-        always follows from the residuals, but with σ given it is at least that.
+        always follows from the residuals, but with σ given it is at least that. Correlated
+        residuals smaller than σ do not lower it: they may be small only where they were fitted.
+    extra : sequence of (K, T, M, 3), optional
+        Samples of what the residuals have besides their noise, in units of σ, by experiment.
 
     Raises
     ------
@@ -177,14 +194,17 @@ def uncertainty_of(
             f"the noise cannot be estimated from {fit.measurements} measurements of "
             f"{int((~fit.at_bound).sum())} parameters; give sigma_m and use noise = 'given'"
         )
-    reduced = fit.chi_squared / max(1.0, freedom)
-    found = dependence(fit, factored)
-    of_all, quantiles = _independent(fit, factored, noise, reduced, freedom)
+    level, found = noise_level(fit, factored, extra), dependence(fit, factored)
+    found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
+    dependent = found.found and not _expected(fit, factored, level, found, extra)
+    correlated = errors == "autocorrelated" or (errors == "auto" and dependent)
+    kind = _kind(noise, level, correlated)
+    of_all, quantiles = _independent(fit, factored, kind, level)
     used: Errors = "independent"
-    if errors == "autocorrelated" or (errors == "auto" and found.found):
-        correlated = _autocorrelated(fit, factored, noise)
-        if errors == "autocorrelated" or noise == "estimated" or _widens(fit, correlated, of_all):
-            (of_all, quantiles), used = correlated, "autocorrelated"
+    if correlated:
+        persistent = _autocorrelated(fit, factored, kind, level)
+        if errors == "autocorrelated" or kind != "given" or _widens(fit, persistent, of_all):
+            (of_all, quantiles), used = persistent, "autocorrelated"
     shared = fit.shared
     of_all[fit.at_bound] = of_all[:, fit.at_bound] = np.nan
     of_q, bounded = of_all[:shared, :shared], fit.at_bound[:shared]
@@ -203,43 +223,93 @@ def uncertainty_of(
         nuisance=dict(
             zip(fit.names[shared:], np.sqrt(np.diag(of_all)[shared:]).tolist(), strict=True)
         ),
-        noise=noise,
+        nuisance_covariance=of_all[shared:, shared:],
+        noise=kind,
         errors=used,
+        level=level,
         dependence=found,
         chi_squared=fit.chi_squared,
         degrees_of_freedom=freedom,
         notes=(
             *_parameter_notes(parameters, q, bounded, estimates),
-            *_residual_notes(noise, used, found, reduced, forced=errors == "independent"),
+            *_size_notes(noise, kind, level, used),
+            *_correlation_notes(used, found, forced=errors == "independent"),
         ),
     )
 
 
 def _check(noise: str, errors: str) -> None:
     for name, value, known in (
-        ("noise", noise, get_args(Noise)),
+        ("noise", noise, get_args(NoiseOption)),
         ("errors", errors, get_args(ErrorsOption)),
     ):
         if value not in known:
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(known)}")
 
 
+def _kind(noise: NoiseOption, level: NoiseLevel, correlated: bool) -> Noise:
+    """What the size of the errors is taken from."""
+    if noise != "auto":
+        return noise
+    return "given" if correlated and level.pooled < 1 else level.kind
+
+
 def _independent(
-    fit: LinearisedFit, factored: Information, noise: Noise, reduced: float, freedom: float
+    fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
     """Covariance of all parameters, and the quantiles of the shared ones."""
-    identity = np.eye(len(factored.prior))
-    if noise == "given":
-        return factored.covariance(identity), np.full(fit.shared, norm.ppf(0.975))
-    of_score = reduced * (identity - factored.prior) + factored.prior
-    return factored.covariance(of_score), np.full(fit.shared, t.ppf(0.975, freedom))
+    of_score, freedom = level.score_covariance(kind, factored, fit.shared)
+    return factored.covariance(of_score), t.ppf(0.975, freedom)
 
 
-def _autocorrelated(fit: LinearisedFit, factored: Information, noise: Noise) -> tuple[Array, Array]:
+def _expected(
+    fit: LinearisedFit,
+    factored: Information,
+    level: NoiseLevel,
+    found: Dependence,
+    extra: Extra | None,
+) -> bool:
+    """Whether what is known to add to the noise makes residuals as dependent as they are."""
+    if extra is None or all(each is None for each in extra):
+        return False
+    added = drawn(fit, extra)
+    rng = np.random.default_rng(0)
+    size = np.sqrt(max(1.0, level.pooled))
+    errors = [
+        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.present[..., None]
+        for each, block in zip(added, fit.blocks, strict=True)
+    ]
+    _, left = projected(factored, errors)
+    replicas = [
+        dependence(
+            replace(
+                fit,
+                blocks=tuple(
+                    replace(block, residual=each[k] * block.present[..., None])
+                    for block, each in zip(fit.blocks, left, strict=True)
+                ),
+            ),
+            factored,
+        )
+        for k in range(len(errors[0]))
+    ]
+    least, most = (pick(each.lag1 for each in replicas) for pick in (min, max))
+    return least <= found.lag1 <= most and found.shared_p >= min(r.shared_p for r in replicas)
+
+
+def _autocorrelated(
+    fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
+) -> tuple[Array, Array]:
     of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared)
-    if noise == "given":  # in no direction less than independent errors of the σ given bring
-        values, vectors = np.linalg.eigh(of_score)
-        of_score = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    if kind == "given" or level.extra.any():
+        # In no direction less than independent errors of the σ given bring, nor than those found
+        # with what is known to add to them: an autoregression may miss that.
+        least, _ = level.score_covariance(kind, factored, fit.shared)
+        root = np.linalg.cholesky(least + 1e-12 * np.eye(len(least)))
+        over = np.linalg.solve(root, np.linalg.solve(root, of_score).T)
+        values, vectors = np.linalg.eigh((over + over.T) / 2)
+        wide = root @ vectors
+        of_score = (wide * np.maximum(values, 1.0)) @ wide.T
     return factored.covariance(of_score), t.ppf(0.975, freedom)
 
 
@@ -276,29 +346,58 @@ def _parameter_notes(
     return notes
 
 
-def _residual_notes(
-    noise: Noise, errors: Errors, found: Dependence, reduced: float, forced: bool
-) -> list[str]:
-    large = noise == "given" and reduced > SUSPICIOUS_CHI_SQUARED
-    size = f"the residuals are {np.sqrt(reduced):.2g} times as large as sigma_m says"
+def _size_notes(noise: NoiseOption, kind: Noise, level: NoiseLevel, errors: Errors) -> list[str]:
+    """On residuals larger or smaller than sigma_m says."""
+    if noise == "estimated" or level.kind == "given":
+        return []
+    factor = float(np.sqrt(level.pooled))
+    low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
+    ratio = level.factors[high] / level.factors[low]
+    if level.unequal and ratio > NOTEWORTHY**2:
+        size = (
+            f"the residuals are between {level.factors[low]:.2g} ({low}) and "
+            f"{level.factors[high]:.2g} ({high}) times as large as sigma_m says"
+        )
+    elif factor > NOTEWORTHY:
+        size = f"the residuals are {factor:.2g} times as large as sigma_m says"
+    elif factor < 1 / NOTEWORTHY:
+        size = (
+            f"the residuals are only {factor:.2g} times as large as sigma_m says: it seems "
+            f"{1 / factor:.2g} times too large"
+        )
+    else:
+        return []
+    return [f"{size}; {_consequence(noise, kind, factor, errors)}"]
+
+
+def _consequence(noise: NoiseOption, kind: Noise, factor: float, errors: Errors) -> str:
+    if kind != "given" or (factor > 1 and errors == "autocorrelated"):
+        return "the error bars follow the residuals. Check sigma_m and the model"
+    if factor > 1:
+        return (
+            "the error bars are too small by about that much; check sigma_m and the model, or use "
+            "noise = 'auto'"
+        )
+    if noise == "given":
+        return "the error bars keep to sigma_m, as asked for"
+    return "the residuals are not independent, so the error bars keep to sigma_m"
+
+
+def _correlation_notes(errors: Errors, found: Dependence, forced: bool) -> list[str]:
+    """On residuals that hang together."""
     if found.in_time:
         pattern = f"persist from sample to sample (autocorrelation {found.lag1:.2f})"
     else:
         pattern = "have parts that markers or axes share"
-    correlated = f"{size} and {pattern}" if large else f"the residuals {pattern}"
     if errors == "autocorrelated" and found.found:
         return [
-            f"{correlated}: camera noise seldom does, so something is missing in the model or in "
-            "the experiment's description. The error bars allow for errors of that kind, not for "
-            "a bias they hide"
+            f"the residuals {pattern}: camera noise seldom does, so something is missing in the "
+            "model or in the experiment's description. The error bars are widened by a model of "
+            "autocorrelated errors; a bias is not covered"
         ]
     if forced and found.found:
-        return [f"{correlated}, but error bars for independent errors were asked for: too small"]
-    if large and errors == "autocorrelated":
-        return [f"{size}; the error bars follow the residuals. Check sigma_m and the model"]
-    if large:
         return [
-            f"{size}: the error bars are too small by about that much; check sigma_m and the "
-            "model, or use noise = 'estimated'"
+            f"the residuals {pattern}, but error bars for independent errors were asked for: too "
+            "small"
         ]
     return []

@@ -118,7 +118,7 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Render
         (
             str(number),
             run.label,
-            " ".join(f"{value:.4g}" for value in run.guess.values()),
+            " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
             "finished" if run.key in finished else "to do",
         )
         for number, run in enumerate(planned, start=1)

@@ -36,7 +36,7 @@ class PlannedRun:
     method : str
     start : int, 0 is the file's guess
     overrides : tuple of "key=value"
-    guess : mapping of the estimated parameters to their guesses
+    guess : mapping of the estimated parameters to their guesses, None where there is none
     swept : mapping of swept keys to their values as text
     allow_code : bool, run the Python files that the problem names
     """
@@ -46,7 +46,7 @@ class PlannedRun:
     method: str
     start: int = 0
     overrides: tuple[str, ...] = ()
-    guess: Mapping[str, float] = field(default_factory=dict)
+    guess: Mapping[str, float | None] = field(default_factory=dict)
     swept: Mapping[str, str] = field(default_factory=dict)
     allow_code: bool = False
 
@@ -102,7 +102,8 @@ def plan_comparison(
     Raises
     ------
     InputError
-        For a number of starts, spread or seed that cannot be, and a problem without a file.
+        For a number of starts, spread or seed that cannot be, starts about a parameter that has
+        neither guess nor truth, and a problem without a file.
     """
     _refuse_options(starts, spread, seed)
     if problem.path is None:
@@ -164,8 +165,15 @@ def _start_overrides(
     exponents = np.random.default_rng([seed, start]).uniform(-1, 1, len(free))
     moved = []
     for item, exponent in zip(free, exponents, strict=True):
-        value = truth.get(item.name, item.guess) * spread**exponent
-        inside = float(np.clip(value, item.lower, item.upper))
+        centre = truth.get(item.name, item.guess)
+        if centre is None:
+            raise InputError(
+                "has neither a guess nor a truth that starts could be spread about; expected one, "
+                "or --starts 1",
+                problem.path,
+                f"parameters.{item.name}",
+            )
+        inside = float(np.clip(centre * spread**exponent, item.lower, item.upper))
         moved.append(f"parameters.{item.name}.guess={inside!r}")
     return moved
 
@@ -181,7 +189,9 @@ def _planned(
     guess = {
         name: section.guess
         for name, section in file.parameters.items()
-        if isinstance(section, ParameterSection) and section.guess is not None
+        if isinstance(section, ParameterSection)
+        and section.fixed is None
+        and section.tied_to is None
     }
     content = file.model_dump(mode="json", exclude_unset=True)
     solver = content.get("solver", {})

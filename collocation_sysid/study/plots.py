@@ -51,6 +51,8 @@ def comparison_plots(
         figures["tip"] = tip_tracks(answered, records)
     done = [row for row in rows if row["status"] != "missing"]
     centre = reference(done, yardstick) if done else {}
+    # A run without a guess that failed has no place among the starts.
+    done = [row for row in done if all(row[f"guess_{name}"] is not None for name in centre)]
     if centre and len({row["start"] for row in done}) > 1:
         figures["success"] = success_by_distance(done, centre, bool(yardstick.truth))
         figures["basins"] = basins(done, centre, bool(yardstick.truth))

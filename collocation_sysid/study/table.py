@@ -121,8 +121,11 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
 
 
 def _parameters(run: PlannedRun, result: Mapping[str, Any], truth: Mapping[str, float]) -> Row:
-    row: Row = {f"guess_{name}": guess for name, guess in run.guess.items()}
+    row: Row = {}
     found = result.get("parameters") or {}
+    for name, guess in run.guess.items():
+        estimate = found.get(name) or {}
+        row[f"guess_{name}"] = estimate.get("guess") if guess is None else guess
     for name in run.guess:
         estimate = found.get(name) or {}
         value = estimate.get("value")

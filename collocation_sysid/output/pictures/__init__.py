@@ -10,6 +10,7 @@ from .elements import elements_picture
 from .errors import error_over_time
 from .jacobian import jacobian_sparsity
 from .mesh import mesh_picture
+from .scan import scan_picture
 from .shapes import shapes
 from .spectrum import spectrum
 from .tracks import tracks
@@ -25,6 +26,7 @@ __all__ = [
     "jacobian_sparsity",
     "mesh_picture",
     "save_pictures",
+    "scan_picture",
     "shapes",
     "spectrum",
     "tracks",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,6 +19,7 @@ from .convergence import convergence
 from .elements import elements_picture
 from .errors import error_over_time
 from .mesh import mesh_picture
+from .scan import scan_picture
 from .shapes import shapes
 from .spectrum import spectrum
 from .tracks import tracks
@@ -29,6 +31,7 @@ def album(
     names: Sequence[str],
     confidence: Confidence | None = None,
     truth: Mapping[str, float] | None = None,
+    scan: Mapping[str, Any] | None = None,
 ) -> dict[str, Figure]:
     """All pictures of a run but that of its Jacobian, by file name.
 
@@ -42,8 +45,13 @@ def album(
     confidence : Confidence, optional
     truth : mapping, optional
         See `convergence`.
+    scan : mapping, optional
+        What result.json says of the scan of the stiffness.
     """
     pictures = {"convergence": convergence(history, names, truth)} if history else {}
+    if scan is not None:
+        curve = np.array(scan["young_pa"]), np.array(scan["misfit"], dtype=float)
+        pictures["scan"] = scan_picture(*curve, scan["best"])
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
@@ -65,6 +73,7 @@ def _of_body(replay: Replay) -> dict[str, Figure]:
             replay.up,
             replay.surface_parts,
             replay.part_names,
+            replay.given_places_m,
         ),
         "elements": elements_picture(replay.undeformed_m, replay.tetrahedra),
     }

@@ -63,7 +63,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     _tick_blocks(middle, "y", "c", range(first, steps), height)
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
-    free = "" if segment.explicit_grasps else ", free ones only"
+    free = "" if segment.grasps_have_rows else ", free ones only"
     dress(right, f"{name}: the mesh graph", "column, 3 node + axis", f"row{free}")
     for axes in (left, middle, right):
         axes.grid(False)

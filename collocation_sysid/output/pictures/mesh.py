@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array
-from ..style import COLUMN_MM, SMALL_PT
+from ..style import BLUE, COLUMN_MM, SMALL_PT
 from .camera import ELEVATION_DEG, Camera, Triangles
 from .scene import (
     Drawn,
@@ -29,6 +31,13 @@ from .scene import (
 MOST_NAMES = 24
 HEAD_MM, FOOT_MM, GAP_MM, LINE_MM, LETTER_MM = 6.0, 14.0, 3.0, 3.2, 1.4
 TALLEST_MM = 70.0
+# A way between two places that is shorter on paper would hide below their marks.
+SEEN_MM = 0.4
+GIVEN, UNKNOWN = "place given", "no place given"
+LOOKS: dict[str, dict[str, Any]] = {
+    GIVEN: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
+    UNKNOWN: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
+}
 
 
 def mesh_picture(
@@ -40,6 +49,7 @@ def mesh_picture(
     up: ArrayLike = (0.0, 0.0, 1.0),
     parts: NDArray[np.integer] | None = None,
     part_names: Sequence[str] = (),
+    given_m: Array | None = None,
 ) -> Figure:
     """Draw the undeformed body from the front and from behind, with its markers' names.
 
@@ -53,17 +63,23 @@ def mesh_picture(
     up : (3,)
     parts : (F,) the part of the body that each triangle belongs to
     part_names : (P,) str
+    given_m : (M, 3), optional
+        The places that were given for the markers, NaN where there was none: a cross where a
+        marker was found elsewhere, and a frame about a marker without.
     """
+    given_m = places_m if given_m is None else given_m
     front = Camera.facing(nodes_m[None], up)
     behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
-    aspect = width_over_height(front, np.vstack([nodes_m, places_m]))
+    everything = np.vstack([nodes_m, places_m, given_m])
+    aspect = width_over_height(front, everything)
     named = 0 < len(names) <= MOST_NAMES
     margin = min(26.0, 4.0 + LETTER_MM * max(map(len, names))) if named else 2.0
     beside = aspect < 1.0
     room = COLUMN_MM - 2 * margin
     width = (room - GAP_MM) / 2 if beside else room
     height = min(width / aspect, TALLEST_MM / (1 if beside else 2))
-    head = HEAD_MM + (LINE_MM if len(part_names) > 1 else 0.0)
+    elsewhere = not np.array_equal(given_m, places_m)
+    head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + elsewhere)
     total = head + FOOT_MM + (height if beside else 2 * height + GAP_MM)
     figure, axes = sheet(COLUMN_MM, total)
     corners = (
@@ -71,11 +87,11 @@ def mesh_picture(
         (margin + width + GAP_MM, FOOT_MM) if beside else (margin, FOOT_MM),
     )
     first = _seen_first(front, behind, places_m, nodes_m, surface)
-    views = []
+    views, unlike = [], set[str]()
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
-        everything = np.vstack([nodes_m, places_m])
         view = View.fitting(camera, everything, (width, height), corner)
         Drawn(axes, view, surface, parts).show(nodes_m, held, places_m)
+        unlike |= _draw_given(axes, view, places_m, given_m)
         if named:
             dots = view.places(places_m[mine])
             own = [name for name, here in zip(names, mine, strict=True) if here]
@@ -86,11 +102,28 @@ def mesh_picture(
     draw_scale(axes, views[0].mm_per_m, (COLUMN_MM / 2 - 12, 4.0), 15.0)
     entries = ["grasped"] if held.any() else []
     entries += ["markers", "behind the body"] if len(names) else []
-    draw_key(axes, key(*entries), (1.0, total - 1.5))
+    lines = [key(*entries), [Line2D([], [], label=w, **LOOKS[w]) for w in sorted(unlike)]]
     if len(part_names) > 1:
-        skins = [skin_key(k, name or "rest") for k, name in enumerate(part_names)]
-        draw_key(axes, skins, (1.0, total - 1.5 - LINE_MM))
+        lines.append([skin_key(k, name or "rest") for k, name in enumerate(part_names)])
+    for k, handles in enumerate(filter(None, lines)):
+        draw_key(axes, handles, (1.0, total - 1.5 - k * LINE_MM))
     return figure
+
+
+def _draw_given(axes: Axes, view: View, places_m: Array, given_m: Array) -> set[str]:
+    """Mark markers that are not where they were given, or were not given; what was drawn."""
+    found, given, drawn = view.places(places_m), view.places(given_m), set[str]()
+    unknown = np.isnan(given_m[:, 0])
+    moved = np.linalg.norm(found - given, axis=1) > SEEN_MM  # False for NaN
+    if unknown.any():
+        axes.plot(*found[unknown].T, zorder=6, **LOOKS[UNKNOWN])
+        drawn.add(UNKNOWN)
+    if moved.any():
+        axes.plot(*given[moved].T, zorder=6, **LOOKS[GIVEN])
+        ways = np.stack([given[moved], found[moved]], axis=1)
+        axes.add_collection(LineCollection(list(ways), colors=BLUE, linewidths=0.5, zorder=6))
+        drawn.add(GIVEN)
+    return drawn
 
 
 def _seen_first(

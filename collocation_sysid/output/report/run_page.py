@@ -11,18 +11,20 @@ from ...errors import InputError
 from ...fem.constants import symbol_of, unit_of
 from .page import millimetres, number, picture, read_json, rendered
 
+SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
 WORST, APART = 8, 5
 
 CAPTIONS = {
     "shapes": "The body at times of the recording; orange: measured markers.",
-    "mesh": "The mesh, its grasped nodes and the markers' places.",
+    "mesh": "The mesh, its grasped nodes and the markers' places as found.",
     "tracks": "Measured, fitted and rolled-out markers, the residual below.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % confidence ellipses of pairs of parameters.",
     "correlation": "Correlation of the estimates.",
     "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
+    "scan": "Scan of the stiffness for a start: misfit of the first part of the recordings.",
     "elements": "Size and quality of the elements.",
     "jacobian": "Structure of the constraints' Jacobian.",
 }
@@ -42,9 +44,12 @@ def run_page(run: str | Path) -> str:
         return rendered(
             "run.html",
             result=result,
+            trust=result["trust"],
             verdict=verdict(result),
             notes=_notes(result),
             parameters=_parameters(result),
+            places=_places(result),
+            nuisance=_nuisance(result),
             worst=_worst_errors(run),
             pictures=_pictures(run),
             problem=_text(run / "problem.toml"),
@@ -120,6 +125,51 @@ def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def _places(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """By experiment the places of the markers in millimetres."""
+    return {
+        experiment: [
+            {
+                "marker": marker,
+                "coordinates": _coordinates(place),
+                "prior": "exact" if place["prior_m"] == 0 else _size(place["prior_m"], "m"),
+                "given": place["given"],
+            }
+            for marker, place in places.items()
+        ]
+        for experiment, places in result["places"].items()
+    }
+
+
+def _coordinates(place: dict[str, Any]) -> list[tuple[str, str]]:
+    """Each coordinate with its error, in millimetres."""
+    errors_m = place["std_error_m"] or [None] * 3
+    return [
+        (f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2))
+        for x, error in zip(place["position_m"], errors_m, strict=True)
+    ]
+
+
+def _nuisance(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """By experiment its other nuisance parameters in units for people."""
+    tables = {}
+    for experiment, named in result["nuisance"].items():
+        tables[experiment] = []
+        for label, found in named.items():
+            words, _, unit = label.rstrip("]").rpartition(" [")
+            cells = {key: _size(found[key], unit) for key in ("value", "std_error", "prior")}
+            tables[experiment].append({"label": words, **cells})
+    return tables
+
+
+def _size(value: float | None, unit: str) -> str:
+    """A number in the unit that suits it: millimetres, milliseconds or degrees."""
+    factor, shown = SHOWN_UNITS[unit]
+    # No powers of ten for the sizes of bodies.
+    digits = 2 if value is None or abs(factor * value) < 99.5 else 4
+    return "–" if value is None else f"{number(factor * value, digits)}{shown}"
 
 
 def _worst_errors(run: Path) -> list[dict[str, Any]]:

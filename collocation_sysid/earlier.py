@@ -1,0 +1,128 @@
+"""An earlier answer, from its run folder, as the start of another solve."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from .arrays import Array
+from .errors import InputError
+from .methods.start import marched
+from .nlp.collocation import Collocation
+from .nlp.segment import Segment
+from .problem import Problem
+
+RESULT_FILE = "result.json"
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What an earlier run found.
+
+    Attributes
+    ----------
+    folder : Path
+    values : mapping of name to value, of parameters and of moduli derived from them
+    nuisance : mapping of experiment and name to value, by names as in `Collocation.names`
+    places_m : mapping of experiment to places (3,) by marker
+    """
+
+    folder: Path
+    values: Mapping[str, float]
+    nuisance: Mapping[str, float]
+    places_m: Mapping[str, Mapping[str, Array]]
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Earlier:
+        """Read a run folder.
+
+        Raises
+        ------
+        InputError
+            If it is not one, or damaged.
+        """
+        file = Path(folder) / RESULT_FILE
+        if not file.is_file():
+            raise InputError(f"has no {RESULT_FILE}; expected the folder of an earlier run", folder)
+        try:
+            result = json.loads(file.read_text(encoding="utf-8"))
+            found = {**result["derived"], **result["parameters"]}
+            values = {name: float(each["value"]) for name, each in found.items()}
+            nuisance = {
+                f"{experiment}: {name}": float(each["value"])
+                for experiment, named in result["nuisance"].items()
+                for name, each in named.items()
+            }
+            places_m = {
+                experiment: {name: _point(each["position_m"]) for name, each in named.items()}
+                for experiment, named in result.get("places", {}).items()
+            }
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            what = f"is damaged ({type(error).__name__}: {error}); solve that problem again"
+            raise InputError(what, file) from error
+        return cls(Path(folder), values, nuisance, places_m)
+
+    def started(self, problem: Problem) -> Problem:
+        """The problem with what was found as its guesses, clipped to its bounds.
+
+        Raises
+        ------
+        InputError
+            If no estimated parameter has a name that was found.
+        """
+        free = problem.parameters.free
+        known = {i: self.values[i.name] for i in free if i.name in self.values}
+        if not known:
+            raise InputError(
+                f"found {', '.join(self.values)}; expected at least one of the parameters that are "
+                f"estimated, {', '.join(item.name for item in free)}",
+                self.folder / RESULT_FILE,
+            )
+        guesses = {i.name: float(np.clip(value, i.lower, i.upper)) for i, value in known.items()}
+        return replace(problem, parameters=problem.parameters.with_guess(guesses))
+
+    def placed(self, collocation: Collocation) -> Collocation:
+        """The problem with markers that are to be placed where they were found."""
+        places_m = []
+        for segment in collocation.segments:
+            here = segment.places_m(segment.guess_phi)
+            for m, place in self._known_places(segment).items():
+                here[m] = place
+            places_m.append(here)
+        return collocation.placed_at(places_m)
+
+    def _known_places(self, segment: Segment) -> dict[int, Array]:
+        found = self.places_m.get(segment.experiment.name, {})
+        names = segment.experiment.markers.names
+        return {m: found[names[m]] for m in segment.chart.estimated.tolist() if names[m] in found}
+
+    def variables(self, collocation: Collocation) -> Array | None:
+        """Simulated variables z at the guess with the nuisance parameters that were found.
+
+        None where there are none, or the simulation fails: the guess is all that is known then.
+        Places are those of the problem.
+        """
+        p, matches = collocation.guess_p, 0
+        for segment in collocation.segments:
+            nuisance = segment.nuisance
+            matches += len(self._known_places(segment))
+            for k, (name, scale) in enumerate(zip(nuisance.names, nuisance.scales, strict=True)):
+                if name in self.nuisance:
+                    p[segment.first.phi + k] = self.nuisance[name] / scale
+                    matches += 1
+        if not matches:
+            return None
+        p = np.clip(p, *collocation.bounds_p)
+        positions, failure = marched(collocation, p)
+        return None if failure is not None else collocation.pack(p, positions)
+
+
+def _point(position_m: Sequence[float]) -> Array:
+    point = np.array(position_m, dtype=float)
+    if point.shape != (3,):
+        raise ValueError(f"a place of shape {point.shape}")
+    return point

@@ -1,0 +1,388 @@
+"""Where a search starts without a guess: a scan of the stiffness, from stiff to soft.
+
+At each stiffness the free moduli take the values that they usually have beside each other, the
+other parameters without a guess theirs, and the first part of every recording is simulated and
+compared with its markers. A stiff body can always be simulated and moves as the grasp does; the
+softer it is, the more it sags and lags, until it fits, and then falls apart. So the best start is
+found by simulations that are cheap, and the search begins on the right side of what can be
+simulated.
+
+The same scan is the rescue where a guess cannot be simulated, or fits worse than a rigid body.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import groupby
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError, SimulationError
+from ..fem.constants import is_modulus, usual_value
+from ..nlp.collocation import Collocation, Part
+from ..nlp.marching import march_on
+from ..nlp.newton import NewtonOptions, Solver
+from ..nlp.parameters import Parameter, Parameters
+from ..nlp.rest import rest_state
+from .ladder import SHARES, part_of
+
+# Young's moduli that are tried, those beyond where the best is at an end, and the most of these.
+STIFFEST_PA, SOFTEST_PA, STEPS = 1e7, 1e2, 15
+LIMITS_PA = 1e10, 1.0
+# Of a body that nothing is known of.
+SOFT_PA = 1e4
+# What is simulated for a comparison need not be exact.
+LOOSE = NewtonOptions(tolerance=1e-4)
+# The scan ends after this many stiffnesses in a row that fail or fit this much worse than the best.
+LOST, WORSE = 2, 3.0
+# Beyond an end a stiffness is tried as long as the last one fitted better by this share.
+BETTER = 0.01
+NO_GUESS = "no guess"
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What a scan of the stiffness found.
+
+    Attributes
+    ----------
+    reason : str
+        Why there was one.
+    young_pa : (k,) ndarray
+        Young's moduli that were tried, ascending; moduli with a guess, and those fixed, kept it.
+    misfit : (k,) ndarray
+        Root mean square of the markers' residuals in standard deviations; NaN where the body could
+        not be simulated.
+    best : int
+        Position of the one that was chosen.
+    parameters : Parameters
+        With the guesses to start from.
+    samples : int
+        How many first samples were compared, over all experiments.
+    time_s : float
+    """
+
+    reason: str
+    young_pa: Array
+    misfit: Array
+    best: int
+    parameters: Parameters
+    samples: int
+    time_s: float
+
+    @property
+    def sentence(self) -> str:
+        """What was done, for people."""
+        return (
+            f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
+            f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
+        )
+
+
+def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation, Scan | None]:
+    """The problem with a guess of every parameter, and the scan that found it, if there was one.
+
+    Guesses that are given stay, unless the body cannot be simulated with them or misses its
+    markers by more than a rigid one, and the scan finds better ones.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    whole : bool
+        Whether the start must be simulable to the end of the recordings.
+
+    Raises
+    ------
+    InputError
+        Where parameters have no guess and the body cannot be simulated at any stiffness.
+    """
+    unguessed = collocation.parameters.unguessed
+    if any(is_modulus(name) for name in unguessed):
+        found = scan(collocation, whole=whole)
+        return replace(collocation, parameters=found.parameters), found
+    if unguessed:
+        usual = usual_parameters(collocation.parameters, STIFFEST_PA)
+        collocation = replace(collocation, parameters=usual)
+    if not _scannable(collocation):
+        return collocation, None
+    trial = _Trial(collocation)
+    misfit, failure = trial.guess(whole)
+    if failure is None and misfit <= trial.rigid_misfit:
+        return collocation, None
+    reason = f"the body cannot be simulated at the guess ({failure})"
+    if failure is None:
+        reason = "at the guess the markers are missed by more than those of a rigid body"
+    found = rescue(collocation, reason, whole)
+    if found is None:
+        return collocation, None  # the method will tell what it needs
+    if failure is None and misfit <= found.misfit[found.best]:
+        return collocation, None
+    return replace(collocation, parameters=found.parameters), found
+
+
+def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan | None:
+    """The scan without the guesses that are given; None where it finds nothing."""
+    if not _scannable(collocation):
+        return None
+    try:
+        return scan(_without_guesses(collocation), reason, whole)
+    except InputError:
+        return None
+
+
+def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) -> Scan:
+    """Try stiffnesses from stiff to soft with the parameters that have no guess.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    reason : str
+        Why; the sentence begins with it.
+    whole : bool
+        Whether the start must be simulable to the end of the recordings.
+
+    Raises
+    ------
+    InputError
+        Where the body cannot be simulated at any stiffness.
+    """
+    began = time.perf_counter()
+    trial = _Trial(replace(collocation, parameters=_sized(collocation.parameters, 1.0)))
+    tried = _Tried(trial)
+    step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
+    tried.walk([STIFFEST_PA * step**k for k in range(STEPS)])
+    if tried.at_end(softest=True):
+        tried.walk_on(min(tried.misfits), step)
+    if tried.at_end(softest=False):
+        tried.warm = None
+        tried.walk_on(max(tried.misfits), 1 / step)
+    young_pa = np.array(sorted(tried.misfits))
+    misfit = np.array([tried.misfits[young] for young in young_pa])
+    chosen = [young for young in _ranked(young_pa, misfit) if not whole or trial.runs(young)]
+    if not chosen:
+        raise InputError(
+            f"no start was found: the body cannot be simulated at any of {len(young_pa)} "
+            f"stiffnesses from E = {young_pa[-1]:.3g} to {young_pa[0]:.3g} Pa "
+            f"({trial.failure}); check grasp, mass and units, or give guesses",
+            None,
+            "parameters",
+        )
+    best = int(np.flatnonzero(young_pa == chosen[0])[0])
+    start = usual_parameters(collocation.parameters, chosen[0])
+    samples, time_s = sum(trial.samples), time.perf_counter() - began
+    return Scan(reason, young_pa, misfit, best, start, samples, time_s)
+
+
+def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:
+    """Parameters whose missing guesses are what is usual at a stiffness, or their priors' means.
+
+    What is fixed or has a guess keeps it.
+    """
+    known = {i.name: i.guess for i in parameters.items if i.tied is None and i.guess is not None}
+
+    def value(item: Parameter) -> float:
+        if item.guess is not None:
+            return item.guess
+        region, dot, _ = item.name.rpartition(".")
+        poisson = known.get(f"{region}{dot}poisson", known.get("poisson", 0.3))
+        usual = usual_value(item.name, young_pa, poisson)
+        if item.prior is not None:
+            usual = item.prior[0]
+        assert usual is not None  # by `parameter`
+        return float(np.clip(usual, item.lower, item.upper))
+
+    sized = _sized(parameters, young_pa)
+    return sized.with_guess({item.name: value(item) for item in parameters.free})
+
+
+def usual_constants(parameters: Parameters) -> dict[str, float]:
+    """Values by name: guesses, or what is usual of a soft body."""
+    return usual_parameters(parameters, SOFT_PA).guesses
+
+
+def _ranked(young_pa: Array, misfit: Array) -> list[float]:
+    """Stiffnesses that could be simulated: the best, then those stiffer."""
+    if np.isnan(misfit).all():
+        return []
+    best = int(np.nanargmin(misfit))
+    return [float(young_pa[k]) for k in range(best, len(young_pa)) if np.isfinite(misfit[k])]
+
+
+def _sized(parameters: Parameters, young_pa: float) -> Parameters:
+    """The same parameters; linear ones of no known size change by what is usual of a modulus."""
+    unit = young_pa / 10
+    return Parameters(
+        tuple(replace(i, unit=unit) if np.isnan(i.unit) else i for i in parameters.items)
+    )
+
+
+def _scannable(collocation: Collocation) -> bool:
+    free = collocation.parameters.free
+    return any(is_modulus(item.name) and item.scale == "log" for item in free)
+
+
+def _without_guesses(collocation: Collocation) -> Collocation:
+    """The problem without the guesses that the scan can do without."""
+
+    def forgotten(item: Parameter) -> Parameter:
+        known = item.prior is not None or usual_value(item.name, 1.0) is not None
+        return replace(item, guess=None) if known and item in free else item
+
+    free = collocation.parameters.free
+    items = tuple(map(forgotten, collocation.parameters.items))
+    return replace(collocation, parameters=Parameters(items))
+
+
+def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
+    """Root mean square of the markers' residuals, in standard deviations, on the first rows.
+
+    Unknown places are where the first samples lie on the body.
+    """
+    collocation, p = collocation.placed(p, positions)
+    residuals = []
+    for part in collocation.parts_at(p, positions):
+        markers = part.segment.experiment.markers
+        read = part.segment.observation.predicted(part.x, part.phi)
+        off = (read - markers.positions_m[: len(read)]) / markers.sigma_m[:, None]
+        residuals.append(off[part.segment.observation.present[: len(read)]].ravel())
+    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
+
+
+class _Trial:
+    """Simulates the first part of every recording."""
+
+    def __init__(self, collocation: Collocation) -> None:
+        self.collocation = collocation
+        self.samples, self.rows, self.whole = [], [], []
+        for segment in collocation.segments:
+            t_s, markers = segment.experiment.t_s, segment.experiment.markers
+            seen = int(np.flatnonzero(markers.present.any(axis=1))[0])
+            self.samples.append(min(len(t_s), max(part_of(len(t_s), SHARES[0]), seen + 1)))
+            self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
+            self.whole.append(segment.grid_rows)
+        self.failure: SimulationError | None = None
+
+    @cached_property
+    def rigid_misfit(self) -> float:
+        """Of the undeformed body, carried by the grasp."""
+        positions = []
+        for segment, rows in zip(self.collocation.segments, self.rows, strict=True):
+            at = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
+            positions.append(at.reshape(rows, -1))
+        p = np.zeros(self.collocation.nq + self.collocation.nphi)
+        return _misfit(self.collocation, p, positions)
+
+    def guess(self, whole: bool) -> tuple[float, SimulationError | None]:
+        """The misfit of the guess, or why it cannot be simulated."""
+        p = self.collocation.guess_p
+        positions, failure = self._simulated(p, None, self.whole if whole else self.rows)
+        if failure is not None:
+            return np.nan, failure
+        return self._compared(p, positions), None
+
+    def at(self, young_pa: float, warm: list[Array] | None) -> tuple[float, list[Array] | None]:
+        """The misfit at a stiffness, NaN where it cannot be simulated, and the first rows."""
+        p = self._p(young_pa)
+        positions, failure = self._simulated(p, warm, self.rows)
+        if failure is not None:
+            self.failure = failure
+            return np.nan, None
+        return self._compared(p, positions), [x[0] for x in positions]
+
+    def runs(self, young_pa: float) -> bool:
+        """Whether the whole recordings can be simulated at a stiffness."""
+        _, failure = self._simulated(self._p(young_pa), None, self.whole)
+        self.failure = failure or self.failure
+        return failure is None
+
+    def key(self, young_pa: float) -> tuple[float, ...]:
+        """What tells stiffnesses apart: beyond all bounds they are the same."""
+        return tuple(self._p(young_pa).tolist())
+
+    def _p(self, young_pa: float) -> Array:
+        q = usual_parameters(self.collocation.parameters, young_pa).guess_q
+        return np.concatenate([q, np.zeros(self.collocation.nphi)])
+
+    def _compared(self, p: Array, positions: Sequence[Array]) -> float:
+        first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
+        misfit = _misfit(self.collocation, p, first)
+        return misfit if np.isfinite(misfit) else np.nan
+
+    def _simulated(
+        self, p: Array, warm: list[Array] | None, rows: Sequence[int]
+    ) -> tuple[list[Array], SimulationError | None]:
+        nothing = [np.zeros((0, segment.dofs)) for segment in self.collocation.segments]
+        found = []
+        for k, part in enumerate(self.collocation.parts_at(p, nothing)):
+            experiment, theta = part.segment.corrected(part.phi), part.setting.theta
+            known = None if warm is None else _rest(part, warm[k])
+            dynamics = part.setting.dynamics.first_rows(rows[k])
+            x, failure = march_on(experiment, dynamics, theta, known, LOOSE)
+            if failure is not None:
+                return [], failure
+            found.append(x)
+        return found, None
+
+
+def _rest(part: Part, warm: Array) -> Array | None:
+    """(1, 3n) the rest state near another one; None where there is none, or it is not the start."""
+    experiment = part.segment.corrected(part.phi)
+    if experiment.start != "equilibrium":
+        return None
+    solver = Solver(experiment, LOOSE)
+    try:
+        return rest_state(experiment, part.setting.theta, start=warm, solver=solver)[None]
+    except SimulationError:
+        return None
+
+
+class _Tried:
+    """The stiffnesses tried so far, by Young's modulus."""
+
+    def __init__(self, trial: _Trial) -> None:
+        self.trial = trial
+        self.misfits: dict[float, float] = {}
+        self.warm: list[Array] | None = None
+        self.lost = False
+
+    def walk(self, young_pa: Sequence[float]) -> None:
+        """Try from stiff to soft until the body is lost; those beyond all bounds are one."""
+        lost = 0
+        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.key))
+        for young in (first[-1], *(same[0] for same in others)):
+            misfit = self._try(young)
+            found = [m for m in self.misfits.values() if np.isfinite(m)]
+            is_lost = bool(found) and not misfit <= WORSE * min(found)
+            lost = lost + 1 if is_lost else 0
+            if lost == LOST:
+                self.lost = True
+                return
+
+    def walk_on(self, young_pa: float, factor: float) -> None:
+        """Go on beyond an end as long as it gets better."""
+        best, beyond = self.misfits[young_pa], young_pa * factor
+        while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
+            if self.trial.key(beyond) == self.trial.key(beyond / factor):
+                return
+            misfit = self._try(beyond)
+            if not misfit < (1 - BETTER) * best:
+                return
+            best, beyond = misfit, beyond * factor
+
+    def at_end(self, softest: bool) -> bool:
+        """Whether the best is at an end that was reached."""
+        known = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
+        if not known or (softest and self.lost):
+            return False
+        best = min(known, key=lambda young: known[young])
+        return best == (min(self.misfits) if softest else max(self.misfits))
+
+    def _try(self, young_pa: float) -> float:
+        misfit, warm = self.trial.at(young_pa, self.warm)
+        self.warm = warm or self.warm
+        self.misfits[young_pa] = misfit
+        return misfit

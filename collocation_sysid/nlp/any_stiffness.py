@@ -1,0 +1,192 @@
+"""Where markers may be if the stiffness is unknown: the grasp's motion, and the body's sway.
+
+In the frame that the grasp carries, a body of small strains sways under gravity and the grasp's
+acceleration in its modes φ_k, q̈ + 2ζω_k q̇ + ω_k² q = φ_kᵀM Rᵀ(g − ẍ). A stiffness that is not known
+scales all ω_k; so a few scales and dampings predict the markers of any body of this shape roughly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import scipy.linalg
+
+from ..arrays import Array
+from ..experiment.experiment import Experiment
+from ..experiment.grasp import Grasp
+from .modes import natural_modes
+
+MODES = 20
+# The softest body sags by half its size; first frequencies from there on, and a rigid body.
+SOFTEST_SAG, STIFFNESSES, STIFFEST = 0.5, 12, 30.0
+DAMPING_RATIOS = (0.03, 0.25)
+STANDARD_GRAVITY_M_S2 = 9.81
+MOST_SAMPLES = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """What an experiment says of poses, markers, mesh and gravity, all of which may be wrong.
+
+    Attributes
+    ----------
+    t_s : (T,)
+    rotations : (T, 3, 3) R of the grasp's poses
+    translations_m : (T, 3) p of them
+    tracks_m : (T, M, 3) measured, NaN where missing
+    gravity_m_s2 : (3,)
+    mesh_scale : float
+        By which the mesh and the markers' places on it are too small.
+    """
+
+    t_s: Array
+    rotations: Array
+    translations_m: Array
+    tracks_m: Array
+    gravity_m_s2: Array
+    mesh_scale: float = 1.0
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Described | None:
+        """Its first samples; None where no single motion carries the body throughout."""
+        grasp = carrying(experiment)
+        if grasp is None:
+            return None
+        t_s = experiment.t_s[:MOST_SAMPLES]
+        rotations, translations = grasp.poses.at(t_s)
+        tracks = experiment.markers.positions_m[:MOST_SAMPLES]
+        return cls(t_s, rotations, translations, tracks, experiment.gravity_m_s2)
+
+    def carry(self, points_m: Array) -> Array:
+        """Points (..., T, M, 3) in the grasp's frame where it carries them."""
+        turned = np.einsum("tij,...tmj->...tmi", self.rotations, points_m)
+        return turned + self.translations_m[:, None]
+
+    def pulled_back(self, points_m: Array) -> Array:
+        """Points (T, M, 3) of the cameras' frame in that of the grasp."""
+        return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
+
+    def after(self, rotation: Array, translation_m: Array) -> Described:
+        """The same with another rigid motion before the poses: x → U(Cx)."""
+        shifted = self.translations_m + self.rotations @ translation_m
+        return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
+
+
+def carrying(experiment: Experiment) -> Grasp | None:
+    """The grasp that carries the body throughout, if all others that hold move with it."""
+    holding = [grasp for grasp in experiment.grasps if grasp.holds(experiment.t_s).any()]
+    if not holding or not all(grasp.holds(experiment.t_s).all() for grasp in holding):
+        return None
+    motions = [grasp.poses.at(experiment.t_s) for grasp in holding]
+    together = all(
+        np.allclose(a, b, atol=1e-9)
+        for motion in motions[1:]
+        for a, b in zip(motion, motions[0], strict=True)
+    )
+    return holding[0] if together else None
+
+
+@dataclass(frozen=True, eq=False)
+class Sway:
+    """The modes of a body in its grasp as its markers show them.
+
+    Attributes
+    ----------
+    places_m : (M, 3) on the undeformed body
+    omega : (K,) angular frequencies over the first one
+    shapes : (K, M, 3) displacement of the markers
+    pushed : (K, 3) φᵀM for an acceleration common to all nodes
+    turned : (K, 3, 3) φᵀM xᵀ for one that is linear in the place
+    size_m : float
+        Diagonal of the body.
+    from_rest : bool
+        Whether it starts in its equilibrium, else undeformed.
+    """
+
+    places_m: Array
+    omega: Array
+    shapes: Array
+    pushed: Array
+    turned: Array
+    size_m: float
+    from_rest: bool
+
+    @classmethod
+    def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Sway:
+        """Of an experiment; of the constants only ratios count."""
+        body, markers = experiment.body, experiment.markers
+        free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
+        mass = experiment.node_mass_kg(experiment.t_s[:1])[0]
+        theta = body.theta(constants)
+        modes = natural_modes(body, body.nodes_m, free, theta, MODES, np.repeat(mass, 3))
+        weighed = modes.shapes * mass[:, None]
+        omega = modes.angular_frequencies_rad_s
+        return cls(
+            markers.observe(body.nodes_m),
+            omega / omega[:1],
+            markers.observe(modes.shapes),
+            weighed.sum(axis=1),
+            np.einsum("kni,nj->kij", weighed, body.nodes_m),
+            float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
+            experiment.start == "equilibrium",
+        )
+
+    def predicted(self, described: Described) -> Array:
+        """(S, T, M, 3) markers of bodies of S stiffnesses and dampings, the last one rigid."""
+        scale = described.mesh_scale
+        loads = self._loads(described)
+        step_s = float(described.t_s[1] - described.t_s[0])
+        omega = self._omega(scale)
+        states = [
+            _responses(omega, ratio, loads, step_s, self.from_rest) for ratio in DAMPING_RATIOS
+        ]
+        q = np.concatenate([*states, np.zeros((1, *loads.shape))])
+        swayed = np.einsum("stk,kmi->stmi", q, self.shapes)
+        limit = scale * self.size_m
+        # Small strains are assumed: what sways farther than the body is long, stays there.
+        far = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
+        return described.carry(scale * self.places_m + swayed / np.maximum(far, 1.0))
+
+    def _omega(self, scale: float) -> Array:
+        """(S, K) angular frequencies."""
+        softest = np.sqrt(STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m))
+        stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
+        return np.asarray(np.outer(stiffnesses, self.omega), dtype=np.float64)
+
+    def _loads(self, described: Described) -> Array:
+        """(T, K) of gravity and the grasp's acceleration."""
+        inverse = described.rotations.transpose(0, 2, 1)
+        step_s = float(described.t_s[1] - described.t_s[0])
+        lift = described.gravity_m_s2 - _acceleration(described.translations_m, step_s)
+        pushed = np.einsum("tij,tj->ti", inverse, lift)
+        spun = inverse @ _acceleration(described.rotations, step_s) * described.mesh_scale
+        return pushed @ self.pushed.T - np.einsum("tij,kij->tk", spun, self.turned)
+
+
+def _acceleration(x: Array, step_s: float) -> Array:
+    """Second differences of (T, ...), which rests before the first sample."""
+    padded = np.concatenate([x[1:2], x, x[-1:]])
+    second = (padded[2:] - 2 * padded[1:-1] + padded[:-2]) / step_s**2
+    second[-1] = second[-2]
+    return second
+
+
+def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_rest: bool) -> Array:
+    """(S, T, K) coordinates of oscillators (S, K), exact for loads linear between samples."""
+    chain = np.zeros((*omega.shape, 4, 4))
+    chain[..., 0, 1] = chain[..., 1, 2] = 1.0
+    chain[..., 1, 0], chain[..., 1, 1] = -(omega**2), -2 * ratio * omega
+    chain[..., 2, 3] = 1.0 / step_s
+    step = scipy.linalg.expm(chain * step_s)
+    state = np.zeros((*omega.shape, 4))
+    if from_rest:
+        state[..., 0] = loads[0] / omega**2
+    found = [state[..., 0]]
+    for now, then in pairwise(loads):
+        state[..., 2], state[..., 3] = now, then - now
+        state = np.einsum("skij,skj->ski", step, state)
+        found.append(state[..., 0])
+    return np.stack(found, axis=1)

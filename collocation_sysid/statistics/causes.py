@@ -1,0 +1,278 @@
+"""Why a fit misses its markers: what is tried, refitted, and fits far better is the likely cause.
+
+Doubts about the description (`statistics.description`) come for little. The others are changes of
+one experiment, the one that fits worst: it is fitted again without each mistake, and the factor by
+which its misfit falls is the cause's strength.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError, SimulationError
+from ..experiment.experiment import Experiment
+from ..experiment.grasp import Grasp
+from ..experiment.poses import PoseSequence
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution, Status
+from ..nlp.any_stiffness import Described
+from ..nlp.collocation import Collocation
+from .cause import Cause, ranked
+from .description import doubts
+from .mistakes import gravity_mistakes
+
+if TYPE_CHECKING:
+    from ..run import Run
+
+# Residuals up to so many standard deviations are noise: they need no cause.
+NOISE = 1.15
+# A refit is far better if its misfit is smaller by this factor, or if it leaves noise only.
+BETTER = 1.5
+# A marker slips if two means, before and after, explain its residuals so much better than one.
+SLIP = 2.0
+MOST_SAMPLES, MOST_SWEEPS, CLOCK_REFITS = 100, 40, 4
+BUDGET_S = 60.0
+SAME_LAG_S = 5e-4
+# Samples before and after a slip at least.
+SHORTEST = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    cause: str
+    said: str
+    experiment: Experiment
+
+
+def likely_causes(found: Run | Solution, budget_s: float = BUDGET_S) -> tuple[Cause, ...]:
+    """What is likely described wrongly, likeliest first; empty where the residuals are noise.
+
+    Parameters
+    ----------
+    found : Run or Solution
+    budget_s : float
+        No further refit is begun after this time.
+
+    Returns
+    -------
+    tuple of Cause
+        Their `strength` is the factor by which the misfit falls without the mistake.
+    """
+    solution = found if isinstance(found, Solution) else found.solution
+    fitted = [segment.experiment for segment in solution.collocation.segments]
+    misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
+    if max(misfits) <= NOISE:
+        return ()
+    causes, worst = [], fitted[int(np.argmax(misfits))]
+    # The answer itself is there, and worth writing when somebody interrupts.
+    with contextlib.suppress(KeyboardInterrupt):
+        causes += doubts(worst, solution.parameters)
+        causes += _refitted(solution.collocation, worst, time.monotonic() + budget_s)
+    return ranked(causes)
+
+
+def _refitted(collocation: Collocation, experiment: Experiment, until: float) -> list[Cause]:
+    """Causes without which the experiment fits far better."""
+    alone = _Alone(collocation)
+    given = _first_samples(experiment)
+    base = alone.fit(given)
+    if base is None:
+        return []
+    misfit = _misfit(given, base)
+    found = [_best_lag(alone, given, base, until)]
+    for trial in (*_slip(given, base), *_trials(given)):
+        if time.monotonic() > until:
+            break
+        if (read := alone.fit(trial.experiment)) is not None:
+            found.append((trial, _misfit(trial.experiment, read)))
+    causes = []
+    for trial, left in found:
+        strength = misfit / max(1.0, left)
+        if strength > BETTER or left < NOISE < misfit:
+            sentence = f"'{experiment.name}': {trial.said} ({strength:.2g} times nearer)"
+            causes.append(Cause(trial.cause, sentence, strength))
+    return causes
+
+
+def _trials(given: Experiment) -> Iterator[_Trial]:
+    described = Described.of(given)
+    for mistake in gravity_mistakes(described) if described is not None else ():
+        turned = replace(given, gravity_m_s2=mistake.without.gravity_m_s2)
+        yield _Trial(mistake.cause, mistake.said, turned)
+    for deeper, said in ((True, "deeper"), (False, "less deep")):
+        layered = _one_layer(given, deeper)
+        if layered is not None:
+            yield _Trial(
+                "grasp-layer",
+                f"the fit is better if the grasp holds one layer of nodes {said}: check the box of "
+                "grasp.nodes against where the fingers end",
+                layered,
+            )
+
+
+def _slip(given: Experiment, read: Array) -> Iterator[_Trial]:
+    """The experiment without the marker whose residuals step most, if one does."""
+    residual = _residual(given, read)
+    described = Described.of(given)
+    if described is not None:
+        residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
+    clearest = [_step(residual[:, m]) for m in range(residual.shape[1])]
+    m = int(np.argmax([ratio for ratio, _ in clearest]))
+    if clearest[m][0] < SLIP or residual.shape[1] < 2:
+        return
+    tracks = np.array(given.markers.positions_m)
+    tracks[:, m] = np.nan
+    name, at_s = given.markers.names[m], given.t_s[clearest[m][1]]
+    yield _Trial(
+        "marker-slip",
+        f"marker {name} slips at about t = {at_s:.4g} s: give it markers.weights = 0, or end "
+        "window_s before",
+        replace(given, markers=replace(given.markers, positions_m=tracks)),
+    )
+
+
+def _step(residual: Array) -> tuple[float, int]:
+    """How much better two means explain residuals (T, 3) than one, and from which sample on."""
+    there = np.flatnonzero(np.isfinite(residual[:, 0]))
+    if len(there) < 2 * SHORTEST:
+        return 1.0, 0
+    x = residual[there]
+    total, count = np.cumsum(x, axis=0)[:-1], np.arange(1, len(x))[:, None]
+    before, after = total / count, (x.sum(axis=0) - total) / (len(x) - count)
+    gain = np.sum(count * before**2 + (len(x) - count) * after**2, axis=1)
+    k = SHORTEST - 1 + int(np.argmax(gain[SHORTEST - 1 : len(x) - SHORTEST]))
+    one, two = np.sum((x - x.mean(axis=0)) ** 2), np.sum(x**2) - gain[k]
+    return float(np.sqrt(one / max(two, 1e-30))), int(there[k + 1])
+
+
+class _Alone:
+    """Fits of one experiment at a time, from the problem's guess."""
+
+    def __init__(self, collocation: Collocation) -> None:
+        self.collocation = collocation
+        self.method = ReducedSpace(max_iterations=MOST_SWEEPS, tolerance=1e-3)
+
+    def fit(self, experiment: Experiment) -> Array | None:
+        """Fitted markers (T, M, 3); None where there is no fit."""
+        try:
+            found = self.method(replace(self.collocation, experiments=(experiment,)))
+        except (InputError, SimulationError):
+            return None
+        if found.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        ended = found.status.converged or found.status is Status.ITERATION_LIMIT
+        return found.readings_m[0] if ended else None
+
+
+def _best_lag(alone: _Alone, given: Experiment, read: Array, until: float) -> tuple[_Trial, float]:
+    """The lag by which residuals and velocities agree, refitted a few times, and what it leaves."""
+    misfit, lag_s = _misfit(given, read), 0.0
+    best, least, shifted = 0.0, misfit, given
+    for _ in range(CLOCK_REFITS):
+        more_s = _lag_s(shifted, read)
+        lag_s += more_s
+        if abs(more_s) < SAME_LAG_S or time.monotonic() > until:
+            break
+        later = with_lag(given, lag_s)
+        fitted = None if later is None else alone.fit(later)
+        if later is None or fitted is None:
+            break
+        shifted, read = later, fitted
+        if (now := _misfit(shifted, read)) < least:
+            best, least = lag_s, now
+    late = "late" if best > 0 else "early"
+    said = (
+        f"the markers' clock is {late} by about {1e3 * abs(best):.2g} ms against the poses': "
+        f"{'add' if best > 0 else 'subtract'} that to t_s of the poses, or estimate it with "
+        "nuisance.time_shift"
+    )
+    return _Trial("clock", said, shifted), least
+
+
+def with_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
+    """The experiment with its poses `lag_s` later; None if too little is left of it."""
+    t_s = experiment.t_s
+    kept = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
+    if kept.sum() < 3:
+        return None
+    markers = experiment.markers
+    try:
+        return replace(
+            experiment,
+            t_s=t_s[kept],
+            grasps=[replace(g, poses=_later(g, t_s, lag_s)) for g in experiment.grasps],
+            markers=replace(markers, t_s=t_s[kept], positions_m=markers.positions_m[kept]),
+        )
+    except InputError:
+        return None
+
+
+def _later(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
+    poses = grasp.poses
+    if len(poses.t_s) < 2:
+        return poses
+    times, first = poses.t_s + lag_s, slice(0, 1)
+    if lag_s <= 0:
+        return replace(poses, t_s=times)
+    # Before its first pose the grasp rests there.
+    return replace(
+        poses,
+        t_s=np.r_[min(t_s[0], poses.t_s[0]), times],
+        positions_m=np.concatenate([poses.positions_m[first], poses.positions_m]),
+        quaternions_xyzw=np.concatenate([poses.quaternions_xyzw[first], poses.quaternions_xyzw]),
+    )
+
+
+def _lag_s(experiment: Experiment, read: Array) -> float:
+    """By how much the markers lag behind the fit: Σ r·v / Σ v·v of residuals and velocities."""
+    v = np.gradient(read, experiment.timestep_s, axis=0)
+    residual = np.where(
+        np.isfinite(experiment.markers.positions_m), _residual(experiment, read), 0.0
+    )
+    moving = np.where(experiment.markers.present[..., None], v, 0.0)
+    return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
+
+
+def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
+    """With every grasp one layer of elements deeper or less deep; None where that is none."""
+    cells, n = experiment.body.cells, len(experiment.body.nodes_m)
+    grasps = []
+    for grasp in experiment.grasps:
+        held = np.isin(np.arange(n), grasp.nodes)
+        # The layer that touches what is held, or of what is held that which touches the rest.
+        touched = held if deeper else ~held
+        grown = np.zeros(n, dtype=bool)
+        grown[cells[touched[cells].any(axis=1)]] = True
+        nodes = np.flatnonzero(grown if deeper else held & ~grown)
+        if len(nodes) < 3 or len(nodes) > n - 1:
+            return None
+        grasps.append(replace(grasp, nodes=nodes))
+    try:
+        return replace(experiment, grasps=grasps)
+    except InputError:
+        return None
+
+
+def _first_samples(experiment: Experiment) -> Experiment:
+    markers, here = experiment.markers, slice(MOST_SAMPLES)
+    few = replace(markers, t_s=markers.t_s[here], positions_m=markers.positions_m[here])
+    return replace(experiment, t_s=experiment.t_s[here], markers=few) if few.samples else experiment
+
+
+def _residual(experiment: Experiment, read: Array) -> Array:
+    return np.where(
+        experiment.markers.present[..., None], read - experiment.markers.positions_m, np.nan
+    )
+
+
+def _misfit(experiment: Experiment, read: Array) -> float:
+    """Root mean square of the residuals in standard deviations."""
+    scaled = _residual(experiment, read) / experiment.markers.sigma_m[:, None]
+    return float(np.sqrt(np.nanmean(scaled**2)))

@@ -1,0 +1,156 @@
+"""What noise of the poses does to the residuals: it acts through the dynamics.
+
+A pose that is off for a sample shakes the body, and the markers miss the fit for as long as that
+swings on. To first order the residuals change by D η, η being the noise of all poses and D the
+response of the linearised equations of motion to grasped nodes that move. D is never formed:
+samples of D η for random η tell its covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline, interp1d
+from scipy.special import binom
+
+from ..arrays import Array
+from ..experiment.grasp import Grasp
+from ..experiment.poses import PoseSequence
+from ..nlp.collocation import Collocation, Part
+from ..nlp.lapack import one_blas_thread
+from ..nlp.tangent import BlockSolver
+
+# Samples of D η, and the fewest and the memory where bodies are large.
+DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
+# Differences of this order leave noise and take away a smooth motion.
+ORDER = 5
+# Noise below these is rounding of a file.
+LEAST_M, LEAST_RAD = 2e-6, 2e-5
+# Noise whose residuals are below this share of sigma is of no consequence.
+NEGLIGIBLE = 0.02
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Noise of the poses of one grasp.
+
+    Attributes
+    ----------
+    experiment : str
+    sigma_m, sigma_rad : float
+    judged : bool
+        By how rough the poses are, not given.
+    """
+
+    experiment: str
+    sigma_m: float
+    sigma_rad: float
+    judged: bool
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        how = "as rough as they are" if self.judged else "as given"
+        return (
+            f"the error bars of '{self.experiment}' allow for noise of the poses of "
+            f"{1e3 * self.sigma_m:.2g} mm and {np.degrees(self.sigma_rad):.2g}°, {how}"
+        )
+
+
+def roughness(poses: PoseSequence) -> tuple[float, float]:
+    """Standard deviations [m] and [rad] of white noise that makes poses as rough as they are.
+
+    From differences of fifth order, in which a smooth motion hardly shows; zero for noise that
+    printing explains, and for too few poses.
+    """
+    if len(poses.t_s) < 4 * ORDER:
+        return 0.0, 0.0
+    turns = poses.turns
+    sizes = [np.diff(poses.positions_m, ORDER, axis=0), np.diff(turns, ORDER - 1, axis=0)]
+    scale = np.sqrt(binom(2 * ORDER, ORDER))
+    # The median of squares, so that a jump or a stroke does not count as noise.
+    found = [float(np.median(np.abs(size)) / 0.6745 / scale) for size in sizes]
+    return (
+        found[0] if found[0] > LEAST_M else 0.0,
+        found[1] if found[1] > LEAST_RAD else 0.0,
+    )
+
+
+@one_blas_thread()
+def pose_noise_draws(
+    collocation: Collocation, z: Array, seed: int = 0
+) -> tuple[list[Array | None], tuple[PoseNoise, ...]]:
+    """Samples of how noise of the poses changes the residuals, and what noise that is.
+
+    Returns
+    -------
+    draws : list by experiment of (K, T, M, 3) in standard deviations of the markers, or None
+    noises : tuple of PoseNoise, those that matter
+    """
+    draws: list[Array | None] = []
+    noises: list[PoseNoise] = []
+    for part in collocation.parts(z):
+        here = [_noise(part.segment.experiment.name, g) for g in part.segment.experiment.grasps]
+        found = None
+        if any(noise.sigma_m or noise.sigma_rad for noise in here):
+            found = _drawn(part, here, np.random.default_rng(seed))
+            if np.sqrt(np.mean(found**2)) < NEGLIGIBLE:
+                found = None
+        draws.append(found)
+        if found is not None:
+            noises += [noise for noise in here if noise.sigma_m or noise.sigma_rad]
+    return draws, tuple(noises)
+
+
+def _noise(name: str, grasp: Grasp) -> PoseNoise:
+    rough_m, rough_rad = roughness(grasp.poses)
+    sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
+    sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad
+    return PoseNoise(name, sigma_m, sigma_rad, grasp.sigma_m is None)
+
+
+def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) -> Array:
+    """(K, T, M, 3) changes of the residuals."""
+    segment, held = part.segment, part.setting.held
+    numbers = held.positions_m.size * 8
+    count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
+    moved = np.zeros((*held.positions_m.shape, count))
+    for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
+        _add_noise(moved, part, grasp, noise, rng)
+    rows = BlockSolver(segment).response(part.x, part.setting, moved)
+    sampled = set(segment.observation.grid_rows.tolist())
+    operator = segment.observation.operator(part.phi)
+    at_samples = np.stack([operator @ row for t, row in enumerate(rows) if t in sampled])
+    return np.moveaxis(segment.observation.response(part.x, part.phi, at_samples), 3, 0)
+
+
+def _add_noise(
+    moved: Array, part: Part, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator
+) -> None:
+    """Add how noise of one grasp moves its nodes to `moved` (N, g, c), in place."""
+    segment, held = part.segment, part.setting.held
+    t_s, count = segment.dynamics.t_s, moved.shape[2]
+    if len(grasp.poses.t_s) < 2:
+        return
+    rows = np.flatnonzero(grasp.holds(t_s))
+    dofs = np.searchsorted(held.dofs, (3 * grasp.nodes[:, None] + np.arange(3)).ravel())
+    _, translations = grasp.poses.at(t_s[rows])
+    arms = held.positions_m[np.ix_(rows, dofs)].reshape(len(rows), -1, 3) - translations[:, None]
+    white = rng.normal(size=(2, len(grasp.poses.t_s), 3 * count))
+    shifts, turns = (
+        _between(grasp.poses, sigma * values, t_s[rows]).reshape(len(rows), 1, count, 3)
+        for sigma, values in zip((noise.sigma_m, noise.sigma_rad), white, strict=True)
+    )
+    change = shifts + np.cross(turns, arms[:, :, None])  # (rows, nodes, c, 3)
+    moved[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(len(rows), len(dofs), count)
+
+
+def _between(poses: PoseSequence, values: Array, t_s: Array) -> Array:
+    """Values (m, …) at the poses' times as the poses are interpolated."""
+    if poses.interpolation == "smooth" and len(poses.t_s) > 3:
+        return CubicSpline(poses.t_s, values)(t_s)
+    kind = "previous" if poses.interpolation == "hold" else "linear"
+    inside = np.clip(t_s, poses.t_s[0], poses.t_s[-1])
+    return interp1d(poses.t_s, values, kind, axis=0)(inside)

@@ -1,0 +1,101 @@
+"""Everything about a finished run that gives concern, see `statistics.trust`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from .check.motion import Motion, motion_of
+from .errors import SimulationError
+from .methods.solution import Solution, Status
+from .nlp.schemes import as_scheme
+from .problem import Problem
+from .rollout import Rollout
+from .statistics.diagnostics import MarkerDiagnosis
+from .statistics.trust import (
+    Concern,
+    clock_concerns,
+    fit_concerns,
+    marker_concerns,
+    noise_rms_m,
+    nuisance_concerns,
+    parameter_concerns,
+    rollout_concerns,
+    scheme_concerns,
+)
+from .statistics.uncertainty import Uncertainty
+
+
+def concerns(
+    solution: Solution,
+    rollouts: Mapping[str, Rollout | str],
+    motions: Iterable[Motion],
+    uncertainty: Uncertainty | None,
+    diagnoses: Sequence[MarkerDiagnosis],
+) -> Iterator[Concern]:
+    """What speaks against an answer."""
+    status = solution.status
+    if not status.converged:
+        yield f"the solve did not converge: {solution.message}", "doubtful"
+        return
+    if status is Status.ACCEPTABLE:
+        yield "the solve converged to the acceptable tolerance only", "check"
+    if uncertainty is not None:
+        yield from fit_concerns(uncertainty)
+        yield from parameter_concerns(uncertainty)
+    elif solution.collocation.nq:
+        yield "no error bars could be found", "doubtful"
+    yield from marker_concerns(diagnoses)
+    for part in solution.collocation.parts(solution.z):
+        nuisance = part.segment.nuisance
+        low, high = nuisance.limits(part.segment.chart.samples)
+        yield from nuisance_concerns(nuisance.names, part.phi, low, high)
+        for k in nuisance.places("time"):
+            scale, name = float(nuisance.scales[k]), part.segment.experiment.name
+            yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
+    for name, rollout in rollouts.items():
+        yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
+    for motion in motions:
+        if motion.first is not None and motion.first.damping_ratio < 1:
+            yield from scheme_concerns(
+                motion.experiment,
+                motion.first.damping_ratio,
+                motion.first.numerical_damping_ratio,
+                motion.first.period_error,
+            )
+
+
+def _of_rollout(
+    name: str, rollout: Rollout | str, solution: Solution, noise_m: float
+) -> list[Concern]:
+    fit_rms_m = solution.rms_by_experiment_m
+    if isinstance(rollout, Rollout):
+        fitted = name in fit_rms_m
+        fit_m = fit_rms_m.get(name, solution.rms_m)
+        return rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+    return [(f"the roll-out of '{name}' failed: {rollout}", "doubtful")]
+
+
+def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
+    """RMS distance of the fitted markers that noise of the σ given would leave."""
+    markers = [segment.experiment.markers for segment in solution.collocation.segments]
+    samples = np.concatenate([each.present.sum(axis=0) for each in markers]).astype(float)
+    sigma_m = np.concatenate([each.sigma_m for each in markers])
+    freedom = 3 * samples.sum() if uncertainty is None else uncertainty.degrees_of_freedom
+    return noise_rms_m(sigma_m, samples, 3 * float(samples.sum()) - float(freedom))
+
+
+def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
+    """How each body oscillates with the answer; a solve that failed has none worth the search."""
+    found = {}
+    scheme = as_scheme(solution.collocation.scheme)
+    for experiment in problem.experiments if solution.status.converged else ():
+        theta = experiment.body.theta(solution.parameters)
+        try:
+            found[experiment.name] = motion_of(
+                experiment, scheme, experiment.timestep_s / problem.substeps, theta
+            )
+        except SimulationError:
+            continue
+    return found

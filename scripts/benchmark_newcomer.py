@@ -1,0 +1,49 @@
+"""What it costs to know nothing: a run at the paper's size without guess and places of markers.
+
+The same recording is identified with both (a guess a factor of two off, places known to 1 mm) and
+without either, in turn, and the ratio of the medians is printed. A run is the whole of it: start,
+solve, roll-out, error bars and verdict. Compiling the element's code comes before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+
+import numpy as np
+from study_starts import CASES, described, problem_of, with_noise
+
+from collocation_sysid import run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--body", default="cylinder", choices=list(CASES))
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    known = with_noise(CASES[arguments.body](), 1e-3, 0)
+    unknown = described(known, unplaced=True, ideal=False)
+    truth = np.array(list(known.truth.values()))
+    problems = {
+        "with guess and places": problem_of(known, 2 * truth),
+        "with neither": problem_of(unknown, np.full(len(truth), np.nan)),
+    }
+    times_s: dict[str, list[float]] = {name: [] for name in problems}
+    run(problems["with guess and places"])
+    for _ in range(arguments.repeats):
+        for name, problem in problems.items():
+            began = time.perf_counter()
+            found = run(problem)
+            times_s[name].append(time.perf_counter() - began)
+            if not found.solution.status.converged:
+                raise SystemExit(f"{name}: {found.solution.message}")
+    medians = {name: statistics.median(each) for name, each in times_s.items()}
+    for name, median_s in medians.items():
+        print(f"{name}: {median_s:.2f} s (median of {arguments.repeats})")
+    both, neither = medians.values()
+    print(f"ratio {neither / both:.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Faultless twins: two small bodies, moved at random, seen with noise."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.experiment import Experiment, Grasp, Markers, PoseSequence
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.parameters import Unknown
+from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.problem import Problem
+
+NOISE_M = 5e-4
+SAMPLES, STEP_S = 60, 0.01
+# Body, and where its grasp begins along its longest axis; both hang or stick out of the hand.
+BODIES = {"block": ((0.06, 0.06, 0.09), (2, 2, 3)), "bar": ((0.03, 0.03, 0.12), (1, 1, 4))}
+SOFT = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
+GUESS = {
+    "lambda_pa": Unknown(400.0, 10.0, 1e5),
+    "mu_pa": Unknown(150.0, 10.0, 1e5),
+    "gamma_r_s": Unknown(0.02, 1e-5, 1.0),
+    "gamma_m_1_s": Unknown(0.5, 1e-3, 100.0),
+}
+STIFF = SOFT | {"lambda_pa": 16e3, "mu_pa": 12e3, "gamma_r_s": 0.002}
+
+
+@cache
+def block(size_m: tuple[float, ...], divisions: tuple[int, ...]) -> Body:
+    """Bodies are shared: their kernels compile once."""
+    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0)
+
+
+def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
+    """A motion from rest in all six degrees of freedom, from some pose in the room."""
+    start = Rotation.from_quat(rng.normal(size=4))
+    place_m = rng.uniform(-0.5, 0.5, 3)
+    rise = (t_s - t_s[0]) ** 2 / ((t_s - t_s[0]) ** 2 + 0.1**2)
+
+    def swing(size: float) -> np.ndarray:
+        frequency, phase = rng.uniform(1.0, 3.0, 3), rng.uniform(0, 2 * np.pi, 3)
+        wave = np.sin(2 * np.pi * np.outer(t_s, frequency) + phase)
+        return size * rise[:, None] * rng.uniform(0.5, 1.0, 3) * wave
+
+    turns = Rotation.from_rotvec(swing(0.5)) * start
+    return PoseSequence(t_s, place_m + swing(0.05), turns.as_quat())
+
+
+def twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) -> Problem:
+    """A body that is described rightly."""
+    rng = np.random.default_rng(seed)
+    size_m, divisions = BODIES[name]
+    body, t_s = block(size_m, divisions), STEP_S * np.arange(samples)
+    held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
+    free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
+    places = body.nodes_m[rng.choice(free, 6, replace=False)]
+    markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, None, places)
+    experiment = Experiment(body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing")
+    tracks = simulate(experiment, truth).markers_m
+    noise = rng.normal(scale=NOISE_M, size=tracks.shape)
+    return Problem([with_markers(experiment, tracks + noise)], GUESS)

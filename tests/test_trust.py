@@ -1,0 +1,205 @@
+"""The verdict in one word: faultless answers are good, hidden faults are found."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fits_small import PARAMETERS, autoregressive, problem
+from problem_files import run_command, settings, write_problem
+
+from collocation_sysid import Run, run
+from collocation_sysid.methods.solution import Status
+from collocation_sysid.output.record import result
+from collocation_sysid.statistics.cause import Cause
+from collocation_sysid.statistics.trust import (
+    Trust,
+    fit_concerns,
+    noise_rms_m,
+    nuisance_concerns,
+    parameter_concerns,
+    rollout_concerns,
+    scheme_concerns,
+)
+from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.terminal import plain_text, summary
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from twins import BODIES, NOISE_M, SOFT, twin
+from wrong_twins import FAULTS
+
+RNG = np.random.default_rng
+OF = problem((80,), markers=3)
+
+
+def verdict_of_fit(errors: np.ndarray) -> Trust:
+    fit, wrong = OF.fit([errors], np.zeros(len(OF.names)))
+    found = uncertainty_of(fit, PARAMETERS, wrong[:4])
+    return Trust.of(fit_concerns(found) + parameter_concerns(found))
+
+
+# The verdict of single findings
+
+
+def test_the_gravest_concern_gives_the_verdict():
+    assert Trust.of([]) == Trust("good")
+    assert Trust.of([("a", "check"), ("a", "check")]) == Trust("check", ("a",))
+    assert Trust.of([("a", "check"), ("b", "doubtful")]) == Trust("doubtful", ("b", "a"))
+
+
+def test_white_residuals_of_the_stated_size_are_good():
+    found = [verdict_of_fit(RNG(seed).normal(size=(80, 3, 3))).verdict for seed in range(300)]
+    assert found.count("good") >= 297
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ([2.5, 2.5, 2.5], "times as large as sigma_m says"),
+        ([0.3, 0.3, 0.3], "times too large"),
+        ([4.0, 1.0, 1.0], "swing 0/m0 is off by"),
+    ],
+)
+def test_a_wrong_sigma_is_to_be_checked(factors, words):
+    for seed in range(5):
+        errors = np.array(factors)[:, None] * RNG(seed).normal(size=(80, 3, 3))
+        found = verdict_of_fit(errors)
+        assert found.verdict == "check"
+        assert any(words in reason for reason in found.reasons)
+
+
+def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
+    for seed in range(5):
+        errors = autoregressive(RNG(seed), 80, 3, 0.8)
+        found = verdict_of_fit(1.2 * errors)
+        assert found.verdict == "check"
+        assert "persist" in found.reasons[0]
+        assert verdict_of_fit(5 * errors).verdict == "doubtful"
+        assert verdict_of_fit(0.02 * errors).verdict != "doubtful"
+
+
+def test_nuisance_parameters_far_from_their_prior():
+    many = [f"n{k}" for k in range(100)]
+    nowhere, infinite = np.zeros(100), np.full(100, np.inf)
+    assert not nuisance_concerns(many, nowhere, -infinite, infinite)
+    assert not nuisance_concerns(many, nowhere + 3.5, -infinite, infinite)  # one in forty such runs
+    ((said, strength),) = nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
+    assert (said, strength) == ("time is 4.0 deviations of its prior away from zero", "check")
+    for phi, low, high in ((-7.0, -9.0, 9.0), (2.0, -2.0, 2.0), (2.0, 2.0, 6.0)):
+        ((_, strength),) = nuisance_concerns(["time"], [phi], [low], [high])
+        assert strength == "doubtful"
+
+
+def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
+    assert not rollout_concerns("a", 1.05, 1.0, 1.0, fitted=True)
+    assert not rollout_concerns("a", 0.1, 0.001, 1.0, fitted=True)  # far below the noise
+    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=True)[0][1] for rms in (1.5, 4.0)]
+    assert strengths == ["check", "doubtful"]
+    assert not rollout_concerns("a", 2.0, 1.0, 1.0, fitted=False)
+    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=False)[0][1] for rms in (4.0, 20.0)]
+    assert strengths == ["check", "doubtful"]
+
+
+def test_a_scheme_that_damps_or_slows_is_a_concern():
+    assert not scheme_concerns("a", 0.05, 0.0, 0.01)
+    (damped,) = scheme_concerns("a", 0.05, 0.02, 0.0)
+    assert damped[1] == "check"
+    assert "0.02 to the 0.05" in damped[0]
+    assert scheme_concerns("a", 0.05, 0.06, 0.0)[0][1] == "doubtful"
+    assert scheme_concerns("a", 0.05, 0.0, -0.05)[0][1] == "check"
+
+
+def test_what_noise_alone_would_leave():
+    assert noise_rms_m(np.array([1e-3]), np.array([100.0]), 0) == pytest.approx(1e-3 * np.sqrt(3))
+    fewer = noise_rms_m(np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0)
+    assert fewer == pytest.approx(1e-3 * np.sqrt(3 * 2.5 * 0.9))
+
+
+# Whole runs
+
+
+@cache
+def judged(fault: str, seed: int = 100) -> Run:
+    problem = twin(list(BODIES)[seed % len(BODIES)], SOFT, seed)
+    if fault != "none":
+        problem = FAULTS[fault](problem, RNG(seed))
+    # With one step a sample the scheme itself is a reason to check.
+    problem = replace(problem, substeps=2)
+    return run(problem, "reduced-space")
+
+
+@pytest.mark.parametrize("seed", [100, 101])
+def test_faultless_twins_are_good(seed):
+    found = judged("none", seed)
+    assert found.trust == Trust("good")
+    assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
+
+
+@pytest.mark.parametrize("fault", ["gravity", "clock 100 ms late", "markers exchanged"])
+def test_faults_that_spoil_the_answer_are_doubtful(fault):
+    assert judged(fault).trust.verdict == "doubtful"
+
+
+@pytest.mark.parametrize("fault", ["clock 30 ms late", "grasp one layer deeper"])
+def test_no_hidden_fault_is_good(fault):
+    assert judged(fault).trust.verdict != "good"
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.3, "as large as"), (3.0, "too large")])
+def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
+    problem = twin("block", SOFT, 100)
+    (experiment,) = problem.experiments
+    claimed = replace(experiment.markers, sigma_m=factor * experiment.markers.sigma_m)
+    stated = replace(experiment, markers=claimed)
+    stated = replace(problem, experiments=[stated], substeps=2)
+    found = run(stated, "reduced-space")
+    assert found.trust.verdict == "check"
+    assert words in found.trust.reasons[0]
+    assert found.uncertainty is not None
+    assert found.uncertainty.noise == "estimated"
+    said = [diagnosis.sentence for diagnosis in found.diagnoses]
+    assert not any("as noise should be" in sentence for sentence in said)
+
+
+def test_the_verdict_is_shown_stored_and_fed():
+    found = judged("none")
+    assert ", good: " in repr(found)
+    assert result(found)["trust"] == {"verdict": "good", "reasons": []}
+    lines = plain_text(summary(found, Path("runs"))).splitlines()
+    assert lines[1] == "Verdict: good"
+    (markers,) = [line for line in lines if line.startswith("markers: ")]
+    assert "mm from noise alone" in markers
+    noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
+    assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
+    caused = replace(found, causes=(Cause("clock", "the clock is late", 9.0),))
+    assert caused.trust == Trust("doubtful", ("likely: the clock is late",))
+
+
+def test_an_answer_that_did_not_converge_is_doubtful():
+    found = judged("none")
+    lost = replace(found, solution=replace(found.solution, status=Status.STALLED))
+    assert lost.trust.verdict == "doubtful"
+    assert "did not converge" in lost.trust.reasons[0]
+
+
+def test_strict_fails_where_the_verdict_is_doubtful(tmp_path):
+    file = write_problem(tmp_path, {"swing": 25})
+    method = settings("solver.method=reduced-space", "transcription.scheme=midpoint")
+    wrong = settings("experiment.swing.gravity_m_s2=[0.0, -9.81, 0.0]")
+    out = ("--out", tmp_path / "run")
+    assert run_command("solve", file, *method, "--strict", *out).code == 0
+    lax = run_command("solve", file, *method, *wrong, *out)
+    strict = run_command("solve", file, *method, *wrong, "--strict", *out)
+    assert "Verdict: doubtful" in lax.out
+    assert (lax.code, strict.code) == (0, 1)
+    assert run_command("report", tmp_path / "run").code == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert '<div class="verdict doubtful">' in page
+    stored = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert stored["trust"]["reasons"]

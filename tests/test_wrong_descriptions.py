@@ -1,0 +1,221 @@
+"""Descriptions that are wrong in a known way are recognised, and right ones are left in peace."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem_files import both, replace_text, run_command
+from problems_small import box
+
+from collocation_sysid.check.description import description_causes
+from collocation_sysid.check.hold import hold_warnings, holds_of
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Grasp
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.plausible import oddities
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.problem import Problem
+from collocation_sysid.run import run, solve
+from collocation_sysid.statistics.causes import likely_causes
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from twins import BODIES, SOFT, STIFF, twin
+from wrong_twins import FAULTS
+
+BEFORE = [
+    "poses in mm",
+    "poses in km",
+    "markers in mm",
+    "markers in km",
+    "poses inverted",
+    "wxyz as xyzw",
+    "xyzw as wxyz",
+    "gripper's frame",
+    "mesh's frame",
+    "cameras' frame",
+    "markers exchanged",
+    "pose jumps",
+]
+# These are small beside what an unknown stiffness may do: the fit tells them.
+AFTER = ["gravity", "grasp one layer deeper", "marker slips"]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+def soft(name: str, seed: int = 1) -> Problem:
+    return _twin(name, "soft", seed)
+
+
+@cache
+def _twin(name: str, kind: str, seed: int) -> Problem:
+    return twin(name, {"soft": SOFT, "stiff": STIFF}[kind], seed)
+
+
+# Before solving -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("kind", ["soft", "stiff"])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_right_description_is_not_doubted(name: str, kind: str, seed: int):
+    assert description_causes(_twin(name, kind, seed)) == ()
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("fault", BEFORE)
+def test_a_wrong_description_is_named_before_solving(name: str, fault: str, rng):
+    causes = description_causes(FAULTS[fault](soft(name), rng))
+    assert causes, fault
+    assert causes[0].cause in FAULTS[fault].causes
+    assert causes[0].strength > 2
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_late_clock_comes_with_its_lag_and_sign(name: str, rng):
+    for fault, said in (("clock 100 ms late", "late"), ("clock 30 ms early", "early")):
+        (first, *_) = description_causes(FAULTS[fault](_twin(name, "stiff", 1), rng))
+        assert first.cause == "clock"
+        assert f"{said} by about {fault.split()[1]} ms" in first.sentence
+
+
+def test_the_sentence_says_by_how_much_and_which_key(rng):
+    (first, *_) = description_causes(FAULTS["poses in mm"](soft("block"), rng))
+    assert "0.001 times as large" in first.sentence
+    assert 'grasp.length_unit = "mm"' in first.sentence
+
+
+# Sizes and densities ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("edge_m", "density_kg_m3", "expected"),
+    [
+        (0.1, 30.0, []),
+        (60.0, 1100.0, ["length-unit"]),
+        (2e-5, 1100.0, ["length-unit"]),
+        (0.1, 1.1, ["density"]),
+        (0.1, 1.1e6, ["density"]),
+        (60.0, 1.1, ["length-unit", "density"]),
+    ],
+)
+def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
+    body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
+    assert [oddity.cause for oddity in oddities(body)] == expected
+
+
+@pytest.mark.parametrize(("edge_m", "density_kg_m3"), [(2e3, 1e3), (0.1, 0.03), (0.1, 1e7)])
+def test_impossible_ones_are_refused(edge_m, density_kg_m3):
+    body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
+    with pytest.raises(InputError, match="expected"):
+        oddities(body)
+
+
+@pytest.mark.parametrize("fault", ["density in g/cm3", "mass in g", "mesh in mm"])
+def test_they_come_first(fault, rng):
+    heavy = Body(box_mesh(*BODIES["block"]), density_kg_m3=1000.0)
+    given = soft("block")
+    silicone = replace(given, experiments=[replace(given.experiments[0], body=heavy)])
+    wrong = FAULTS[fault](silicone, rng)
+    assert description_causes(wrong)[0].cause in FAULTS[fault].causes
+    assert any("expected 10 to" in note or "expected 0.0001" in note for note in wrong.notes)
+
+
+# The nodes of a grasp -----------------------------------------------------------------------------
+
+
+def held_of(points_m: np.ndarray, below_m: float) -> Problem:
+    experiment = soft("block").experiments[0]
+    mesh = replace_points(experiment.body, points_m)
+    nodes = np.flatnonzero(mesh.nodes_m[:, 2] > below_m)
+    return replace(experiment, body=mesh, grasps=[Grasp(nodes, experiment.grasps[0].poses)])
+
+
+def replace_points(body: Body, points_m: np.ndarray) -> Body:
+    return Body(type(body.mesh)(points_m, body.mesh.tetrahedra), density_kg_m3=30.0)
+
+
+def test_a_layer_is_held_for_sure():
+    (hold,) = holds_of(soft("block").experiments[0], 0.03)
+    assert (hold.nodes, hold.nearly_held, hold.nearly_free) == (9, 0, 0)
+    assert hold.share == pytest.approx(9 / 36)
+    assert hold_warnings(hold) == []
+
+
+def test_nodes_at_the_edge_of_the_box_are_warned_of():
+    points_m = np.array(box(*BODIES["block"]).mesh.points_m)
+    top = np.flatnonzero(points_m[:, 2] > 0.089)
+    points_m[top[:3], 2] -= 6e-4
+    missed = held_of(points_m, 0.0895)
+    (hold,) = holds_of(missed, 0.03)
+    assert (hold.nodes, hold.nearly_held) == (6, 3)
+    assert "cuts through elements" in hold_warnings(hold)[0]
+
+
+# After solving ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_good_fit_has_no_cause(name: str):
+    assert likely_causes(solve(soft(name))) == ()
+
+
+def test_a_clock_that_is_estimated_is_told(rng):
+    problem = FAULTS["clock 10 ms late"](soft("bar"), rng)
+    reasons = run(problem).trust.reasons
+    assert any("ms" in said and "than their times say" in said for said in reasons), reasons
+
+
+@pytest.mark.parametrize("fault", AFTER)
+def test_a_wrong_description_is_named_after_solving(fault: str, rng):
+    causes = likely_causes(solve(FAULTS[fault](soft("bar"), rng)))
+    assert causes, fault
+    assert causes[0].cause in FAULTS[fault].causes
+    assert causes[0].strength > 1.5
+
+
+# On the command line ------------------------------------------------------------------------------
+
+
+def test_check_does_not_call_a_doubtful_problem_valid(tiny: Path):
+    late = 'start = "equilibrium"\ngravity_m_s2 = [0.0, 0.0, -9.81]\n'
+    replace_text('name = "swing"\n', f'name = "swing"\n{late}')(tiny)
+    low, mid = "low = [0.0, 0.0, 0.0]", "mid = [0.03, 0.02, 0.03]"
+    both(replace_text(low, "LOW"), replace_text(mid, mid.replace("mid", "low")))(tiny)
+    replace_text("LOW", low.replace("low", "mid"))(tiny)
+    outcome = run_command("check", "problem.toml")
+    assert outcome.code == 1
+    flat = " ".join(outcome.out.split())
+    assert "The problem is valid" not in flat
+    assert "the description looks wrong: 'swing': markers have each other's names" in flat
+    assert "grasp of 'swing' 9 nodes, 25% of all" in flat
+
+
+def test_a_refusal_names_the_likeliest_cause(tiny: Path):
+    file = tiny / "swing_motion.csv"
+    rows = file.read_text().splitlines()
+    moved = [rows[0]]
+    for row in rows[1:]:
+        cells = row.split(",")
+        cells[1:4] = [str(1e3 * (float(x) + 0.5)) for x in cells[1:4]]
+        moved.append(",".join(cells))
+    file.write_text("\n".join(moved) + "\n")
+    tracks = tiny / "swing_markers.csv"
+    rows = tracks.read_text().splitlines()
+    shifted = [rows[0]]
+    for row in rows[1:]:
+        t, *cells = row.split(",")
+        shifted.append(",".join([t, *(str(float(x) + 0.5) for x in cells)]))
+    tracks.write_text("\n".join(shifted) + "\n")
+    outcome = run_command("check", "problem.toml")
+    assert outcome.code == 2
+    said = " ".join(outcome.err.split())
+    assert "from where the grasp carries its place" in said
+    assert "likely 'swing': the poses would fit if they were 0.001 times as large" in said
