@@ -36,6 +36,9 @@ class InputError(ValueError):
         self.where = where
         super().__init__(": ".join(str(part) for part in (source, where, message) if part))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
+        return type(self), (self.message, self.source, self.where)
+
     def located(self, source: str | Path | None = None, where: str | None = None) -> InputError:
         """Return the same error with file and key filled in where they were missing."""
         return InputError(self.message, self.source or source, self.where or where)
@@ -55,7 +58,12 @@ class SimulationError(RuntimeError):
     """
 
     def __init__(self, message: str, time_s: float, element: int | None = None) -> None:
+        self.message = message
         self.time_s = time_s
         self.element = element
         at = f"t = {time_s:.6g} s" + (f", element {element}" if element is not None else "")
         super().__init__(f"{message} ({at})")
+
+    def __reduce__(self) -> tuple[type[SimulationError], tuple[str, float, int | None]]:
+        # Else a process would hand on the text alone, from which the other cannot build it anew.
+        return type(self), (self.message, self.time_s, self.element)

@@ -15,6 +15,7 @@ from .arrays import Array
 from .check.motion import Motion
 from .earlier import Earlier
 from .errors import InputError, SimulationError, hint_at
+from .experiment.turning import turning_warnings
 from .fem.constants import unit_of
 from .methods.method import Method, Watch
 from .methods.scan import Scan, rescue, started
@@ -326,7 +327,8 @@ def run(
     rollouts = {e.name: roll_out(problem, e, solution) for e in problem.experiments}
     found = _checked(problem, solution, rollouts, say)
     say("looking for causes of the misfit")
-    return replace(found, causes=likely_causes(solution))
+    turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
+    return replace(found, notes=(*turns, *found.notes), causes=likely_causes(solution))
 
 
 def _checked(

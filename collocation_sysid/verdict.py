@@ -8,6 +8,7 @@ import numpy as np
 
 from .check.motion import Motion, motion_of
 from .errors import SimulationError
+from .experiment.turning import TOO_FAST, fastest_turn
 from .methods.solution import Solution, Status
 from .nlp.schemes import as_scheme
 from .problem import Problem
@@ -56,6 +57,11 @@ def concerns(
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     for name, rollout in rollouts.items():
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
+    collocation = solution.collocation
+    for segment in collocation.segments:
+        turn = fastest_turn(segment.experiment, collocation.substeps)
+        if turn.angle_rad > TOO_FAST:
+            yield turn.brief, "check"
     for motion in motions:
         if motion.first is not None and motion.first.damping_ratio < 1:
             yield from scheme_concerns(

@@ -14,10 +14,12 @@ from problem_files import REFERENCES, Edit, both, replace_cell, replace_text, ru
 from collocation_sysid.check import Findings, check_problem
 from collocation_sysid.check.cost import Cost, cost_notes, cost_warnings
 from collocation_sysid.check.elements import element_warnings, slenderness, worst_elements
-from collocation_sysid.check.motion import motion_warnings
+from collocation_sysid.check.motion import ModeFinding, Motion, motion_of, motion_warnings
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.numerical_damping import numerical_mode
+from collocation_sysid.nlp.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
@@ -33,6 +35,13 @@ COMPRESSIBLE = np.array([100.0, 100.0, 0.0, 0.0])
 
 def checked(folder: Path, *overrides: str) -> Findings:
     return check_problem(Problem.read(folder / "problem.toml", overrides))
+
+
+def checked_motion(folder: Path, *overrides: str) -> Motion:
+    """How the body of the only experiment oscillates at the guess."""
+    (segment,) = Problem.read(folder / "problem.toml", overrides).collocation().segments
+    theta, step_s = segment.body.theta(segment.parameters.guesses), segment.dynamics.step_s
+    return motion_of(segment.experiment, as_scheme(segment.scheme), step_s, theta)
 
 
 def about(findings: Findings, *words: str) -> str:
@@ -66,7 +75,7 @@ def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_
 def test_midpoint_at_ten_milliseconds_is_not_warned_of(tiny: Path):
     findings = checked(tiny, *SILICONE)
     first = findings.motions[0].modes[0]
-    assert first.numerical_damping_ratio == 0
+    assert first.numerical_damping_ratio == pytest.approx(0, abs=1e-3)
     assert first.samples_per_period == first.steps_per_period == pytest.approx(13, abs=0.5)
     assert not any("midpoint" in warning for warning in findings.warnings)
     assert any("midpoint lengthens" in note and "substeps = 2" in note for note in findings.notes)
@@ -79,6 +88,36 @@ def test_damping_at_the_guess_is_rayleighs(tiny: Path):
     for mode in modes:
         omega = 2 * np.pi * mode.frequency_hz
         assert mode.damping_ratio == pytest.approx(0.01 * omega + 0.25 / omega)
+
+
+def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
+    def first(*overrides: str) -> ModeFinding:
+        return checked_motion(tiny, *SILICONE, *overrides).modes[0]
+
+    def added(mode: ModeFinding, scheme: str, damping_ratio: float) -> float:
+        omega = 2 * np.pi * mode.frequency_hz
+        return numerical_mode(SCHEMES[scheme], omega, 0.01, damping_ratio).damping_ratio
+
+    damped = first("parameters.gamma_r_s.guess=0.01")
+    assert damped.damping_ratio > 0.2
+    # Midpoint leaves the undamped alone and takes from the damped; the period is the undamped one.
+    expected = added(damped, "midpoint", damped.damping_ratio)
+    assert damped.numerical_damping_ratio == pytest.approx(expected, rel=1e-9)
+    assert expected < -1e-3
+    assert damped.period_error == first().period_error
+    creeping = first("parameters.gamma_r_s.guess=0.1", "transcription.scheme=backward-euler")
+    assert creeping.damping_ratio > 1
+    undamped = added(creeping, "backward-euler", 0.0)
+    assert creeping.numerical_damping_ratio == pytest.approx(undamped)
+
+
+def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
+    motion = checked_motion(tiny, *SILICONE, "parameters.gamma_r_s.guess=0.02")
+    first = replace(motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05)
+    said = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))[0]
+    assert "takes a damping ratio of 0.05 from the first mode" in said
+    assert "found will be too high" in said
+    assert f"set transcription.substeps = {motion.substeps_needed}" in said
 
 
 def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
@@ -106,6 +145,23 @@ def test_nearly_incompressible_linear_elements_are_warned_of(tiny: Path):
     assert "tet10 elements lock from 0.45 on" in about(quadratic, "Poisson's ratio is 0.49")
     averaging = checked(tiny, *nearly, "object.element=tet10-p0")
     assert not any("Poisson" in warning for warning in averaging.warnings)
+
+
+@pytest.mark.parametrize("young_pa", [2e5, 100.0, 1543.0])
+def test_locking_is_warned_of_at_its_very_poisson_ratio(young_pa: float):
+    body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=30.0, element="tet10")
+    shape, worst = slenderness(body.mesh), worst_elements(body.mesh)[0]
+
+    def warnings(poisson: float) -> list[str]:
+        # By way of λ and μ, 0.45 comes back as 0.44999999999999996 for E = 200 kPa.
+        shear = young_pa / (2 + 2 * poisson)
+        theta = np.array([2 * shear * poisson / (1 - 2 * poisson), shear, 0.0, 0.0])
+        return element_warnings(body, theta, shape, worst)
+
+    (warning,) = warnings(0.45)
+    assert "tet10 elements lock from 0.45 on" in warning
+    assert 'set object.element = "tet10-p0"' in warning
+    assert warnings(0.449) == []
 
 
 def test_the_worst_element_is_named():

@@ -8,6 +8,7 @@ from problems_small import (
     EDGE_M,
     GRAVITY_M_S2,
     GUESS,
+    IDEAL,
     TRUTH,
     as_theta,
     box,
@@ -18,6 +19,7 @@ from problems_small import (
     times,
     vertex_markers,
 )
+from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
@@ -119,6 +121,58 @@ def test_a_body_at_rest_stays_there(integrator: str):
     expected = np.broadcast_to(motion.positions_m[0], motion.positions_m.shape)
     np.testing.assert_allclose(motion.positions_m, expected, atol=1e-9)
     np.testing.assert_allclose(motion.velocities_m_s, 0, atol=1e-7)
+
+
+def bar_in_two_grasps(
+    way_m: tuple[float, float, float], turn_rad: tuple[float, float, float], element: str = "tet4"
+) -> Experiment:
+    """A bar of small elements, one end held and the other moved and turned about its middle."""
+    divisions = (12, 4, 4) if element == "tet4" else (6, 2, 2)
+    body, t_s = box((0.15, 0.05, 0.05), divisions, element), times(2)
+    middle, turn = np.array([0.15, 0.025, 0.025]), Rotation.from_rotvec(turn_rad)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), middle + way_m - turn.apply(middle)
+    grasps = [
+        Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed()),
+        Grasp(nodes_where(body, 0, 0.15), np.tile(pose, (len(t_s), 1, 1))),
+    ]
+    return Experiment(body, t_s, grasps, vertex_markers(body, [0], t_s), nuisance=IDEAL)
+
+
+STRAINED = {
+    "stretched": ((0.045, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    "compressed": ((-0.015, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    "twisted": ((0.0, 0.0, 0.0), (0.5 * np.pi, 0.0, 0.0)),
+    "twisted nearly half a turn": ((0.0, 0.0, 0.0), (3.0, 0.0, 0.0)),
+    "bent": ((-0.01, 0.0, -0.05), (0.0, 1.2, 0.0)),
+}
+
+
+@pytest.mark.parametrize("way", STRAINED)
+def test_two_grasps_may_strain_the_body_at_the_start(way: str):
+    bar, theta = bar_in_two_grasps(*STRAINED[way]), np.array([2e4, 3e4, 0.0, 0.0])
+    x = rest_state(bar, theta)
+    assert_stable_equilibrium(bar, theta, x)
+    at = x.reshape(-1, 3)[bar.held_nodes]
+    np.testing.assert_allclose(at, bar.held_positions([0.0])[0], rtol=1e-15, atol=1e-17)
+
+
+def test_quadratic_elements_may_be_strained_at_the_start_too():
+    bar = bar_in_two_grasps((0.06, 0.0, 0.0), (1.0, 0.0, 0.0), "tet10")
+    theta = np.array([2e4, 3e4, 0.0, 0.0])
+    assert_stable_equilibrium(bar, theta, rest_state(bar, theta))
+
+
+def test_a_stretched_bar_pulls_as_its_material_does():
+    bar, young_pa, stretch = bar_in_two_grasps((0.03, 0.0, 0.0), (0.0, 0.0, 0.0)), 6e4, 1.2
+    light = replace(bar, gravity_m_s2=np.zeros(3))
+    theta = np.array([0.0, young_pa / 2, 0.0, 0.0])  # Poisson's ratio 0: no lateral strain
+    x = rest_state(light, theta)
+    force = light.body.force(x, np.zeros_like(x), theta)[0].reshape(-1, 3)
+    pull = force[nodes_where(light.body, 0, 0.15), 0].sum()
+    # ψ = ½ μ (tr FᵀF − 3) − μ ln J: P = μ (s − 1/s) over the undeformed cross-section.
+    nominal = young_pa / 2 * (stretch - 1 / stretch)
+    assert -pull == pytest.approx(nominal * 0.05**2, rel=1e-3)
 
 
 # Motion

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..experiment.turning import turning_warnings
 from ..methods.method import Method
 from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import started
@@ -142,6 +143,8 @@ def check_problem(problem: Problem) -> Findings:
         warnings += hold_warnings(hold)
     for motion in motions:
         warnings += motion_warnings(motion)
+    for experiment in problem.experiments:
+        warnings += turning_warnings(experiment, problem.substeps)
     for recording in recordings:
         body = next(each for each in bodies if recording.experiment in each.experiments)
         warnings += recording_warnings(recording, body.edges_m[1], body.diagonal_m)

@@ -16,6 +16,8 @@ FLAT = 0.1
 # Too stiff from this Poisson's ratio on: linear tetrahedra cannot keep their volume and bend;
 # with quadratic ones a beam's stiffness is found 6 % too low at 0.45, and 12 % at 0.49.
 LOCKING_POISSON = {"tet4": 0.4, "tet10": 0.45}
+# 0.45 by way of E, λ and μ may be a little less.
+ROUND_OFF = 1e-9
 # A body this many times as long as thick bends. Linear elements need this many across it, and where
 # the dilatation is averaged one across sags by half too much, two by 4 to 8 %.
 SLENDER, CELLS_ACROSS = 2.5, {"tet4": 4.0, "tet10-p0": 2.0}
@@ -102,7 +104,7 @@ def element_warnings(
         )
     name = body.element.name
     poisson = max(engineering(*lame)[1] for lame in body.lame(theta).values())
-    if name in LOCKING_POISSON and poisson >= LOCKING_POISSON[name]:
+    if name in LOCKING_POISSON and poisson >= LOCKING_POISSON[name] - ROUND_OFF:
         warnings.append(
             f"Poisson's ratio is {poisson:.3g} at the guess and {name} elements lock from "
             f"{LOCKING_POISSON[name]:g} on, so that the stiffness found will be too low: "

@@ -39,9 +39,9 @@ class ModeFinding:
     damping_ratio : float
         Of the material, at the guess.
     numerical_damping_ratio : float
-        What the scheme adds.
+        What the scheme adds at that damping; negative where it takes some away.
     period_error : float
-        By how much the scheme lengthens the period, relatively.
+        By how much the scheme lengthens the undamped period, relatively.
     """
 
     frequency_hz: float
@@ -105,7 +105,8 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
     if found:
         omega = float(modes.angular_frequencies_rad_s[0])
         limit = _damping_limit(found[0])
-        needed = substeps_needed(scheme, omega, experiment.timestep_s, limit)
+        ratio = _oscillating(found[0].damping_ratio)
+        needed = substeps_needed(scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio)
     return Motion(
         experiment.name,
         about,
@@ -135,18 +136,25 @@ def _mode_findings(
 ) -> tuple[ModeFinding, ...]:
     findings = []
     for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
-        numerical = numerical_mode(scheme, 2 * np.pi * frequency, step_s)
+        omega = 2 * np.pi * frequency
+        undamped = numerical_mode(scheme, omega, step_s)
+        damped = numerical_mode(scheme, omega, step_s, _oscillating(float(ratio)))
         findings.append(
             ModeFinding(
                 float(frequency),
                 float(1 / frequency / experiment.timestep_s),
                 float(1 / frequency / step_s),
                 float(ratio),
-                round(numerical.damping_ratio, ROUNDING) + 0.0,  # no −0
-                numerical.period_error,
+                round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
+                undamped.period_error,
             )
         )
     return tuple(findings)
+
+
+def _oscillating(damping_ratio: float) -> float:
+    """The damping ratio, or none where nothing oscillates whose damping a scheme could change."""
+    return damping_ratio if damping_ratio < 1 else 0.0
 
 
 def _damping_limit(mode: ModeFinding) -> float:
@@ -176,11 +184,14 @@ def motion_warnings(motion: Motion) -> list[str]:
 def _grid_warnings(motion: Motion, mode: ModeFinding) -> list[str]:
     """What the scheme and its step spoil."""
     which = _first_mode(motion, mode)
-    if mode.numerical_damping_ratio > _damping_limit(mode):
+    added = mode.numerical_damping_ratio
+    if abs(added) > _damping_limit(mode):
+        does, found = (("adds", "to"), "low") if added > 0 else (("takes", "from"), "high")
+        remedy = _finer(motion) if motion.scheme == UNDAMPED else _less_damping(motion)
         return [
-            f"{motion.scheme} at {1e3 * motion.timestep_s:.3g} ms adds a damping ratio of "
-            f"{mode.numerical_damping_ratio:.2g} to {which}, by which the damping found will be "
-            f"too low: {_less_damping(motion)}"
+            f"{motion.scheme} at {1e3 * motion.timestep_s:.3g} ms {does[0]} a damping ratio of "
+            f"{abs(added):.2g} {does[1]} {which}, by which the damping found will be too {found}: "
+            f"{remedy}"
         ]
     if mode.steps_per_period < FEW_STEPS:
         return [

@@ -206,24 +206,24 @@ class Experiment:
         That is the first grasp that holds throughout, else the first. Without a grasp the body
         stays where it is undeformed.
         """
-        return self._carry_rigidly(self.body.nodes_m, t_s)
+        rotations, translations = self.rigid_motion(t_s)
+        return np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
 
-    def _carry_rigidly(self, points_m: Array, t_s: ArrayLike) -> Array:
+    def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
+        """Rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if not self.grasps:
-            return np.repeat(points_m[None], np.size(t_s), axis=0)
+            return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
         throughout = [grasp for grasp in self.grasps if grasp.holds(self.t_s).all()]
         poses = (throughout or self.grasps)[0].poses
-        times = np.asarray(t_s, dtype=np.float64)
         if len(poses.t_s) > 1 and not throughout:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
-        return poses.carry(points_m, times)
+        return poses.at(times)
 
     def _carried_back(self, points_m: Array, t_s: Array) -> Array:
         """Where points (M, 3) seen at `t_s` (M,) sit on the body if it was carried rigidly."""
-        origin_axes = np.vstack([np.zeros(3), np.eye(3)])
-        carried = self._carry_rigidly(origin_axes, t_s)  # (M, 4, 3)
-        turned = carried[:, 1:] - carried[:, :1]  # rows are the images of the axes
-        return np.einsum("mij,mj->mi", turned, points_m - carried[:, 0])
+        rotations, translations = self.rigid_motion(t_s)
+        return np.einsum("mji,mj->mi", rotations, points_m - translations)
 
     @property
     def place_sigma_m(self) -> Array:

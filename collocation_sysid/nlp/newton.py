@@ -49,7 +49,10 @@ class NewtonFailure(Exception):
     def __init__(self, x: Array, reason: str) -> None:
         self.x = x
         self.reason = reason
-        super().__init__(reason)
+        super().__init__(x, reason)
+
+    def __str__(self) -> str:
+        return self.reason
 
 
 class Solver:

@@ -90,6 +90,7 @@ def substeps_needed(
     timestep_s: float,
     limit: float,
     period_error: float = PERIOD_ERROR,
+    damping_ratio: float = 0.0,
 ) -> int | None:
     """The fewest substeps with which a mode is damped and slowed down little.
 
@@ -100,9 +101,11 @@ def substeps_needed(
     timestep_s : float
         Time between samples.
     limit : float
-        Largest numerical damping ratio.
+        Largest |numerical damping ratio|.
     period_error : float
-        Largest |relative error| of the period.
+        Largest |relative error| of the period without damping.
+    damping_ratio : float
+        Physical ζ, below 1.
 
     Returns
     -------
@@ -110,8 +113,11 @@ def substeps_needed(
     """
 
     def suffices(substeps: int) -> bool:
-        mode = numerical_mode(scheme, angular_frequency_rad_s, timestep_s / substeps)
-        return abs(mode.damping_ratio) <= limit and abs(mode.period_error) <= period_error
+        mode, damped = (
+            numerical_mode(scheme, angular_frequency_rad_s, timestep_s / substeps, ratio)
+            for ratio in (0.0, damping_ratio)
+        )
+        return abs(damped.damping_ratio) <= limit and abs(mode.period_error) <= period_error
 
     high = 1
     while not suffices(high):

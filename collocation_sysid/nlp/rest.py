@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
@@ -21,8 +22,8 @@ def rest_state(
 ) -> Array:
     """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
 
-    Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails
-    the load is applied in steps.
+    Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails, the
+    load is applied and the other grasps are moved in steps, from the shape carried.
 
     Raises
     ------
@@ -30,12 +31,11 @@ def rest_state(
         If no stable equilibrium is found.
     """
     solver = solver or Solver(experiment)
-    t_s = np.atleast_1d(experiment.t_s[0] if time_s is None else time_s)
+    at_s = float(experiment.t_s[0] if time_s is None else time_s)
     body = experiment.body
-    load = external_force(experiment, float(t_s[0]))
+    load = external_force(experiment, at_s)
     still = np.zeros((1, body.pattern.size))
-    x = experiment.rigid_positions(t_s).ravel() if start is None else start.copy()
-    x[solver.held] = experiment.grasped(t_s)[1].ravel()[solver.held]
+    carried = experiment.rigid_positions([at_s])[0]
 
     def solve(x: Array, share: float) -> Array:
         def residual(state: Array) -> Array:
@@ -45,20 +45,46 @@ def rest_state(
             forces = body.linearise(state, still, theta)
             return forces.force[0] + share * load, -forces.by_position[0]
 
-        return solver.newton(x, residual, linearise, keep_definite=True)
+        moved = x.copy()
+        moved[solver.held] = _on_the_way(experiment, carried, at_s, share).ravel()[solver.held]
+        return solver.newton(moved, residual, linearise, keep_definite=True)
 
-    reached, increment = 0.0, 1.0
+    x = carried.ravel() if start is None else start
+    rate, reached, increment = np.zeros_like(x), 0.0, 1.0
     while reached < 1.0:
+        step = min(increment, 1.0 - reached)
         try:
-            x = solve(x, min(1.0, reached + increment))
-            reached = min(1.0, reached + increment)
+            found = solve(x + step * rate, reached + step)
         except NewtonFailure as failure:
-            increment /= 2
+            increment = step / 2
             if increment < 0.5**solver.options.halvings:
-                raise simulation_error(
-                    solver, failure, float(t_s[0]), "finding the rest state"
-                ) from failure
+                raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
+            x = carried.ravel() if reached == 0 else x
+        else:
+            x, rate, reached = found, (found - x) / step, reached + step
     return x
+
+
+def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
+    """Held nodes (n, 3) when their grasps have come a share of their way from the carried body.
+
+    Each grasp turns about the middle of its nodes, which goes straight: none is squeezed or
+    sheared on the way, however far it turns. Other nodes stay where they are carried.
+    """
+    positions = carried.copy()
+    for grasp in experiment.grasps:
+        if not grasp.holds(time_s):
+            continue
+        start, nodes = carried[grasp.nodes], grasp.nodes
+        goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
+        if share == 1:
+            positions[nodes] = goal
+            continue
+        turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
+        part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
+        middle, way = start.mean(axis=0), (goal - start).mean(axis=0)
+        positions[nodes] = middle + share * way + part.apply(start - middle)
+    return positions
 
 
 def start_state(experiment: Experiment, theta: Array, solver: Solver) -> tuple[Array, Array]:
