@@ -165,16 +165,21 @@ def test_local_parameters_have_standard_deviations():
     np.testing.assert_allclose(list(found.nuisance.values()), expected, rtol=1e-6)
 
 
-def test_a_local_parameter_at_its_bound_counts_as_fixed():
+@pytest.mark.parametrize("bounded", [1, 4])
+def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free(bounded):
     fit, wrong = sample()
-    bounded = replace(fit, at_bound=np.arange(len(fit.names)) == 4)
-    found = uncertainty_of(bounded, PARAMETERS, wrong[:4], errors="independent")
-    kept = np.delete(np.delete(plain_information(fit), 4, 0), 4, 1)
-    expected = np.linalg.inv(kept)[:4, :4]
-    np.testing.assert_allclose(found.covariance, expected, rtol=1e-6)
-    assert np.isnan(found.nuisance[fit.names[4]])
-    free = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
-    assert found.degrees_of_freedom > free.degrees_of_freedom
+    at_bound = replace(fit, at_bound=np.arange(len(fit.names)) == bounded)
+    found, free = (
+        uncertainty_of(each, PARAMETERS, wrong[:4], errors="independent")
+        for each in (at_bound, fit)
+    )
+    shown = np.arange(4) != bounded
+    both = np.ix_(shown, shown)
+    np.testing.assert_allclose(found.covariance[both], free.covariance[both], rtol=1e-9)
+    assert np.isnan([*found.nuisance.values()]).tolist() == [
+        *(np.arange(4, len(fit.names)) == bounded)
+    ]
+    assert np.isnan(np.diag(found.covariance)).tolist() == [*~shown]
 
 
 def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():

@@ -25,11 +25,14 @@ NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """A⁻¹ = L Lᵀ of the parameters within their bounds, in the r directions that are determined.
+    """A⁻¹ = L Lᵀ of all parameters, in the r directions that are determined.
+
+    Those that ended at a bound are free here like the others: had the noise been another, they
+    would not have, and what they can take from the others belongs to these others' error.
 
     Attributes
     ----------
-    root : (p, r) L, with rows of zeros for parameters at a bound
+    root : (p, r) L
     slopes : of each experiment (T, 3M, r), D = S L; zero where missing
     prior : (r, r) Lᵀ PᵀP L
     undetermined : (p,) bool
@@ -56,22 +59,18 @@ class Information:
 
 
 def information(fit: LinearisedFit) -> Information:
-    """Factor the information of a fit; parameters at a bound count as fixed."""
-    free = np.flatnonzero(~fit.at_bound)
-    slopes = [block.channels[1][..., free] for block in fit.blocks]
-    matrix = np.diag(fit.prior_slope[free] ** 2)
+    """Factor the information of a fit."""
+    count = len(fit.names)
+    slopes = [block.channels[1] for block in fit.blocks]
+    matrix = np.diag(fit.prior_slope**2)
     for slope in slopes:
-        rows = slope.reshape(slope.shape[0] * slope.shape[1], len(free))
+        rows = slope.reshape(slope.shape[0] * slope.shape[1], count)
         matrix = matrix + rows.T @ rows
     units = np.sqrt(np.diag(matrix))
     units[units == 0] = 1.0
     values, vectors = np.linalg.eigh(matrix / np.outer(units, units))
     known = values > SINGULAR
-    root = np.zeros((len(fit.names), int(known.sum())))
-    root[free] = vectors[:, known] / np.sqrt(values[known]) / units[:, None]
-    undetermined = np.zeros(len(fit.names), dtype=bool)
-    undetermined[free] = (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
+    root = vectors[:, known] / np.sqrt(values[known]) / units[:, None]
+    undetermined = (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
     prior = root * fit.prior_slope[:, None]
-    return Information(
-        root, tuple(slope @ root[free] for slope in slopes), prior.T @ prior, undetermined
-    )
+    return Information(root, tuple(slope @ root for slope in slopes), prior.T @ prior, undetermined)

@@ -76,7 +76,7 @@ class Uncertainty:
     names : (nq,) estimated parameters, in the order of q
     covariance : (nq, nq) of the parameters' logarithms, with nuisance parameters free
         Of a parameter that may be negative, of its deviation over its size.
-        NaN in rows and columns of parameters at a bound, the others' is as if those were fixed;
+        NaN in rows and columns of parameters at a bound, which the others' takes for free;
         infinite variance where the data do not determine a parameter.
     correlation : (nq, nq) NaN likewise
     quantiles : (nq,) half widths of the 95 % intervals, in standard deviations
@@ -192,7 +192,7 @@ def uncertainty_of(
     if noise == "estimated" and freedom < 1:
         raise InputError(
             f"the noise cannot be estimated from {fit.measurements} measurements of "
-            f"{int((~fit.at_bound).sum())} parameters; give sigma_m and use noise = 'given'"
+            f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
     level, found = noise_level(fit, factored, extra), dependence(fit, factored)
     found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
@@ -331,7 +331,8 @@ def _parameter_notes(
             side = "lower" if q[k] - parameters.bounds_q[0][k] < AT_BOUND else "upper"
             notes.append(
                 f"{item.name} ended at its {side} bound {getattr(item, side):g}: it has no error "
-                "bar, and the others' hold only if that is its value; widen the bound or fix it"
+                "bar, and the others' allow for other values of it; widen the bound, or fix it "
+                "if it is known"
             )
         elif estimate.ci95 is None:
             notes.append(
