@@ -304,6 +304,7 @@ def run(
     watch: Watch | None = None,
     log: Log | None = None,
     start: str | Path | None = None,
+    seek_causes: bool = True,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
 
@@ -314,6 +315,8 @@ def run(
         See `solve`.
     log : callable, optional
         Called with what is being done now, a text.
+    seek_causes : bool
+        Whether a misfit's cause is looked for, which takes a minute at most.
 
     Raises
     ------
@@ -325,6 +328,8 @@ def run(
     say("checking the answer by a forward simulation")
     rollouts = {e.name: roll_out(problem, e, solution) for e in problem.experiments}
     found = _checked(problem, solution, rollouts, say)
+    if not seek_causes:
+        return found
     say("looking for causes of the misfit")
     return replace(found, causes=likely_causes(solution))
 

@@ -3,7 +3,8 @@
 Two small bodies, soft and stiffer, moved at random, with white noise and nuisance parameters as
 they are by default. Faultless twins are to be called good, at least 95 of 100; of those whose
 problem is described wrongly (`wrong_twins`) at most 2 of 100. What is refused before it is solved
-counts as recognised.
+counts as recognised. A cause of the misfit, which takes refits to find, is looked for only where
+the answer would be called good without.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -34,9 +35,10 @@ from collocation_sysid.nlp.parameters import Unknown
 from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.recording import refuse_other_scale
+from collocation_sysid.statistics.causes import likely_causes
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
-SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 100, 0.01, 2, 1e-3
+SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3
 # An answer is right whose parameters are all within so many standard errors.
 RIGHT = 3.0
 DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
@@ -115,7 +117,9 @@ def judged(fault: str, seed: int) -> Outcome:
             oddities(body)
         for experiment in problem.experiments:
             refuse_other_scale(experiment, usual_constants(problem.parameters))
-        found = run(problem)
+        found = run(problem, seek_causes=False)
+        if found.trust.verdict == "good":
+            found = replace(found, causes=likely_causes(found))
     except (InputError, SimulationError) as error:
         return Outcome(fault, seed, "refused", (str(error),), None, None)
     errors = errors_of(found, truth)
@@ -149,11 +153,12 @@ def bodies() -> tuple[tuple[Body, float], ...]:
     )
 
 
+@cache
 def swung(seed: int) -> tuple[Problem, dict[str, float]]:
     """A body moved at random, described rightly and guessed wrongly, and its truth."""
     rng = np.random.default_rng(seed)
     body, young_pa = bodies()[seed % 2]
-    truth = {"young_pa": young_pa * (1, 2)[seed // 2 % 2], "poisson": 0.3} | DAMPING
+    truth = {"young_pa": young_pa * (1, 1.5)[seed // 2 % 2], "poisson": 0.3} | DAMPING
     t_s = STEP_S * np.arange(SAMPLES)
     nodes, length_m = body.nodes_m, np.ptp(body.nodes_m[:, 2])
     held = np.flatnonzero(nodes[:, 2] < 1e-9)
