@@ -305,6 +305,7 @@ def run(
     watch: Watch | None = None,
     log: Log | None = None,
     start: str | Path | None = None,
+    seek_causes: bool = True,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
 
@@ -315,6 +316,8 @@ def run(
         See `solve`.
     log : callable, optional
         Called with what is being done now, a text.
+    seek_causes : bool
+        Whether a misfit's cause is looked for, which takes a minute at most.
 
     Raises
     ------
@@ -326,6 +329,8 @@ def run(
     say("checking the answer by a forward simulation")
     rollouts = {e.name: roll_out(problem, e, solution) for e in problem.experiments}
     found = _checked(problem, solution, rollouts, say)
+    if not seek_causes:
+        return found
     say("looking for causes of the misfit")
     turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
     return replace(found, notes=(*turns, *found.notes), causes=likely_causes(solution))

@@ -3,14 +3,17 @@
 Every parameter is guessed log-uniformly within a factor of the truth, or none is. The bodies:
 the paper's cylinder, which hangs; a soft bar, which sags as far as it is long; a block of silicone,
 stiff enough to move as the hand does. A start succeeds when every parameter is within 1 % of the
-best answer of all, or within three of its standard errors. The cost is counted in sweeps: one
-factorisation of every timestep's block, those of simulations and of the rest state included.
+best answer of all, or within three of its standard errors; or, as where the data do not tell some
+parameter, when it fits as well: the likelihood ratio of the two is within three deviations. How
+many succeed so only is told. The cost is counted in sweeps: one factorisation of every timestep's
+block, those of simulations and of the rest state included.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -46,23 +49,32 @@ TOLERANCE, ERRORS = 0.01, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A body that was swung, and the parameters that its tracks were made with."""
+    """A body that was swung, and the parameters that its tracks were made with.
+
+    Noise of `noise_m` is what its markers have, and are said to have.
+    """
 
     experiment: Experiment
     truth: Mapping[str, float]
     scheme: str = "midpoint"
+    noise_m: float = SIGMA_M
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One start; the ratio and the errors are to the best answer of all, of the worst parameter."""
+    """One start; the ratio and the errors are to the best answer of all, of the worst parameter.
+
+    `excess` is by how much its loss is higher, `same_fit` whether that alone makes it a success.
+    """
 
     number: int
     status: str
     success: bool
+    same_fit: bool
     sweeps: float
     time_s: float
     loss: float
+    excess: float
     rms_m: float
     worst_ratio: float
     worst_errors: float
@@ -83,7 +95,7 @@ def main() -> None:
     parser.add_argument("--unplaced", action="store_true", help="markers' places are unknown too")
     parser.add_argument("--ideal", action="store_true", help="no nuisance parameters")
     parser.add_argument("--method", default="reduced-space")
-    parser.add_argument("--noise-m", type=float, default=SIGMA_M)
+    parser.add_argument("--noise-m", type=float, help="other than the case's")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, nargs="*", help="numbers of the starts to run")
     parser.add_argument("--json", action="store_true")
@@ -91,16 +103,17 @@ def main() -> None:
     found = {}
     for body in arguments.bodies:
         case = described(CASES[body](), arguments.unplaced, arguments.ideal)
+        noise_m = case.noise_m if arguments.noise_m is None else arguments.noise_m
         starts = guesses(arguments.starts, arguments.factor, arguments.seed, case.truth)
         if arguments.unguessed:
             found[body] = [
                 replace(outcome, number=seed)
                 for seed in range(arguments.starts)
-                for noisy in [with_noise(case, arguments.noise_m, seed)]
+                for noisy in [with_noise(case, noise_m, seed)]
                 for outcome in study(noisy, np.full((1, len(case.truth)), np.nan), arguments.method)
             ]
         else:
-            noisy = with_noise(case, arguments.noise_m, arguments.seed)
+            noisy = with_noise(case, noise_m, arguments.seed)
             found[body] = study(noisy, starts, arguments.method, arguments.only)
         if not arguments.json:
             print(f"{body}: {summary(found[body])}", flush=True)
@@ -133,7 +146,11 @@ def soft_bar() -> Case:
 
 
 def silicone_block() -> Case:
-    """A block of 60 × 60 × 100 mm that hangs, of E = 500 kPa and 1100 kg/m³."""
+    """A block of 60 × 60 × 100 mm that hangs, of E = 500 kPa and 1100 kg/m³.
+
+    It sways by some tenths of a millimetre, so its markers are seen as well as that: noise of 1 mm
+    would tell nothing of its damping.
+    """
     body = Body(box_mesh((0.06, 0.06, 0.1), (3, 3, 5)), density_kg_m3=1100.0)
     motion = Swing(
         duration_s=1.0,
@@ -145,7 +162,7 @@ def silicone_block() -> Case:
     )
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     truth = moduli(5e5, 0.45) | {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.5}
-    return measured(body, held, motion, truth)
+    return measured(body, held, motion, truth, noise_m=1e-4)
 
 
 def moduli(young_pa: float, poisson: float) -> dict[str, float]:
@@ -154,7 +171,11 @@ def moduli(young_pa: float, poisson: float) -> dict[str, float]:
 
 
 def measured(
-    body: Body, held: NDArray[np.int64], motion: Swing, truth: Mapping[str, float]
+    body: Body,
+    held: NDArray[np.int64],
+    motion: Swing,
+    truth: Mapping[str, float],
+    noise_m: float = SIGMA_M,
 ) -> Case:
     """A body swung from its rest state, with tracks of every fifth node outside."""
     poses = motion.poses(STEP_S)
@@ -162,11 +183,11 @@ def measured(
     at_side = (nodes == nodes.min(axis=0)) | (nodes == nodes.max(axis=0))
     marked = np.setdiff1d(np.flatnonzero(at_side.any(axis=1)), held)[::5]
     nowhere = np.zeros((len(poses.t_s), len(marked), 3))
-    markers = Markers(poses.t_s, nowhere, SIGMA_M, places_m=body.nodes_m[marked])
+    markers = Markers(poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked])
     grasp, ideal = Grasp(held, poses), Nuisance.none()
     experiment = Experiment(body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal)
     tracks = simulate(experiment, truth, "midpoint").markers_m
-    return Case(with_markers(experiment, tracks), truth)
+    return Case(with_markers(experiment, tracks), truth, noise_m=noise_m)
 
 
 def described(case: Case, unplaced: bool, ideal: bool) -> Case:
@@ -242,16 +263,17 @@ def study(
     fit = linearised_fit(best.collocation, best.z)
     found = uncertainty_of(fit, best.collocation.parameters, best.q, "given", "independent")
     std_errors = [found.estimates[name].std_error or np.nan for name in case.truth]
-    outcomes = [
-        attempt(case, number, guess, method)
-        for number, guess in enumerate(starts)
-        if not only or number in only
-    ]
+    outcomes = []
+    for number, guess in enumerate(starts):
+        if not only or number in only:
+            outcomes.append(attempt(case, number, guess, method))
+            print(end=".", file=sys.stderr, flush=True)
     losses = [best.history[-1].loss, *(each.loss for each in outcomes)]
     answers = [tuple(best.parameters[name] for name in case.truth), *(e.found for e in outcomes)]
     ended = [True, *(each.status in ("converged", "acceptable") for each in outcomes)]
     first = min(np.flatnonzero(ended), key=lambda k: losses[k])
-    return [judged(each, np.array(answers[first]), np.array(std_errors)) for each in outcomes]
+    least, reference = losses[first], np.array(answers[first])
+    return [judged(each, reference, least, np.array(std_errors)) for each in outcomes]
 
 
 def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) -> Outcome:
@@ -261,17 +283,19 @@ def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) ->
         try:
             solution = solve(problem_of(case, guess), method)
         except InputError as error:
-            worst = (np.inf, np.nan, np.inf, np.inf)
+            worst = (np.inf, np.inf, np.nan, np.inf, np.inf)
             return Outcome(
-                number, "refused", False, 0.0, 0.0, *worst, given, nothing, (), str(error)
+                number, "refused", False, False, 0.0, 0.0, *worst, given, nothing, (), str(error)
             )
     return Outcome(
         number,
         solution.status.value,
         False,
+        False,
         count[0] / len(case.experiment.t_s),
         solution.timing.total + (solution.scan.time_s if solution.scan else 0.0),
         solution.history[-1].loss if solution.history else np.inf,
+        np.inf,
         solution.rms_m,
         np.inf,
         np.inf,
@@ -282,17 +306,23 @@ def attempt(case: Case, number: int, guess: NDArray[np.float64], method: str) ->
     )
 
 
-def judged(outcome: Outcome, best: NDArray[np.float64], std_errors: NDArray[np.float64]) -> Outcome:
+def judged(
+    outcome: Outcome, best: NDArray[np.float64], least: float, std_errors: NDArray[np.float64]
+) -> Outcome:
     """The outcome compared with the best answer."""
-    found = np.array(outcome.found)
+    found, excess = np.array(outcome.found), outcome.loss - least
     ratios = np.abs(np.log(found / best))
     errors = np.abs(found - best) / std_errors
     close = bool(((ratios < TOLERANCE) | (errors < ERRORS)).all())
+    # The loss is χ².
+    as_well = excess < ERRORS**2
     return replace(
         outcome,
-        success=close and outcome.status in ("converged", "acceptable"),
+        success=(close or as_well) and outcome.status in ("converged", "acceptable"),
+        same_fit=as_well and not close,
+        excess=excess,
         worst_ratio=float(np.exp(ratios.max())),
-        worst_errors=float(errors.max()),
+        worst_errors=float(np.nanmax(errors, initial=0.0)),
     )
 
 
@@ -334,7 +364,8 @@ def summary(outcomes: list[Outcome]) -> str:
     sweeps = [outcome.sweeps for outcome in outcomes if outcome.success]
     failures = [outcome for outcome in outcomes if not outcome.success]
     lines = [
-        f"success: {len(sweeps)} of {len(outcomes)}",
+        f"success: {len(sweeps)} of {len(outcomes)}, of which by an equal fit only: "
+        f"{sum(outcome.success and outcome.same_fit for outcome in outcomes)}",
         f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}" if sweeps else "",
         f"time: {sum(outcome.time_s for outcome in outcomes):.1f} s",
         f"failures: {dict(Counter(outcome.status for outcome in failures)) or 'none'}",
@@ -347,7 +378,8 @@ def summary(outcomes: list[Outcome]) -> str:
         lines.append(
             f"  {outcome.number}: {guess} -> {found}, {outcome.sweeps:.1f} sweeps, "
             f"rms {1e3 * outcome.rms_m:.3g} mm, a factor of {outcome.worst_ratio:.3g} and "
-            f"{outcome.worst_errors:.2g} standard errors off: {outcome.message}"
+            f"{outcome.worst_errors:.2g} standard errors off, loss {outcome.excess:.3g} higher: "
+            f"{outcome.message}"
         )
     return "\n".join(lines)
 
