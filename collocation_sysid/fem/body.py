@@ -4,8 +4,8 @@ Signs: Ψ(x) elastic energy, f_e = −∂Ψ/∂x, K = ∂²Ψ/∂x² = −∂f_e
 
     f(x, v; θ) = f_e(x) + f_d(x, v) − γ_m M v,   f_d = −γ_r K(x) v for Rayleigh's damping law.
 
-The slopes of a damping that follows from a dissipation function are not symmetric: their skew
-parts are arrays of their own, which are empty, (T, 0), where no part of the body has any.
+The slopes of a damping law that is a stress, not a potential, are not symmetric: their skew parts
+are arrays of their own, which are empty, (T, 0), where no part of the body has any.
 
 A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
 part in turn: its material's, its damping law's, and its γ_m.
@@ -210,7 +210,7 @@ class Body(Model):
     @property
     def unsymmetric(self) -> bool:
         """Whether the slopes of the force have a skew part."""
-        return any(part.damping.dissipation for part in self.parts)
+        return any(part.damping.stress is not None for part in self.parts)
 
     @cached_property
     def dof_mass(self) -> Array:
@@ -418,7 +418,7 @@ class Body(Model):
         part = self.parts[number]
         kernel = KERNELS[name](self.element, Law(part.material, part.damping))
         cells, geometry = self.cells[part.cells], self.geometry[part.cells]
-        if part.damping.dissipation:
+        if part.damping.stress is not None:
             # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
             # other triangle has another sign.
             cells, geometry = in_ascending_order(cells, geometry)

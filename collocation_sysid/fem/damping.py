@@ -1,4 +1,4 @@
-"""Damping laws: a potential of the rate of deformation, and the constants it needs.
+"""Damping laws: a potential or a stress of the rate of deformation, and the constants it needs.
 
 Kelvin and Voigt's is objective: S_v = γ_r dS/dt, S = 2 ∂ψ/∂C, is a stress in the material frame
 and dissipates γ_r Ė:4 ∂²ψ/∂C²:Ė. Rayleigh's is the same at small strain, but it also resists that
@@ -16,8 +16,10 @@ import casadi as ca
 
 from ..errors import InputError, hint_at
 from .constants import GAMMA_R, Constant
+from .kernel import mirrored
 
 Potential = Callable[..., ca.SX]
+Stress = Callable[..., tuple[ca.SX, ca.SX]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,37 +29,42 @@ class Damping:
     Attributes
     ----------
     name : str
-    potential : callable
-        ``potential(psi, F, rate, **constants)`` → a density ψ_d, from the energy's as an
-        expression in F. F and Ḟ are stacked (9,).
     constants : tuple of Constant
-    dissipation : bool
-        Whether ψ_d is a dissipation function: quadratic in Ḟ, and the first Piola–Kirchhoff
-        stress of the damping is ∂ψ_d/∂Ḟ. If not, it is linear in Ḟ, the stress is ∂ψ_d/∂F, and
-        ∂²ψ_d/∂F∂Ḟ must be symmetric; where an element averages the dilatation, its volume and
-        the rate of that then follow F and Ḟ.
+    potential : callable, optional
+        ``potential(psi, F, rate, **constants)`` → a density ψ_d linear in the rate Ḟ, from the
+        energy's as an expression in F. The first Piola–Kirchhoff stress of the damping is
+        ∂ψ_d/∂F, and ∂²ψ_d/∂F∂Ḟ must be symmetric. F and Ḟ are stacked (9,); where an element
+        averages the dilatation, its volume and the rate of that follow them.
+    stress : callable, optional
+        In its place, ``stress(psi, F, rate, **constants)`` → that stress P_v (9,), and ∂P_v/∂F
+        (9, 9), which need not be symmetric. P_v must be linear in Ḟ, and ∂P_v/∂Ḟ symmetric.
     """
 
     name: str
-    potential: Potential = field(repr=False)
     constants: tuple[Constant, ...]
-    dissipation: bool = False
+    potential: Potential | None = field(default=None, repr=False)
+    stress: Stress | None = field(default=None, repr=False)
 
 
-def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
-    """½ γ_r Ė:4 ∂²ψ/∂C²:Ė = ½ γ_r (Ḟ:∂²ψ/∂F²:Ḟ − S:ḞᵀḞ).
+def kelvin_voigt(
+    psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """P_v = γ_r F dS/dt = γ_r (dP/dt − Ḟ S), and γ_r (∂(dP/dt)/∂F − Ḟ ∂S/∂F).
 
-    The second term takes away the geometric stiffness, so that a spin Ḟ = ωF dissipates nothing.
+    With S = F⁻¹ P, ∂S/∂F:A = F⁻¹ (∂P/∂F:A − A S).
     """
-    stress = ca.gradient(psi, F)
-    along = ca.jtimes(stress, F, rate)
-    power = ca.dot(rate, along)
+    stiffness, stress = ca.hessian(psi, F)
+    change = ca.jtimes(stress, F, rate)
+    slope = mirrored(ca.jacobian(change, F))
     # A linear material knows no difference between the shapes; its stress does not turn along.
-    if ca.depends_on(along, F):
-        Fdot = ca.reshape(rate, 3, 3)
-        spatial = Fdot @ ca.inv(ca.reshape(F, 3, 3))
-        power -= ca.dot(ca.reshape(stress, 3, 3), spatial.T @ Fdot)
-    return 0.5 * gamma_r_s * power
+    if not ca.depends_on(stiffness, F):
+        return gamma_r_s * change, gamma_r_s * slope
+    inverse, Fdot = ca.inv(ca.reshape(F, 3, 3)), ca.reshape(rate, 3, 3)
+    S = mirrored(inverse @ ca.reshape(stress, 3, 3))
+    change -= ca.vec(Fdot @ S)
+    turning = mirrored(stiffness) - ca.kron(S, ca.SX.eye(3))
+    slope -= ca.kron(ca.SX.eye(3), Fdot @ inverse) @ turning
+    return gamma_r_s * change, gamma_r_s * slope
 
 
 def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
@@ -66,8 +73,8 @@ def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
 
 
 DAMPINGS: dict[str, Damping] = {
-    "kelvin-voigt": Damping("kelvin-voigt", kelvin_voigt, (GAMMA_R,), dissipation=True),
-    "rayleigh": Damping("rayleigh", rayleigh, (GAMMA_R,)),
+    "kelvin-voigt": Damping("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
+    "rayleigh": Damping("rayleigh", (GAMMA_R,), rayleigh),
 }
 
 

@@ -14,9 +14,9 @@ and outputs that are summed over points and elements. Matrices are given by the 
 their symmetric part and, where they have one, of their skew part, column after column.
 
 All of them are derivatives of two scalars: an energy Θ(x, v) = Σ_q V_q (ψ + ψ_d), with the
-potential of a damping law that has one, and the dissipation function D(x, v) = Σ_q V_q ψ_d of one
-that has such. The internal force is −∂Θ/∂x − ∂D/∂v. For Rayleigh's law that is −∂Ψ/∂x − γ_r K v,
-for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N.
+potential of a damping law that has one, and half the power that one with a stress dissipates,
+D(x, v) = ½ Σ_q V_q P_v:Ḟ. The internal force is −∂Θ/∂x − ∂D/∂v. For Rayleigh's law that is
+−∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N.
 """
 
 from __future__ import annotations
@@ -54,17 +54,24 @@ class Law:
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """The damping law's, from the energy as an expression in F."""
-        own = theta[len(self.material.constants) :]
-        named = {c.name: own[k] for k, c in enumerate(self.damping.constants)}
-        return self.damping.potential(psi, F, rate, **named)
+        """That of the damping law, from the energy as an expression in F; none, where it has none."""
+        potential = self.damping.potential
+        return potential(psi, F, rate, **self._of_damping(theta)) if potential else ca.SX(0)
 
-    def dissipation(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """The dissipation function's density at F and Ḟ, stacked (9,)."""
+    def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
+        """P_v and ∂P_v/∂F of the damping law at F and Ḟ, stacked (9,); none, where it has none."""
+        if not self.damping.stress:
+            return None
         own_F, own_rate = ca.SX.sym("F", 9), ca.SX.sym("rate", 9)
         psi = self.psi(ca.reshape(own_F, 3, 3), theta)
-        found = self.damping_potential(psi, own_F, own_rate, theta)
-        return ca.substitute(found, ca.vertcat(own_F, own_rate), ca.vertcat(F, rate))
+        found = self.damping.stress(psi, own_F, own_rate, **self._of_damping(theta))
+        own, given = ca.vertcat(own_F, own_rate), ca.vertcat(F, rate)
+        stress, slope = ca.substitute(list(found), [own], [given])
+        return stress, slope
+
+    def _of_damping(self, theta: ca.SX) -> dict[str, ca.SX]:
+        own = theta[len(self.material.constants) :]
+        return {c.name: own[k] for k, c in enumerate(self.damping.constants)}
 
 
 def kernel_of(name: str, point: Point, outputs: Outputs) -> PointKernel:
@@ -73,7 +80,10 @@ def kernel_of(name: str, point: Point, outputs: Outputs) -> PointKernel:
         return averaging_kernel(name, point, outputs)
     pieces: Pieces = {}
     for key, terms in outputs.items():
-        found = [term.of(point.derivative(term.scalar, term.by)) for term in terms]
+        found = [
+            term.of(point.derivative(term.scalar, term.by) if term.known is None else term.known)
+            for term in terms
+        ]
         pieces[key] = terms[0].contraction, sum(found[1:], found[0])
     last = point.phase(name, pieces)
     return PointKernel(last.pieces, tuple(point.fields), last.contractions)
@@ -86,14 +96,13 @@ def _energy(point: Point, law: Law) -> ca.SX:
 def _potential(point: Point, law: Law) -> ca.SX:
     """Θ of one point, whose slope by x is an internal force but for the sign."""
     energy = _energy(point, law)
-    if law.damping.dissipation:
-        return energy
     return energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
 
 
-def _dissipation(point: Point, law: Law) -> ca.SX:
-    """D of one point, whose slope by v is an internal force but for the sign."""
-    return point.volume * law.dissipation(ca.vec(point.felt), point.felt_rate, point.theta)
+def _stress(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
+    """V P_v of one point, and its slope by F."""
+    found = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.theta)
+    return None if found is None else (point.volume * found[0], point.volume * found[1])
 
 
 def energy_kernel(element: Element, law: Law) -> PointKernel:
@@ -106,8 +115,9 @@ def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
     point = Point.of(element, law.constants, "x", "v")
     force = (Term(-_potential(point, law), ("x",)),)
-    if law.damping.dissipation:
-        force += (Term(-_dissipation(point, law), ("v",)),)
+    if found := _stress(point, law):
+        stress = -found[0]
+        force += (Term(ca.dot(stress, point.felt_rate) / 2, ("v",), known=stress),)
     return kernel_of("force", point, {"force": force})
 
 
@@ -121,13 +131,17 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
         "by_velocity": (Term(potential, ("x", "v")),),
         "by_theta": (Term(potential, ("x", "theta")),),
     }
-    if law.damping.dissipation:
-        lost = -_dissipation(point, law)
-        outputs["force"] += (Term(lost, ("v",)),)
-        outputs["by_position"] += (Term(lost, ("v", "x"), "symmetric"),)
-        outputs["by_velocity"] = (Term(lost, ("v", "v")),)
-        outputs["by_theta"] += (Term(lost, ("v", "theta")),)
-        outputs["by_position_skew"] = (Term(lost, ("v", "x"), "skew"),)
+    if found := _stress(point, law):
+        stress, slope = -found[0], -found[1]
+        # Half the power lost, which is quadratic in the rate: its slope by that is the stress.
+        lost = ca.dot(stress, point.felt_rate) / 2
+        by_rate = ca.jacobian(stress, point.gradients["v"])
+        by_theta = ca.jacobian(stress, point.theta)
+        outputs["force"] += (Term(lost, ("v",), known=stress),)
+        outputs["by_position"] += (Term(lost, ("v", "x"), "symmetric", slope),)
+        outputs["by_velocity"] += (Term(lost, ("v", "v"), known=by_rate),)
+        outputs["by_theta"] += (Term(lost, ("v", "theta"), known=by_theta),)
+        outputs["by_position_skew"] = (Term(lost, ("v", "x"), "skew", slope),)
     return kernel_of("linearisation", point, outputs)
 
 
@@ -139,9 +153,9 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
     """
     point = Point.of(element, law.constants, "x", "v", "w")
     power = -point.along_w(_potential(point, law))
-    if law.damping.dissipation:
-        power -= point.along_w(_dissipation(point, law), "v")
-    mixed = Term(power, ("x", "v"), "symmetric" if law.damping.dissipation else "whole")
+    if found := _stress(point, law):
+        power -= ca.dot(found[0], point.felt_weight)
+    mixed = Term(power, ("x", "v"), "symmetric" if found else "whole")
     outputs: Outputs = {
         "position_position": (Term(power, ("x", "x")),),
         "position_velocity": (mixed,),
@@ -150,7 +164,7 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
         "theta_theta": (Term(power, ("theta", "theta")),),
         "gradient_theta": (Term(power, ("theta",)),),
     }
-    if law.damping.dissipation:
+    if found:
         outputs["position_velocity_skew"] = (replace(mixed, part="skew"),)
     return kernel_of("curvature", point, outputs)
 

@@ -33,8 +33,8 @@ from functools import cached_property
 
 import casadi as ca
 
-from .kernel import PointKernel
-from .point import By, Outputs, Pieces, Point, Term, mirrored
+from .kernel import PointKernel, mirrored
+from .point import By, Outputs, Pieces, Point, Term
 
 
 def averaging_kernel(name: str, point: Point, outputs: Outputs) -> PointKernel:

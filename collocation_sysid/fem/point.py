@@ -8,7 +8,7 @@ from typing import Literal
 import casadi as ca
 
 from .elements import Element
-from .kernel import Contraction, Phase, node_gradients
+from .kernel import Contraction, Phase, mirrored, node_gradients
 
 # A derivative of a scalar: by none, one or two of x, v and θ, θ last.
 By = tuple[str, ...]
@@ -25,11 +25,15 @@ class Term:
     by : By
     part : {"whole", "symmetric", "skew"}
         Of a second derivative by fields; one that is taken whole is known to be symmetric.
+    known : SX, optional
+        The derivative by the fields' gradients, where nothing stretches, in a shorter form than
+        differentiation finds.
     """
 
     scalar: ca.SX
     by: By
     part: Literal["whole", "symmetric", "skew"] = "whole"
+    known: ca.SX | None = None
 
     @property
     def contraction(self) -> Contraction:
@@ -117,13 +121,16 @@ class Point:
         """The derivative along v of the deformation gradient that the material feels, (9,)."""
         return ca.jtimes(ca.vec(self.felt), self.strain, self.strain_rate)
 
-    def along_w(self, scalar: ca.SX, by: Literal["x", "v"] = "x") -> ca.SX:
-        """Derivative of a scalar of x and v by one of them, along w."""
-        w = ca.vertcat(self.gradients["w"], *self.stretches[2:])
-        if by == "v":
-            # Of a rate, the derivative by v is that which its like has by x.
-            return ca.jtimes(scalar, self.strain_rate, w[: self.strain_rate.numel()])
-        return ca.jtimes(scalar, ca.vertcat(self.gradients["x"], *self.stretches[:2]), w)
+    @property
+    def felt_weight(self) -> ca.SX:
+        """Its derivative along w."""
+        along = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
+        return ca.jtimes(ca.vec(self.felt), self.strain, along)
+
+    def along_w(self, scalar: ca.SX) -> ca.SX:
+        """Derivative of a scalar of x and v by x, along w."""
+        inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
+        return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """A derivative of a scalar, by the fields' gradients for the fields."""
@@ -153,8 +160,3 @@ class Point:
             name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
         )
         return Phase(function, {key: how for key, (how, _) in pieces.items()})
-
-
-def mirrored(matrix: ca.SX) -> ca.SX:
-    """A matrix that is known to be symmetric, half of which need not be computed."""
-    return ca.tril2symm(ca.tril(ca.densify(matrix)))
