@@ -4,6 +4,9 @@ Signs: Ψ(x) elastic energy, f_e = −∂Ψ/∂x, K = ∂²Ψ/∂x² = −∂f_e
 
     f(x, v; θ) = f_e(x) + f_d(x, v) − γ_m M v,   f_d = −γ_r K(x) v for Rayleigh's damping law.
 
+The slopes of a damping law that is a stress, not a potential, are not symmetric: their skew parts
+are arrays of their own, which are empty, (T, 0), where no part of the body has any.
+
 A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
 part in turn: its material's, its damping law's, and its γ_m.
 """
@@ -28,7 +31,7 @@ from .materials import Energy, Material
 from .mesh import TetMesh
 from .model import Model, Theta
 from .nodes import Nodes
-from .pattern import SymmetricPattern, element_destinations
+from .pattern import SymmetricPattern, element_destinations, in_ascending_order
 from .regions import Part, Region, parts_of
 from .selection import Selection
 
@@ -40,15 +43,18 @@ class Linearisation:
     Attributes
     ----------
     force : (T, 3n) f(x, v; θ) [N]
-    by_position : (T, m) lower triangles of ∂f/∂x; for Rayleigh's damping −K − γ_r D_vK [N/m]
+    by_position : (T, m) lower triangles of ∂f/∂x, its symmetric part; for Rayleigh's damping
+        −K − γ_r D_vK [N/m]
     by_velocity : (T, m) lower triangles of ∂f/∂v; for Rayleigh's −γ_r K − γ_m M [N·s/m]
     by_theta : (T, 3n, k) ∂f/∂θ
+    by_position_skew : (T, m) lower triangles of the skew part of ∂f/∂x, or (T, 0)
     """
 
     force: Array
     by_position: Array
     by_velocity: Array
     by_theta: Array
+    by_position_skew: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +63,11 @@ class Curvature:
 
     Attributes
     ----------
-    position_position, position_velocity : (T, m) lower triangles
+    position_position, position_velocity : (T, m) lower triangles, of the symmetric part
     position_theta, velocity_theta : (T, 3n, k)
     theta_theta : (T, k, k)
     theta : (T, k) first derivative ∂φ/∂θ
+    position_velocity_skew : (T, m) lower triangles of the skew part of ∂²φ/∂x∂v, or (T, 0)
     """
 
     position_position: Array
@@ -69,6 +76,7 @@ class Curvature:
     velocity_theta: Array
     theta_theta: Array
     theta: Array
+    position_velocity_skew: Array
 
 
 class Body(Model):
@@ -86,8 +94,8 @@ class Body(Model):
         A name in `elements.ELEMENTS`. "tet10" puts a node on every edge of the mesh: some eight
         times the unknowns, and far better in bending. "tet10-p0" also averages the dilatation over
         each element: right up to a Poisson's ratio of 0.4999.
-    damping : str or Damping, default "rayleigh"
-        A name in `damping.DAMPINGS`.
+    damping : str or Damping, default "kelvin-voigt"
+        A name in `damping.DAMPINGS`; "rayleigh" is the paper's law.
     regions : sequence of Region
         Parts that differ.
     evaluator : {"auto", "simd", "casadi"}
@@ -123,7 +131,7 @@ class Body(Model):
         element: str = "tet4",
         *,
         mass_kg: float | None = None,
-        damping: str | Damping = "rayleigh",
+        damping: str | Damping = "kelvin-voigt",
         regions: Sequence[Region] = (),
         evaluator: str = "auto",
         threads: int | None = None,
@@ -199,6 +207,11 @@ class Body(Model):
         """Total mass."""
         return float(self.node_mass.sum())
 
+    @property
+    def unsymmetric(self) -> bool:
+        """Whether the slopes of the force have a skew part."""
+        return any(part.damping.stress is not None for part in self.parts)
+
     @cached_property
     def dof_mass(self) -> Array:
         """(3n,) lumped mass of every degree of freedom [kg]."""
@@ -270,8 +283,9 @@ class Body(Model):
         x, v = self._states(positions, velocities)
         rows = self._evaluate("linearisation", [x, v], theta, out)
         size, entries = self.pattern.size, self.pattern.entries
-        force, by_position, by_velocity, by_theta = np.split(
-            rows, np.cumsum([size, entries, entries]), axis=1
+        width = len(self.constants) * size
+        force, by_position, by_velocity, by_theta, skew = np.split(
+            rows, np.cumsum([size, entries, entries, width]), axis=1
         )
         moving = self.dof_mass if dof_mass is None else dof_mass
         drag = self._drag(theta)
@@ -280,12 +294,13 @@ class Body(Model):
         by_theta = by_theta.reshape(len(x), size, -1)
         for column, share in self._drag_shares.items():
             by_theta[:, :, column] = -share * moving * v
-        return Linearisation(force, by_position, by_velocity, by_theta)
+        return Linearisation(force, by_position, by_velocity, by_theta, skew)
 
     @property
     def linearisation_width(self) -> int:
         """Length of one timestep's row of `linearise`."""
-        return (1 + len(self.constants)) * self.pattern.size + 2 * self.pattern.entries
+        entries = (2 + self.unsymmetric) * self.pattern.entries
+        return (1 + len(self.constants)) * self.pattern.size + entries
 
     def curvature(
         self,
@@ -300,21 +315,23 @@ class Body(Model):
         x, v, w = self._states(positions, velocities, weights)
         rows = self._evaluate("curvature", [x, v, w], theta, out)
         size, entries, k = self.pattern.size, self.pattern.entries, len(self.constants)
-        xx, xv, x_theta, v_theta, theta_theta, by_theta = np.split(
-            rows, np.cumsum([entries, entries, k * size, k * size, k * k]), axis=1
+        xx, xv, x_theta, v_theta, theta_theta, by_theta, skew = np.split(
+            rows, np.cumsum([entries, entries, k * size, k * size, k * k, k]), axis=1
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
         moving = self.dof_mass if dof_mass is None else dof_mass
         for column, share in self._drag_shares.items():
             v_theta[:, :, column] = -share * moving * w
             by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
-        return Curvature(xx, xv, x_theta, v_theta, theta_theta.reshape(len(x), k, k), by_theta)
+        theta_theta = theta_theta.reshape(len(x), k, k)
+        return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew)
 
     @property
     def curvature_width(self) -> int:
         """Length of one timestep's row of `curvature`."""
         k = len(self.constants)
-        return 2 * k * self.pattern.size + 2 * self.pattern.entries + k * (k + 1)
+        entries = (2 + self.unsymmetric) * self.pattern.entries
+        return 2 * k * self.pattern.size + entries + k * (k + 1)
 
     @cached_property
     def _drag_shares(self) -> dict[int, Array]:
@@ -400,7 +417,11 @@ class Body(Model):
         """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
         part = self.parts[number]
         kernel = KERNELS[name](self.element, Law(part.material, part.damping))
-        cells = self.cells[part.cells]
+        cells, geometry = self.cells[part.cells], self.geometry[part.cells]
+        if part.damping.stress is not None:
+            # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
+            # other triangle has another sign.
+            cells, geometry = in_ascending_order(cells, geometry)
         vector, lower = element_destinations(self.pattern, cells)
         total, count = len(self.constants), len(cells)
         # γ_m comes after the constants of the points and needs no elements.
@@ -420,10 +441,12 @@ class Body(Model):
             "velocity_theta": (by_theta, total * self.pattern.size),
             "theta_theta": (np.broadcast_to(square, (count, len(square))), total**2),
             "gradient_theta": (np.broadcast_to(columns, (count, len(columns))), total),
+            "by_position_skew": (lower, self.pattern.entries),
+            "position_velocity_skew": (lower, self.pattern.entries),
         }
         used = [places[output] for output in kernel.contractions]
         starts = np.cumsum([0] + [length for _, length in used])
         destinations = np.hstack(
             [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
         )
-        return Batch(kernel, cells, self.geometry[part.cells], destinations, self._width(name))
+        return Batch(kernel, cells, geometry, destinations, self._width(name))

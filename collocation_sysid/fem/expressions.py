@@ -10,18 +10,19 @@ geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume
 theta    k             constants of the material, then of the damping law
 ======== ============= ==============================================================
 
-and outputs that are summed over points and elements. Symmetric matrices are given by their
-lower triangles, column after column.
+and outputs that are summed over points and elements. Matrices are given by the lower triangles of
+their symmetric part and, where they have one, of their skew part, column after column.
 
-All of them are derivatives of one scalar: with the energy and the potential of the damping law,
-Θ(x, v) = Σ_q V_q (ψ + ψ_d), the internal force is −∂Θ/∂x, and its virtual power wᵀf is −D_wΘ. For
-Rayleigh's law that force is −∂Ψ/∂x − γ_r K v.
+All of them are derivatives of two scalars: an energy Θ(x, v) = Σ_q V_q (ψ + ψ_d), with the
+potential of a damping law that has one, and half the power that one with a stress dissipates,
+D(x, v) = ½ Σ_q V_q P_v:Ḟ. The internal force is −∂Θ/∂x − ∂D/∂v. For Rayleigh's law that is
+−∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
@@ -30,7 +31,7 @@ from .elements import Element
 from .kernel import PointKernel
 from .materials import Material
 from .mean_dilatation import averaging_kernel
-from .point import By, Pieces, Point, contraction_of
+from .point import Outputs, Pieces, Point, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +54,37 @@ class Law:
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """The damping law's, from the energy as an expression in F."""
+        """That of the damping law, from the energy as an expression in F; none, where it has none."""
+        potential = self.damping.potential
+        return potential(psi, F, rate, **self._of_damping(theta)) if potential else ca.SX(0)
+
+    def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
+        """P_v and ∂P_v/∂F of the damping law at F and Ḟ, stacked (9,); none, where it has none."""
+        if not self.damping.stress:
+            return None
+        own_F, own_rate = ca.SX.sym("F", 9), ca.SX.sym("rate", 9)
+        psi = self.psi(ca.reshape(own_F, 3, 3), theta)
+        found = self.damping.stress(psi, own_F, own_rate, **self._of_damping(theta))
+        own, given = ca.vertcat(own_F, own_rate), ca.vertcat(F, rate)
+        stress, slope = ca.substitute(list(found), [own], [given])
+        return stress, slope
+
+    def _of_damping(self, theta: ca.SX) -> dict[str, ca.SX]:
         own = theta[len(self.material.constants) :]
-        named = {c.name: own[k] for k, c in enumerate(self.damping.constants)}
-        return self.damping.potential(psi, F, rate, **named)
+        return {c.name: own[k] for k, c in enumerate(self.damping.constants)}
 
 
-def kernel_of(name: str, point: Point, scalar: ca.SX, derivatives: dict[str, By]) -> PointKernel:
-    """The kernel of derivatives of a scalar of a point."""
+def kernel_of(name: str, point: Point, outputs: Outputs) -> PointKernel:
+    """The kernel of derivatives of scalars of a point."""
     if point.stretches:
-        return averaging_kernel(name, point, scalar, derivatives)
-    pieces: Pieces = {
-        key: (contraction_of(by), point.derivative(scalar, by)) for key, by in derivatives.items()
-    }
+        return averaging_kernel(name, point, outputs)
+    pieces: Pieces = {}
+    for key, terms in outputs.items():
+        found = [
+            term.of(point.derivative(term.scalar, term.by) if term.known is None else term.known)
+            for term in terms
+        ]
+        pieces[key] = terms[0].contraction, sum(found[1:], found[0])
     last = point.phase(name, pieces)
     return PointKernel(last.pieces, tuple(point.fields), last.contractions)
 
@@ -75,51 +94,79 @@ def _energy(point: Point, law: Law) -> ca.SX:
 
 
 def _potential(point: Point, law: Law) -> ca.SX:
-    """Θ of one point, whose slope is the internal force but for the sign."""
+    """Θ of one point, whose slope by x is an internal force but for the sign."""
     energy = _energy(point, law)
     return energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
+
+
+def _stress(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
+    """V P_v of one point, and its slope by F."""
+    found = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.theta)
+    return None if found is None else (point.volume * found[0], point.volume * found[1])
 
 
 def energy_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic energy Ψ of the point [J]."""
     point = Point.of(element, law.constants, "x")
-    return kernel_of("energy", point, _energy(point, law), {"energy": ()})
+    return kernel_of("energy", point, {"energy": (Term(_energy(point, law), ()),)})
 
 
 def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
     point = Point.of(element, law.constants, "x", "v")
-    return kernel_of("force", point, -_potential(point, law), {"force": ("x",)})
+    force = (Term(-_potential(point, law), ("x",)),)
+    if found := _stress(point, law):
+        stress = -found[0]
+        force += (Term(ca.dot(stress, point.felt_rate) / 2, ("v",), known=stress),)
+    return kernel_of("force", point, {"force": force})
 
 
 def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
     point = Point.of(element, law.constants, "x", "v")
-    derivatives = {
-        "force": ("x",),
-        "by_position": ("x", "x"),
-        "by_velocity": ("x", "v"),
-        "by_theta": ("x", "theta"),
+    potential = -_potential(point, law)
+    outputs: Outputs = {
+        "force": (Term(potential, ("x",)),),
+        "by_position": (Term(potential, ("x", "x")),),
+        "by_velocity": (Term(potential, ("x", "v")),),
+        "by_theta": (Term(potential, ("x", "theta")),),
     }
-    return kernel_of("linearisation", point, -_potential(point, law), derivatives)
+    if found := _stress(point, law):
+        stress, slope = -found[0], -found[1]
+        # Half the power lost, which is quadratic in the rate: its slope by that is the stress.
+        lost = ca.dot(stress, point.felt_rate) / 2
+        by_rate = ca.jacobian(stress, point.gradients["v"])
+        by_theta = ca.jacobian(stress, point.theta)
+        outputs["force"] += (Term(lost, ("v",), known=stress),)
+        outputs["by_position"] += (Term(lost, ("v", "x"), "symmetric", slope),)
+        outputs["by_velocity"] += (Term(lost, ("v", "v"), known=by_rate),)
+        outputs["by_theta"] += (Term(lost, ("v", "theta"), known=by_theta),)
+        outputs["by_position_skew"] = (Term(lost, ("v", "x"), "skew", slope),)
+    return kernel_of("linearisation", point, outputs)
 
 
 def curvature_kernel(element: Element, law: Law) -> PointKernel:
     """Second derivatives of φ = wᵀ f(x, v; θ), and ∂φ/∂θ, which the chain rule needs.
 
-    ∂²φ/∂v² vanishes and ∂²φ/∂x∂v (Rayleigh: −γ_r D_wK) is symmetric, so two lower triangles hold
-    the position–velocity part.
+    ∂²φ/∂v² vanishes. ∂²φ/∂x∂v is symmetric where the force follows from a potential (Rayleigh:
+    −γ_r D_wK).
     """
     point = Point.of(element, law.constants, "x", "v", "w")
-    derivatives = {
-        "position_position": ("x", "x"),
-        "position_velocity": ("x", "v"),
-        "position_theta": ("x", "theta"),
-        "velocity_theta": ("v", "theta"),
-        "theta_theta": ("theta", "theta"),
-        "gradient_theta": ("theta",),
+    power = -point.along_w(_potential(point, law))
+    if found := _stress(point, law):
+        power -= ca.dot(found[0], point.felt_weight)
+    mixed = Term(power, ("x", "v"), "symmetric" if found else "whole")
+    outputs: Outputs = {
+        "position_position": (Term(power, ("x", "x")),),
+        "position_velocity": (mixed,),
+        "position_theta": (Term(power, ("x", "theta")),),
+        "velocity_theta": (Term(power, ("v", "theta")),),
+        "theta_theta": (Term(power, ("theta", "theta")),),
+        "gradient_theta": (Term(power, ("theta",)),),
     }
-    return kernel_of("curvature", point, -point.along_w(_potential(point, law)), derivatives)
+    if found:
+        outputs["position_velocity_skew"] = (replace(mixed, part="skew"),)
+    return kernel_of("curvature", point, outputs)
 
 
 KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {

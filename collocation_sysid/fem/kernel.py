@@ -131,6 +131,11 @@ def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
     return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
 
 
+def mirrored(matrix: ca.SX) -> ca.SX:
+    """A matrix that is known to be symmetric, half of which need not be computed."""
+    return ca.tril2symm(ca.tril(ca.densify(matrix)))
+
+
 def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
     if how == "none":
         return output

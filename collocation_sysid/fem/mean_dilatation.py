@@ -17,8 +17,9 @@ fixed s, and with Γ = Σ_q ∂g/∂m
         + ∂s/∂α [∂n/∂s (Σ_q ∂²g/∂m²) ∂n/∂s + Γ ∂²n/∂s²] ∂s/∂β + Γ ∂n/∂s ∂²s/∂α∂β   of the second.
 
 So two phases go before the last, for s and for Γ. The node vectors coupled are ∂s/∂x and
-Σ_q ∂²g/∂x∂m; those by v are among them, since what of s is a rate along v changes with v as that
-which it is the rate of changes with x.
+Σ_q ∂²g/∂x∂m; those of s by v are among them, since what of s is a rate along v changes with v as
+that which it is the rate of changes with x. Of a g that is an energy, or its derivative along v,
+those by v are too; of a dissipation function Σ_q ∂²g/∂v∂m is another one.
 
 Of an element only the mean dilatation and the 4 · 5 distortions at its points are resisted: alone,
 it does not resist the three conformal motions that leave its volume as it is. Four elements whose
@@ -32,68 +33,73 @@ from functools import cached_property
 
 import casadi as ca
 
-from .kernel import PointKernel
-from .point import By, Pieces, Point, contraction_of, mirrored
+from .kernel import PointKernel, mirrored
+from .point import By, Outputs, Pieces, Point, Term
 
 
-def averaging_kernel(
-    name: str, point: Point, scalar: ca.SX, derivatives: dict[str, By]
-) -> PointKernel:
-    """The kernel of derivatives of a scalar that depends on `Point.stretches`."""
-    order = max(map(len, derivatives.values()))
-    chain = _Chain.of(point, scalar)
-    own: Pieces = {key: (contraction_of(by), chain.piece(by)) for key, by in derivatives.items()}
-    slopes: Pieces = {"slopes": ("none", chain.by_stretch)} if order else {}
-    sums = ca.vertcat(chain.volume, chain.volumes)
-    earlier = [point.phase("volumes", chain.first(order))]
+def averaging_kernel(name: str, point: Point, outputs: Outputs) -> PointKernel:
+    """The kernel of derivatives of scalars that depend on `Point.stretches`."""
+    shape = _Shape.of(point)
+    chains = _chains(shape, outputs)
+    order = max(len(term.by) for terms in outputs.values() for term in terms)
+    own: Pieces = {}
+    for key, terms in outputs.items():
+        found = [term.of(chains[id(term.scalar)].piece(term.by)) for term in terms]
+        own[key] = terms[0].contraction, sum(found[1:], found[0])
+    slopes: Pieces = {}
+    if order:
+        slopes = {chain.key("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
+    sums = ca.vertcat(shape.volume, shape.volumes)
+    earlier = [point.phase("volumes", shape.first(order))]
     coupled = slopes
     if order > 1:
-        earlier.append(point.phase("slopes", chain.at_sums(slopes), sums))
-        sums = ca.vertcat(sums, chain.slopes)
-        coupled = chain.second()
-    last = point.phase(name, chain.at_sums(own | coupled), sums)
+        earlier.append(point.phase("slopes", shape.at_sums(slopes), sums))
+        sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
+        coupled = {key: p for chain in chains.values() for key, p in chain.second().items()}
+    last = point.phase(name, shape.at_sums(own | coupled), sums)
     return PointKernel(
         last.pieces,
         tuple(point.fields),
         {key: last.contractions[key] for key in own},
         tuple(earlier),
         {key: last.contractions[key] for key in coupled},
-        chain.coupling(derivatives, order) if order else None,
+        _coupling(shape, chains, outputs, order) if order else None,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Chain:
-    """A scalar g in the symbols of a point; V, s and Γ as symbols of sums; σ; and n of σ."""
+class _Shape:
+    """What stretches a point: V and s as symbols of sums, σ, and n of σ."""
 
     point: Point
-    scalar: ca.SX
     volume: ca.SX
     volumes: ca.SX
-    slopes: ca.SX
     own_volumes: ca.SX
 
     @classmethod
-    def of(cls, point: Point, scalar: ca.SX) -> _Chain:
-        count = len(point.stretches)
+    def of(cls, point: Point) -> _Shape:
         F, *rates = point.gradients.values()
         own = point.volume * ca.det(ca.reshape(F, 3, 3))
         for rate in rates:
             own = ca.vertcat(own, ca.jtimes(own, F, rate))
-        s, slopes = ca.SX.sym("volumes", count), ca.SX.sym("slopes", count)
-        return cls(point, scalar, ca.SX.sym("volume"), s, slopes, own)
+        return cls(point, ca.SX.sym("volume"), ca.SX.sym("volumes", len(point.stretches)), own)
 
-    @cached_property
-    def by_stretch(self) -> ca.SX:
-        """∂g/∂m."""
-        return ca.gradient(self.scalar, self._stretches)
+    @property
+    def stretches(self) -> ca.SX:
+        """m."""
+        return ca.vertcat(*self.point.stretches)
+
+    @property
+    def count(self) -> int:
+        """Number of s."""
+        return self.volumes.numel()
 
     def at_sums(self, pieces: Pieces) -> Pieces:
         """Pieces with m put in."""
         m = _stretches(self.volumes, self.volume)
         m -= _stretches(self.own_volumes, self.point.volume)
         return {
-            key: (how, ca.substitute(piece, self._stretches, m))
+            key: (how, ca.substitute(piece, self.stretches, m))
             for key, (how, piece) in pieces.items()
         }
 
@@ -104,106 +110,170 @@ class _Chain:
             "volumes": ("none", self.own_volumes),
         }
         if order:
-            sums["volumes_by_x"] = "nodes", self._own_by("x").T
+            sums["volumes_by_x"] = "nodes", self.own_by("x").T
         return sums
 
-    def second(self) -> Pieces:
-        """Σ_q of what couples in second derivatives besides: ∂²g by (m, m), (m, θ) and (x, m)."""
-        by_theta = ca.jacobian(self.by_stretch, self.point.theta)
-        by_m = (self._lifted("x").T @ self._hessian("x"))[:, 9:]
-        return {
-            "second": ("none", ca.vec(self._hessian("x")[9:, 9:])),
-            "slopes_by_theta": ("none", ca.vec(by_theta)),
-            "slopes_by_x": ("nodes", by_m),
-        }
-
-    def piece(self, by: By) -> ca.SX:
-        """A derivative at fixed s, and Γ ∂n/∂s ∂²σ/∂α∂β."""
-        nodal = [field for field in by if field != "theta"]
-        if not nodal:
-            return self.point.derivative(self.scalar, by)
-        if len(nodal) == 1:
-            gradient = ca.gradient(self.scalar, self.point.gradients[nodal[0]])
-            gradient += (self._lifted(nodal[0])[9:, :]).T @ self.by_stretch
-            return gradient if len(by) == 1 else ca.jacobian(gradient, self.point.theta)
-        alpha, beta = nodal
-        weights = ca.SX.sym("weights", self.volumes.numel())
-        by_s, _ = _slopes(self.volumes, self.volume, self.slopes)
-        by_own, bent_by_own = _slopes(self.own_volumes, self.point.volume, self.by_stretch)
-        bent = ca.jacobian(
-            ca.gradient(ca.dot(weights, self.own_volumes), self.point.gradients[alpha]),
-            self.point.gradients[beta],
-        )
-        weighed = by_s.T @ self.slopes - by_own.T @ self.by_stretch
-        return mirrored(
-            self._lifted(alpha).T @ self._hessian(beta) @ self._lifted(beta)
-            - self._own_by(alpha).T @ bent_by_own @ self._own_by(beta)
-            + ca.substitute(bent, weights, weighed)
-        )
-
-    def coupling(self, derivatives: dict[str, By], order: int) -> ca.Function:
-        """C or D of each derivative; see `kernel`."""
-        count, constants = self.volumes.numel(), self.point.theta.numel()
-        second = ca.SX.sym("second", count, count)
-        by_theta = ca.SX.sym("slopes_by_theta", count, constants)
-        sums = [self.volume, self.volumes, self.slopes]
-        if order > 1:
-            sums += [ca.vec(second), ca.vec(by_theta)]
-        by_s, bent = _slopes(self.volumes, self.volume, self.slopes)
-        couplings = []
-        for by in derivatives.values():
-            if contraction_of(by) == "none":
-                couplings.append(ca.SX(0, 0))
-                continue
-            as_x = self._as_by_x(by[-1] if by[-1] != "theta" else by[0])
-            by_field = by_s @ as_x
-            if contraction_of(by) == "pairs":
-                own = (by_s.T @ second @ by_s + bent) @ as_x
-                couplings.append(ca.blockcat([[own, by_field.T], [by_field, ca.SX(count, count)]]))
-            else:
-                slopes = by_theta if len(by) > 1 else self.slopes
-                rest = ca.SX(count if order > 1 else 0, slopes.shape[1])
-                couplings.append(ca.vertcat(by_field.T @ slopes, rest))
-        return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(derivatives))
-
-    @property
-    def _stretches(self) -> ca.SX:
-        return ca.vertcat(*self.point.stretches)
-
-    def _own_by(self, field: str) -> ca.SX:
+    def own_by(self, field: str) -> ca.SX:
         """∂σ by F or its like."""
         return ca.jacobian(self.own_volumes, self.point.gradients[field])
 
-    def _lifted(self, field: str) -> ca.SX:
-        """∂(F, m)/∂F at fixed s, or its like for another field."""
-        by_own, _ = _slopes(self.own_volumes, self.point.volume, self.by_stretch)
-        return ca.vertcat(ca.SX.eye(9), -by_own @ self._own_by(field))
-
-    def _hessian(self, field: str) -> ca.SX:
-        """∂²g by (F, m), and (F, m) or its like for another field."""
+    def as_by_x(self, field: str) -> ca.SX:
+        """∂s/∂field = this ∂s/∂x."""
         if field == "x":
-            return self._hessian_by_x
-        rate = self.point.gradients[field]
-        return ca.horzcat(
-            ca.vertcat(
-                self.point.derivative(self.scalar, ("x", field)),
-                ca.jacobian(self.by_stretch, rate),
-            ),
-            self._hessian_by_x[:, 9:],
-        )
+            return ca.SX.eye(self.count)
+        # Every second one is the rate of the one before.
+        rates = [ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (self.count // 2)
+        return ca.diagcat(*rates)
+
+
+@dataclass(frozen=True, eq=False)
+class _Chain:
+    """A scalar g in the symbols of a point, and Γ as a symbol of sums.
+
+    `fields` are those whose Σ_q ∂²g/∂field∂m are coupled.
+    """
+
+    shape: _Shape
+    scalar: ca.SX
+    number: int
+    slopes: ca.SX
+    fields: tuple[str, ...]
+
+    def key(self, name: str) -> str:
+        """The name of a sum that is this scalar's."""
+        return f"{name}_{self.number}"
 
     @cached_property
-    def _hessian_by_x(self) -> ca.SX:
-        inputs = ca.vertcat(self.point.gradients["x"], self._stretches)
-        return mirrored(ca.jacobian(ca.gradient(self.scalar, inputs), inputs))
+    def by_stretch(self) -> ca.SX:
+        """∂g/∂m."""
+        return ca.gradient(self.scalar, self.shape.stretches)
 
-    def _as_by_x(self, field: str) -> ca.SX:
-        """∂s/∂field = this ∂s/∂x."""
-        count = self.volumes.numel()
-        if field == "x":
-            return ca.SX.eye(count)
-        # Every second one is the rate of the one before.
-        return ca.diagcat(*[ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (count // 2))
+    def second(self) -> Pieces:
+        """Σ_q of what couples in second derivatives: ∂²g by (m, m), (m, θ) and (field, m)."""
+        by_m = ca.jacobian(self.by_stretch, self.shape.stretches)
+        pieces: Pieces = {
+            self.key("second"): ("none", ca.vec(mirrored(by_m))),
+            self.key("slopes_by_theta"): (
+                "none",
+                ca.vec(ca.jacobian(self.by_stretch, self.shape.point.theta)),
+            ),
+        }
+        for field in self.fields:
+            slopes = (self._lifted(field).T @ self._hessian(field, "x"))[:, 9:]
+            pieces[self.key(f"slopes_by_{field}")] = "nodes", slopes
+        return pieces
+
+    def piece(self, by: By) -> ca.SX:
+        """A derivative at fixed s, and Γ ∂n/∂s ∂²σ/∂α∂β."""
+        shape, point = self.shape, self.shape.point
+        nodal = [field for field in by if field != "theta"]
+        if not nodal:
+            return point.derivative(self.scalar, by)
+        if len(nodal) == 1:
+            gradient = ca.gradient(self.scalar, point.gradients[nodal[0]])
+            gradient += (self._lifted(nodal[0])[9:, :]).T @ self.by_stretch
+            return gradient if len(by) == 1 else ca.jacobian(gradient, point.theta)
+        alpha, beta = nodal
+        weights = ca.SX.sym("weights", shape.count)
+        by_s, _ = _slopes(shape.volumes, shape.volume, self.slopes)
+        by_own, bent_by_own = _slopes(shape.own_volumes, point.volume, self.by_stretch)
+        bent = ca.jacobian(
+            ca.gradient(ca.dot(weights, shape.own_volumes), point.gradients[alpha]),
+            point.gradients[beta],
+        )
+        weighed = by_s.T @ self.slopes - by_own.T @ self.by_stretch
+        return (
+            self._lifted(alpha).T @ self._hessian(alpha, beta) @ self._lifted(beta)
+            - shape.own_by(alpha).T @ bent_by_own @ shape.own_by(beta)
+            + ca.substitute(bent, weights, weighed)
+        )
+
+    def _lifted(self, field: str) -> ca.SX:
+        """∂(F, m)/∂F at fixed s, or its like for another field."""
+        by_own, _ = _slopes(self.shape.own_volumes, self.shape.point.volume, self.by_stretch)
+        return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.own_by(field))
+
+    def _hessian(self, alpha: str, beta: str) -> ca.SX:
+        """∂²g by (F, m) or its like for another field, twice."""
+        gradients = self.shape.point.gradients
+        first, second = (ca.vertcat(gradients[f], self.shape.stretches) for f in (alpha, beta))
+        found = ca.jacobian(ca.gradient(self.scalar, first), second)
+        return mirrored(found) if alpha == beta else found
+
+
+def _chains(shape: _Shape, outputs: Outputs) -> dict[int, _Chain]:
+    """Those of the scalars that have outputs, by their identity."""
+    terms = [term for those in outputs.values() for term in those]
+    chains: dict[int, _Chain] = {}
+    for term in terms:
+        if id(term.scalar) not in chains:
+            number = len(chains)
+            parts = {other.part for other in terms if other.scalar is term.scalar}
+            # Where all is symmetric, what is by v is among what is by x.
+            fields = ("x",) if parts == {"whole"} else ("x", "v")
+            slopes = ca.SX.sym(f"slopes_{number}", shape.count)
+            chains[id(term.scalar)] = _Chain(shape, term.scalar, number, slopes, fields)
+    return chains
+
+
+def _coupling(
+    shape: _Shape, chains: dict[int, _Chain], outputs: Outputs, order: int
+) -> ca.Function:
+    """C or D of each output; see `kernel`."""
+    count, constants = shape.count, shape.point.theta.numel()
+    sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
+    blocks, seconds, by_thetas = {"volumes": slice(0, count)}, {}, {}
+    if order > 1:
+        for key, chain in chains.items():
+            seconds[key] = ca.SX.sym("second", count, count)
+            by_thetas[key] = ca.SX.sym("slopes_by_theta", count, constants)
+            sums += [ca.vec(seconds[key]), ca.vec(by_thetas[key])]
+            for field in chain.fields:
+                first = count * len(blocks)
+                blocks[chain.key(field)] = slice(first, first + count)
+    size = count * len(blocks)
+    couplings = []
+    for terms in outputs.values():
+        total = ca.SX(0, 0)
+        if terms[0].contraction != "none":
+            own = terms[0].by.count("theta") and constants or 1
+            total = ca.SX(size, size if terms[0].contraction == "pairs" else own)
+        for term in terms:
+            chain = chains[id(term.scalar)]
+            by_s, bent = _slopes(shape.volumes, shape.volume, chain.slopes)
+            if term.contraction == "nodes":
+                slopes = by_thetas[id(term.scalar)] if len(term.by) > 1 else chain.slopes
+                total[:count, :] += (by_s @ shape.as_by_x(term.by[0])).T @ slopes
+            elif term.contraction == "pairs":
+                second = by_s.T @ seconds[id(term.scalar)] @ by_s + bent
+                total += _of_pair(shape, chain, blocks, size, term, by_s, second)
+        couplings.append(total)
+    return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs))
+
+
+def _of_pair(
+    shape: _Shape,
+    chain: _Chain,
+    blocks: dict[str, slice],
+    size: int,
+    term: Term,
+    by_s: ca.SX,
+    second: ca.SX,
+) -> ca.SX:
+    """D of a second derivative by two fields, or of its symmetric or skew part."""
+    alpha, beta = term.by
+    of_alpha, of_beta = shape.as_by_x(alpha), shape.as_by_x(beta)
+    here = blocks["volumes"]
+    found = ca.SX(size, size)
+    found[here, here] = of_alpha.T @ second @ of_beta
+    found[blocks[chain.key(alpha)], here] = by_s @ of_beta
+    if beta in chain.fields:
+        found[here, blocks[chain.key(beta)]] = of_alpha.T @ by_s.T
+    else:
+        found[here, blocks[chain.key(alpha)]] = of_beta.T @ by_s.T
+    if term.part == "whole":
+        return found
+    return (found + found.T if term.part == "symmetric" else found - found.T) / 2
 
 
 def _stretches(volumes: ca.SX, volume: ca.SX) -> ca.SX:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from ..arrays import Index
+from ..arrays import Array, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,3 +96,12 @@ def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index
     size = dofs.shape[1]
     local_columns, local_rows = np.triu_indices(size)
     return dofs, pattern.position(dofs[:, local_rows], dofs[:, local_columns])
+
+
+def in_ascending_order(cells: Index, geometry: Array) -> tuple[Index, Array]:
+    """Elements (E, nodes) and their geometry (E, q, 3·nodes + 1) with the nodes in order."""
+    order = np.argsort(cells, axis=1)
+    gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
+    sorted_gradients = np.take_along_axis(gradients, order[:, None, :, None], axis=2)
+    flat = sorted_gradients.reshape(*geometry.shape[:2], -1)
+    return np.take_along_axis(cells, order, axis=1), np.append(flat, geometry[..., -1:], axis=2)

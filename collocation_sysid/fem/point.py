@@ -3,14 +3,56 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 
 from .elements import Element
-from .kernel import Contraction, Phase, node_gradients
+from .kernel import Contraction, Phase, mirrored, node_gradients
 
 # A derivative of a scalar: by none, one or two of x, v and θ, θ last.
 By = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A derivative of a scalar, as a summand of an output.
+
+    Attributes
+    ----------
+    scalar : SX
+        In the symbols of a `Point`.
+    by : By
+    part : {"whole", "symmetric", "skew"}
+        Of a second derivative by fields; one that is taken whole is known to be symmetric.
+    known : SX, optional
+        The derivative by the fields' gradients, where nothing stretches, in a shorter form than
+        differentiation finds.
+    """
+
+    scalar: ca.SX
+    by: By
+    part: Literal["whole", "symmetric", "skew"] = "whole"
+    known: ca.SX | None = None
+
+    @property
+    def contraction(self) -> Contraction:
+        """What becomes of its piece: it has as many node indices as fields."""
+        hows: tuple[Contraction, ...] = ("none", "nodes", "pairs")
+        return hows[len(self.by) - self.by.count("theta")]
+
+    def of(self, piece: ca.SX) -> ca.SX:
+        """What is taken of the (9, 9) piece of a second derivative by fields, any other whole."""
+        if self.contraction != "pairs":
+            return piece
+        if self.part == "whole":
+            return mirrored(piece)
+        # Contracted in pairs, a piece gives the lower triangle of its transpose.
+        return mirrored((piece + piece.T) / 2) if self.part == "symmetric" else (piece.T - piece) / 2
+
+
+# The terms of each output.
+Outputs = dict[str, tuple[Term, ...]]
 # For each output its contraction, and its piece in the symbols of a `Point`.
 Pieces = dict[str, tuple[Contraction, ca.SX]]
 
@@ -74,6 +116,17 @@ class Point:
         """Its derivative along v."""
         return ca.vertcat(self.gradients["v"], *self.stretches[1:2])
 
+    @property
+    def felt_rate(self) -> ca.SX:
+        """The derivative along v of the deformation gradient that the material feels, (9,)."""
+        return ca.jtimes(ca.vec(self.felt), self.strain, self.strain_rate)
+
+    @property
+    def felt_weight(self) -> ca.SX:
+        """Its derivative along w."""
+        along = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
+        return ca.jtimes(ca.vec(self.felt), self.strain, along)
+
     def along_w(self, scalar: ca.SX) -> ca.SX:
         """Derivative of a scalar of x and v by x, along w."""
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
@@ -86,8 +139,7 @@ class Point:
             return scalar
         if len(inputs) < 2:
             return ca.jacobian(scalar, inputs[0]).T
-        found = ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
-        return mirrored(found) if contraction_of(by) == "pairs" else found
+        return ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
 
     def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """A phase of these pieces, which may depend on sums of earlier ones."""
@@ -108,14 +160,3 @@ class Point:
             name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
         )
         return Phase(function, {key: how for key, (how, _) in pieces.items()})
-
-
-def mirrored(matrix: ca.SX) -> ca.SX:
-    """A matrix that is known to be symmetric, half of which need not be computed."""
-    return ca.tril2symm(ca.tril(ca.densify(matrix)))
-
-
-def contraction_of(by: By) -> Contraction:
-    """What becomes of the piece of a derivative: it has as many node indices as fields."""
-    hows: tuple[Contraction, ...] = ("none", "nodes", "pairs")
-    return hows[len(by) - by.count("theta")]

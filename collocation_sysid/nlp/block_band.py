@@ -41,6 +41,7 @@ class Block:
     rows, columns : (e,) entries within the block
     source : (e,) position of each in the lower triangle; −1 where only constants go
     terms : sequence of Term
+    whole : (e,) position of each in both triangles, see `pattern.full`
     """
 
     offset: int
@@ -48,6 +49,7 @@ class Block:
     columns: Index
     source: Index
     terms: Sequence[Term]
+    whole: Index
 
 
 class BlockBand:
@@ -61,6 +63,8 @@ class BlockBand:
     blocks : sequence of Block
     top : int
         Rows above all blocks that every column has an entry in (0 … top − 1).
+    adds : bool
+        Whether `fill` adds to the values instead.
 
     Attributes
     ----------
@@ -69,7 +73,12 @@ class BlockBand:
     """
 
     def __init__(
-        self, columns: int, row_starts: Index, blocks: Sequence[Block], top: int = 0
+        self,
+        columns: int,
+        row_starts: Index,
+        blocks: Sequence[Block],
+        top: int = 0,
+        adds: bool = False,
     ) -> None:
         count = len(row_starts)
         blocks = sorted(blocks, key=lambda block: block.offset)
@@ -97,7 +106,7 @@ class BlockBand:
             [slab.top_positions + starts[t] for t, slab in enumerate(kinds)]
         )
         self._kinds = kinds
-        self._fill = make_combiner(_plan(kinds, starts[:-1], count))
+        self._fill = make_combiner(_plan(kinds, starts[:-1], count, adds))
 
     def positions(self, times: Index, offset: int, rows: Index, columns: Index) -> Index:
         """Positions in the values of entries of the blocks (t + offset, t), which must exist.
@@ -215,7 +224,7 @@ class CombinePlan:
     sources: NDArray[np.int32]
 
 
-def _plan(kinds: Sequence[_Slab], starts: Index, count: int) -> CombinePlan:
+def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> CombinePlan:
     targets, sources, maps = [], [], {}
     used = 0
     tasks, coefficients, first_task = [], [], [0]
@@ -233,7 +242,7 @@ def _plan(kinds: Sequence[_Slab], starts: Index, count: int) -> CombinePlan:
             active = [m for m in block.terms if m.a[t] != 0 or m.b[t] != 0]
             terms = [(m.a[t], m.b[t], t + m.shift) for m in active] or [(0.0, 0.0, 0)]
             for number, (a, b, row) in enumerate(terms):
-                tasks.append((starts[t], start, length, row, min(number, 1)))
+                tasks.append((starts[t], start, length, row, int(adds or number > 0)))
                 coefficients.append((a, b))
         first_task.append(len(tasks))
     return CombinePlan(

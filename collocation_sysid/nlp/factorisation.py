@@ -1,8 +1,10 @@
-"""Factorise symmetric matrices on the mesh graph, again and again with one pattern.
+"""Factorise matrices on the mesh graph, again and again with one pattern.
 
 Reverse Cuthill–McKee makes the mesh graph a narrow band; a banded Cholesky factorisation then
 also tells whether the matrix is positive definite. Indefinite matrices go to SuperLU, and so do
-all where its fill-in is estimated to cost less than the band.
+all where its fill-in is estimated to cost less than the band. What has a skew part besides, see
+`unsymmetric`, takes LU in the same band: where the symmetric part is positive definite and the
+skew one does not outweigh it, rows need no exchange, and it costs half as much again (measured).
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
@@ -21,7 +24,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ..arrays import Array, Index
 from ..fem.batched import in_slices
 from ..fem.pattern import SymmetricPattern
-from .lapack import cholesky_in_place
+from .lapack import cholesky_in_place, lu_in_place
 
 Choice = Literal["auto", "band", "sparse"]
 
@@ -30,7 +33,8 @@ Choice = Literal["auto", "band", "sparse"]
 BAND_SPEED = 10.0
 LITTLE_WORK = 1e8
 
-(_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
+_pbtrs, _gbtrs = get_lapack_funcs(("pbtrs", "gbtrs"), dtype=np.float64)
+NONE = np.zeros(0)
 
 
 class Factor(Protocol):
@@ -38,10 +42,10 @@ class Factor(Protocol):
 
     @property
     def positive_definite(self) -> bool:
-        """Whether the matrix is positive definite."""
+        """Whether the matrix, or its symmetric part, is positive definite."""
         ...
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array, transposed: bool = False) -> Array:
         """Solve for (k,) or (k, m) right-hand sides in the order of the free dofs."""
         ...
 
@@ -52,9 +56,25 @@ class _BandFactor:
     order: Index
     positive_definite: bool = True
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array, transposed: bool = False) -> Array:
         permuted = right[self.order]
         solved, _ = _pbtrs(self.band, permuted, lower=1)
+        result = np.empty_like(right)
+        result[self.order] = solved.reshape(right.shape)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _BandLU:
+    band: Array
+    exchanges: NDArray[np.int32]
+    order: Index
+    positive_definite: bool
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        width = (len(self.band) - 1) // 3
+        permuted = right[self.order]
+        solved, _ = _gbtrs(self.band, width, width, permuted, self.exchanges, trans=transposed)
         result = np.empty_like(right)
         result[self.order] = solved.reshape(right.shape)
         return result
@@ -65,8 +85,8 @@ class _SparseFactor:
     lu: SuperLU
     positive_definite: bool
 
-    def solve(self, right: Array) -> Array:
-        return self.lu.solve(right)
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        return self.lu.solve(right, "T" if transposed else "N")
 
 
 class Factoriser:
@@ -96,10 +116,13 @@ class Factoriser:
         low, high = np.minimum(rank[rows], rank[columns]), np.maximum(rank[rows], rank[columns])
         self.half_bandwidth = int((high - low).max(initial=0))
         self._band_places = low * (self.half_bandwidth + 1) + high - low
+        self._ranks = rank[rows], rank[columns]
         strict = rows != columns
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
         self._full_source = np.concatenate([self._kept, self._kept[strict]])
+        # Whether an entry has the skew part's own sign; none on the diagonal.
+        self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
         self._entries = pattern.entries
 
     @classmethod
@@ -117,10 +140,15 @@ class Factoriser:
 
     @property
     def numbers(self) -> int:
-        """Numbers that one factor holds."""
+        """Numbers that one factor of a symmetric matrix holds."""
         if self.banded:
             return self._size * (self.half_bandwidth + 1)
         return 3 * int(self._column_counts.sum())  # L, U, and their row numbers at half the size
+
+    @property
+    def unsymmetric_numbers(self) -> int:
+        """Numbers that one factor of another matrix holds."""
+        return self._size * (3 * self.half_bandwidth + 1) if self.banded else self.numbers
 
     @property
     def _sparse_work(self) -> float:
@@ -134,28 +162,51 @@ class Factoriser:
         values[self._full_source[self._full_rows == self._full_columns]] = degree
         return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
-    def factorise(self, values: Array) -> Factor:
-        """Factorise the matrix with (m,) lower-triangle values.
+    def factorise(self, values: Array, skew: Array = NONE) -> Factor:
+        """Factorise the matrix with (m,) lower-triangle values, and those of a skew part.
 
         Raises
         ------
         numpy.linalg.LinAlgError
             If the matrix is singular or not finite.
         """
-        if not np.isfinite(values).all():
+        if not (np.isfinite(values).all() and np.isfinite(skew).all()):
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
         if not self.banded:
-            return self._sparse(values)
+            return self._sparse(values, skew)
+        if skew.any():
+            return self._band_lu(values, skew)
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
         band.T.reshape(-1)[self._band_places] = values[self._kept]
         if cholesky_in_place(band):
             return _BandFactor(band, self._order)
         return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
 
+    def _band_lu(self, values: Array, skew: Array) -> Factor:
+        band = np.zeros((3 * self.half_bandwidth + 1, self._size), order="F")
+        entries = band.T.reshape(-1)
+        lower, upper = self._lu_places
+        entries[upper] = values[self._kept] - skew[self._kept]
+        entries[lower] = values[self._kept] + skew[self._kept]
+        exchanges = lu_in_place(band)
+        if exchanges is None:
+            raise np.linalg.LinAlgError("the matrix is singular")
+        if (exchanges == np.arange(1, self._size + 1)).all():
+            definite = bool((band[2 * self.half_bandwidth] > 0).all())
+        else:
+            definite = self.factorise(values).positive_definite
+        return _BandLU(band, exchanges - 1, self._order, definite)
+
+    @cached_property
+    def _lu_places(self) -> tuple[Index, Index]:
+        """Where an entry of the lower triangle and its mirror image are in the band of LU."""
+        (i, j), width = self._ranks, self.half_bandwidth
+        return j * (3 * width + 1) + 2 * width + i - j, i * (3 * width + 1) + 2 * width + j - i
+
     def factorise_each(
-        self, matrix: Callable[[int], Array], count: int, threads: int
+        self, matrix: Callable[[int], tuple[Array, Array]], count: int, threads: int
     ) -> list[Factor]:
-        """Factorise `count` matrices, side by side on threads; matrix(k) gives values (m,).
+        """Factorise `count` matrices, side by side on threads; matrix(k) gives both parts' values.
 
         Raises
         ------
@@ -166,21 +217,25 @@ class Factoriser:
 
         def run(start: int, stop: int) -> None:
             for k in range(start, stop):
-                factors[k] = self.factorise(matrix(k))
+                factors[k] = self.factorise(*matrix(k))
 
         in_slices(run, count, threads)
         return [factors[k] for k in range(count)]
 
-    def _sparse(self, values: Array) -> Factor:
-        lu = self._superlu(values, pivot_below=0.0)
+    def _sparse(self, values: Array, skew: Array) -> Factor:
+        lu = self._superlu(values, pivot_below=0.0, skew=skew)
         if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
             return _SparseFactor(lu, positive_definite=True)
         # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
-        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
+        lu = self._superlu(values, pivot_below=0.1, skew=skew)
+        return _SparseFactor(lu, positive_definite=False)
 
-    def _superlu(self, values: Array, pivot_below: float) -> SuperLU:
+    def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
+        entries = values[self._full_source]
+        if skew.size:
+            entries += self._signs * skew[self._full_source]
         matrix = sp.csc_array(
-            (values[self._full_source], (self._full_rows, self._full_columns)),
+            (entries, (self._full_rows, self._full_columns)),
             shape=(self._size, self._size),
         )
         try:

@@ -138,12 +138,13 @@ class _Step:
         """c_t."""
         return self._balanced(self.force(x), x)
 
-    def linearise(self, x: Array) -> tuple[Array, Array]:
-        """c_t and the lower triangle of −∂c_t/∂x_t."""
+    def linearise(self, x: Array) -> tuple[Array, Array, Array]:
+        """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
         body = self.dynamics.body
         at = body.linearise(*self._states(x), self.theta, dof_mass=self.damped)
         matrix = self.row.block(at.by_position[0], at.by_velocity[0], body.pattern)
-        return self._balanced(at.force[0] + self.load, x), matrix
+        skew = self.row.skew_block(at.by_position_skew[0])
+        return self._balanced(at.force[0] + self.load, x), matrix, skew
 
 
 def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: Array) -> Array:

@@ -129,12 +129,12 @@ class _Stepper:
             v, a = kinematics(x)
             return body.force(x, v, theta, mass)[0] + load - mass * a
 
-        def linearise(x: Array) -> tuple[Array, Array]:
+        def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
             at = body.linearise(x, v, theta, dof_mass=mass)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
             matrix[body.pattern.diagonal] += slope**2 * mass
-            return at.force[0] + load - mass * a, matrix
+            return at.force[0] + load - mass * a, matrix, -at.by_position_skew[0]
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         guess[solver.held] = x_held

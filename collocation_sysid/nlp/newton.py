@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,7 +17,8 @@ from .factorisation import Factor, Factoriser
 from .stopwatch import Stopwatch
 
 Residual = Callable[[Array], Array]
-Linearise = Callable[[Array], tuple[Array, Array]]
+# Residual, and the lower triangles of the symmetric and the skew part of its slope's negative.
+Linearise = Callable[[Array], tuple[Array, Array, Array]]
 T = TypeVar("T")
 
 
@@ -101,12 +102,13 @@ class Solver:
         Parameters
         ----------
         residual : x -> (3n,)
-        linearise : x -> residual (3n,) and lower triangle (m,) of −∂r/∂x
+        linearise : x -> residual (3n,), and lower triangles (m,) of the symmetric and, (m,) or (0,),
+            the skew part of −∂r/∂x
         """
         x = x.copy()
         self._require_upright(x)
         tolerance = self.options.tolerance * self._size_m
-        value, matrix = self._timed(linearise, x)
+        value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         for _ in range(self.options.iterations):
             step = factor.solve(value[self.free])
@@ -134,13 +136,13 @@ class Solver:
             if self.is_upright(trial):
                 # A whole step is mostly taken: it is evaluated with its derivatives at once.
                 if share == 1:
-                    value, matrix = self._timed(linearise, trial)
+                    value, *matrix = self._timed(linearise, trial)
                 else:
                     value, matrix = self._timed(residual, trial), None
                 next_step = factor.solve(value[self.free])
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                     if matrix is None:
-                        value, matrix = self._timed(linearise, trial)
+                        value, *matrix = self._timed(linearise, trial)
                     try:
                         return trial, self._factorise(matrix, trial, keep_definite), value
                     except NewtonFailure:
@@ -148,10 +150,10 @@ class Solver:
             share /= 2
         raise NewtonFailure(x, "no step along Newton's direction makes progress")
 
-    def _factorise(self, matrix: Array, x: Array, keep_definite: bool) -> Factor:
+    def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
         try:
             with self.stopwatch.solving():
-                factor = self.factoriser.factorise(matrix)
+                factor = self.factoriser.factorise(*matrix)
         except np.linalg.LinAlgError as error:
             raise NewtonFailure(x, f"the equations are singular: {error}") from error
         if keep_definite and not factor.positive_definite:

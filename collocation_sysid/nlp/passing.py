@@ -23,6 +23,7 @@ class _Dropped:
     positions: Index
     evaluation: int
     source: Index
+    whole: Index  # the same in both triangles, as `unsymmetric.skew_values` has them
     a: float
     b: float
 
@@ -60,11 +61,16 @@ class PassingGrasps:
         dropped = tuple(_dropped(dynamics, band, pattern, place, scale))
         return cls(dropped, zeros, np.concatenate([nothing, *ones]))
 
-    def correct(self, values: Array, by_position: Array, by_velocity: Array) -> None:
-        """Correct the values in place; G and C are (evaluations, m) lower triangles."""
+    def correct(self, values: Array, by_position: Array, by_velocity: Array, skew: Array) -> None:
+        """Correct the values in place.
+
+        G and C are (evaluations, m) lower triangles; `skew` has the entries of G's skew part.
+        """
         for gone in self.dropped:
             force = gone.a * by_position[gone.evaluation, gone.source]
             values[gone.positions] -= force + gone.b * by_velocity[gone.evaluation, gone.source]
+            if skew.size:
+                values[gone.positions] -= gone.a * skew[gone.evaluation, gone.whole]
         values[self.zeros] = 0.0
         values[self.ones] = 1.0
 
@@ -87,7 +93,6 @@ def _dropped(
                     positions = band.positions(
                         np.array([k - i]), i + j, place[rows[kept]], columns[kept]
                     )
-                    found.append(
-                        _Dropped(positions.ravel(), k - dynamics.first_row, source[kept], a, b)
-                    )
+                    here = positions.ravel(), k - dynamics.first_row
+                    found.append(_Dropped(*here, source[kept], kept, a, b))
     return found

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
+from .factorisation import NONE
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, Solver, simulation_error
 
@@ -41,9 +42,10 @@ def rest_state(
         def residual(state: Array) -> Array:
             return body.force(state, still, theta)[0] + share * load
 
-        def linearise(state: Array) -> tuple[Array, Array]:
+        def linearise(state: Array) -> tuple[Array, Array, Array]:
+            # Nothing moves: there is no skew part.
             forces = body.linearise(state, still, theta)
-            return forces.force[0] + share * load, -forces.by_position[0]
+            return forces.force[0] + share * load, -forces.by_position[0], NONE
 
         moved = x.copy()
         moved[solver.held] = _on_the_way(experiment, carried, at_s, share).ravel()[solver.held]

@@ -58,6 +58,10 @@ class Row:
         values[pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
+    def skew_block(self, by_position_skew: Array) -> Array:
+        """Lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t from that of G."""
+        return -self.w[0] * self.p[0] * by_position_skew
+
 
 def weighted(coefficients: Array, past: Iterable[Array], shape: tuple[int, ...]) -> Array:
     """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""

@@ -30,6 +30,7 @@ from .passing import PassingGrasps
 from .row import Row
 from .schemes import Scheme
 from .setting import Setting
+from .unsymmetric import adding_skew, skew_values
 
 T = TypeVar("T", bound=np.generic)
 
@@ -349,6 +350,14 @@ class Segment:
     @cached_property
     def jacobian(self) -> BlockBand:
         """Structure of ∂c/∂x; row numbers count within the segment."""
+        return BlockBand(self.dofs, self._row_starts(), self._jacobian_blocks())
+
+    @cached_property
+    def _skew_jacobian(self) -> BlockBand:
+        """The same, to add the skew part of ∂F/∂x to it."""
+        return adding_skew(self.dofs, self._row_starts(), self._jacobian_blocks())
+
+    def _jacobian_blocks(self) -> list[Block]:
         rows, columns, source = self.body.pattern.full
         row_place = np.full(self.dofs, -1)
         row_place[self.row_dofs] = np.arange(self.rows_per_time)
@@ -371,8 +380,9 @@ class Segment:
             if lag == 0 and self.grasps_have_rows:
                 kept |= ~free[rows] & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
-            blocks.append(Block(lag, row_place[rows[kept]], columns[kept], source[kept], terms))
-        return BlockBand(self.dofs, self._row_starts(), blocks)
+            entries = row_place[rows[kept]], columns[kept], source[kept]
+            blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
+        return blocks
 
     @cached_property
     def _jacobian_constants(self) -> tuple[Index, Array, Index]:
@@ -425,7 +435,10 @@ class Segment:
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
         positions, inertia, grasps = self._jacobian_constants
         values[positions] += inertia
-        self._passing.correct(values, forces.by_position, forces.by_velocity)
+        skew = skew_values(self.body.pattern, forces.by_position_skew)
+        if skew.size:
+            self._skew_jacobian.fill(values, skew, skew, self.body.threads)
+        self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
         values[grasps] = 1.0
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
         weighed = dynamics.weighed_kg[dynamics.first_row :]
@@ -453,16 +466,31 @@ class Segment:
 
         The nq rows of q stand above the rows of x.
         """
+        return BlockBand(self.dofs, self._hessian_starts, self._hessian_blocks(), top=self.nq)
+
+    @cached_property
+    def _skew_hessian(self) -> BlockBand:
+        """The same, to add what the skew part of ∂²φ/∂x∂v gives."""
+        blocks = self._hessian_blocks(skew=True)
+        return adding_skew(self.dofs, self._hessian_starts, blocks, top=self.nq)
+
+    @property
+    def _hessian_starts(self) -> Index:
+        return self.nq + np.arange(self.grid_rows) * self.dofs
+
+    def _hessian_blocks(self, skew: bool = False) -> list[Block]:
         rows, columns, source = self.body.pattern.full
         blocks = []
         for distance in range(self.dynamics.reach + 1):
             terms = list(self._curvature_terms(distance))
             if distance > 0 and not terms:
                 continue
+            if skew:
+                terms = list(self._skew_terms(distance))
             kept = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
-            blocks.append(Block(-distance, rows[kept], columns[kept], source[kept], terms))
-        starts = self.nq + np.arange(self.grid_rows) * self.dofs
-        return BlockBand(self.dofs, starts, blocks, top=self.nq)
+            entries = rows[kept], columns[kept], source[kept]
+            blocks.append(Block(-distance, *entries, terms, np.flatnonzero(kept)))
+        return blocks
 
     def _curvature_terms(self, distance: int) -> Iterator[Term]:
         """Terms of ∂²φ/∂x_{t−distance}∂x_t, from evaluations k = t + i."""
@@ -476,6 +504,16 @@ class Segment:
             xv = scale * (t.p[:, i] * t.q[:, other] + t.q[:, i] * t.p[:, other]) / step
             if xx.any() or xv.any():
                 yield Term(i - first, _ahead(xx, i), _ahead(xv, i))
+
+    def _skew_terms(self, distance: int) -> Iterator[Term]:
+        """The same of the skew part of ∂²φ/∂x∂v."""
+        t, first = self.dynamics.tables, self.dynamics.first_row
+        scale = self.length_m**2 / self.dynamics.step_s
+        for i in range(self.dynamics.reach + 1 - distance):
+            other = i + distance
+            skew = scale * (t.p[:, other] * t.q[:, i] - t.q[:, other] * t.p[:, i])
+            if skew.any():
+                yield Term(i - first, _ahead(skew, i), np.zeros(len(skew)))
 
     def hessian_values(
         self,
@@ -517,6 +555,9 @@ class Segment:
         band.fill(
             of_band, curvature.position_position, curvature.position_velocity, self.body.threads
         )
+        skew = skew_values(self.body.pattern, curvature.position_velocity_skew)
+        if skew.size:
+            self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
         mixed = np.zeros((2, self.grid_rows, self.dofs, self.nq))
         mixed[0, first:] = curvature.position_theta @ setting.theta_q
         mixed[1, first:] = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)

@@ -26,12 +26,13 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from .factorisation import Choice, Factor, Factoriser
+from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .row import Row, weighted
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
+from .unsymmetric import signs_by_column, signs_by_row
 
 # Element results and factors of this size at most are kept at a time.
 CHUNK_BYTES = 128e6
@@ -78,7 +79,7 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One timestep's F, G, C (lower triangles), ∂F/∂θ, and −∂c_t/∂x_t factorised."""
+    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, and G's skew part."""
 
     t: int
     force: Array
@@ -86,6 +87,7 @@ class _Step:
     by_velocity: Array
     by_theta: Array
     factor: Factor
+    skew: Array
 
 
 class BlockSolver:
@@ -119,6 +121,7 @@ class BlockSolver:
         place[self.free] = np.arange(len(self.free))
         kept = (place[full_rows] >= 0) & (place[full_columns] >= 0)
         self._source = source[kept]
+        self._signs = signs_by_row(self.body.pattern)[kept]
         # Sorted by column; the matrices are symmetric, so that serves for rows as well.
         held = np.full(self.body.pattern.size, -1)
         held[segment.grasping.dofs] = np.arange(len(segment.grasping.dofs))
@@ -129,6 +132,7 @@ class BlockSolver:
         # Its data are their own numbers, in the order that compressing them gave.
         order = np.asarray(self._held.data, dtype=np.int64) - 1
         self._held_source = source[beside][order]
+        self._held_signs = signs_by_column(self.body.pattern)[beside][order]
         self._held = self._held.astype(float)
         counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
         indptr = np.concatenate([[0], np.cumsum(counts)])
@@ -236,13 +240,14 @@ class BlockSolver:
             p, q, w = row.p, row.q, row.w[0]
             by_position, by_velocity = None, None
             if known.any():
-                by_position = self.apply(step.by_position, known)
+                by_position = self.apply(step.by_position, known, -step.skew)
                 by_velocity = self.apply(step.by_velocity, known)
                 pulled[t] -= p[0] * by_position + q[0] * by_velocity
             # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left, and the factor is of its negative.
-            y[t] = -step.factor.solve(self.without_taken(t, pulled[t]))
+            right = self.without_taken(t, pulled[t])
+            y[t] = -step.factor.solve(right, transposed=True)
             force_weight = known + w * y[t]
-            by_position = self.apply(step.by_position, force_weight)
+            by_position = self.apply(step.by_position, force_weight, -step.skew)
             by_velocity = self.apply(step.by_velocity, force_weight)
             for i in lags:
                 if i > 0:
@@ -269,16 +274,22 @@ class BlockSolver:
 
     @property
     def _step_bytes(self) -> int:
-        return 8 * (self.body.linearisation_width + self.factoriser.numbers)
+        solver = self.factoriser
+        numbers = solver.unsymmetric_numbers if self.body.unsymmetric else solver.numbers
+        return 8 * (self.body.linearisation_width + numbers)
 
-    def apply(self, lower: Array, columns: Array) -> Array:
-        """Product of a symmetric matrix, given by its lower triangle, on the free dofs."""
+    def apply(self, lower: Array, columns: Array, skew: Array = NONE) -> Array:
+        """Product of a matrix, given by lower triangles of its two parts, on the free dofs."""
         self._matrix.data = lower[self._source]
+        if skew.size:
+            self._matrix.data += self._signs * skew[self._source]
         return self._matrix @ columns
 
-    def apply_held(self, lower: Array, columns: Array) -> Array:
+    def apply_held(self, lower: Array, columns: Array, skew: Array = NONE) -> Array:
         """Product (free, …) of its columns of grasped dofs, with `columns` (g, …)."""
         self._held.data = lower[self._held_source]
+        if skew.size:
+            self._held.data += self._held_signs * skew[self._held_source]
         return self._held @ columns
 
     def _steps(
@@ -305,19 +316,24 @@ class BlockSolver:
                     at.by_velocity[k],
                     at.by_theta[k],
                     factors[k],
+                    at.by_position_skew[k],
                 )
 
     def _factorise(self, at: Linearisation, rows: slice) -> list[Factor]:
         pattern, taken = self.body.pattern, self.dynamics.taken[rows]
 
-        def matrix(k: int) -> Array:
+        def matrix(k: int) -> tuple[Array, Array]:
             row = Row.of(self.dynamics, rows.start + k)
             values = row.block(at.by_position[k], at.by_velocity[k], pattern)
+            skew = row.skew_block(at.by_position_skew[k])
             if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
-                values[taken[k][pattern.rows] | taken[k][pattern.columns]] = 0
+                gone = taken[k][pattern.rows] | taken[k][pattern.columns]
+                values[gone] = 0
                 values[pattern.diagonal[taken[k]]] = size
-            return values
+                if skew.size:
+                    skew[gone] = 0
+            return values, skew
 
         try:
             return self.factoriser.factorise_each(matrix, len(at.force), self.body.threads)
@@ -396,7 +412,7 @@ class GivenMotion:
         moved = np.flatnonzero(position.any(axis=0) | velocity.any(axis=0))
         force = np.zeros((len(solver.free), position.shape[1]))
         if len(moved):
-            force[:, moved] = solver.apply_held(step.by_position, position[:, moved])
+            force[:, moved] = solver.apply_held(step.by_position, position[:, moved], step.skew)
             force[:, moved] += solver.apply_held(step.by_velocity, velocity[:, moved])
         return force
 
@@ -480,8 +496,9 @@ class _Forward:
         if len(lags) == 1:
             i = lags[0]
             block = p[i] * step.by_position + q[i] * step.by_velocity
-            return self.solver.apply(block, self.past[i])
+            return self.solver.apply(block, self.past[i], p[i] * step.skew)
         total = self.solver.apply(step.by_velocity, weighted(row.q, self.past, self.shape))
         if p.any():
-            total += self.solver.apply(step.by_position, weighted(row.p, self.past, self.shape))
+            past = weighted(row.p, self.past, self.shape)
+            total += self.solver.apply(step.by_position, past, step.skew)
         return total

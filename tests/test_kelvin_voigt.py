@@ -1,0 +1,193 @@
+"""Kelvin and Voigt's damping: objective, dissipative, and exact in every derivative."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from checks import assert_derivative, relative_error
+from materials_small import elastic, theta_for
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.elements import ELEMENTS
+from collocation_sysid.fem.materials import MATERIALS
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.unsymmetric import whole
+
+OBJECTIVE = [name for name in MATERIALS if name != "linear"]
+LENGTH_M = 0.03  # a large change of a position
+
+
+def of_a_user(F, lambda_pa, mu_pa):
+    """Stiffer than Neo-Hooke's when sheared."""
+    log_j, stretch = ca.log(ca.det(F)), ca.sumsqr(F) - 3
+    return 0.5 * lambda_pa * log_j**2 - mu_pa * log_j + mu_pa * (stretch / 2 + stretch**2 / 20)
+
+
+@cache
+def small_body(
+    material: str | Callable = "neo-hookean",
+    element: str = "tet4",
+    evaluator: str = "auto",
+    damping: str = "kelvin-voigt",
+) -> Body:
+    """Six elements, no two alike."""
+    mesh = box_mesh((0.10, 0.12, 0.09), (1, 1, 1))
+    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
+    mesh = TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
+    return Body(mesh, material, 30.0, element, damping=damping, evaluator=evaluator)
+
+
+def state(body: Body, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Positions some way from rest and any velocities, (1, 3n) each."""
+    x = body.nodes_m + rng.uniform(-0.004, 0.004, body.nodes_m.shape)
+    return x.reshape(1, -1), rng.standard_normal((1, x.size))
+
+
+def damping_force(body: Body, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """That of γ_r = 9 ms alone, (T, 3n)."""
+    theta = theta_for(body, 0.009, 0.0)
+    return body.force(x, v, theta) - body.force(x, np.zeros_like(v), theta)
+
+
+def times(body: Body, lower: np.ndarray, skew: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Product with a matrix of one state, given by symmetric and skew part."""
+    return (whole(body.pattern, lower, skew) @ vector.ravel())[None]
+
+
+# What the force is -----------------------------------------------------------------------------
+
+
+def test_stress_is_that_of_neo_hookes_tangent_in_the_material_frame(rng):
+    """P = γ_r F dS/dt, S = λ ln J C⁻¹ + μ (1 − C⁻¹), by the closed form of dS/dt."""
+    points = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
+    body = Body(TetMesh(points, np.array([[0, 1, 2, 3]])), density_kg_m3=30.0)
+    x, v = state(body, rng)
+    F, rate = ((f.reshape(4, 3)[1:] - f.reshape(4, 3)[0]).T / 0.1 for f in (x, v))
+    lame, shear, gamma = 200.0, 300.0, 0.009
+    C_inverse, C_rate = np.linalg.inv(F.T @ F), F.T @ rate + rate.T @ F
+    log_j = np.log(np.linalg.det(F))
+    S_rate = lame * 0.5 * np.trace(C_inverse @ C_rate) * C_inverse
+    S_rate += (shear - lame * log_j) * C_inverse @ C_rate @ C_inverse
+    stress = gamma * F @ S_rate
+    at_nodes = -body.mesh.volumes_m3[0] * stress / 0.1  # ∇N_a of the last three are e_a / 0.1
+    expected = np.vstack([-at_nodes.sum(axis=1), at_nodes.T])
+    assert relative_error(damping_force(body, x, v)[0].reshape(4, 3), expected) < 1e-12
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("material", [*OBJECTIVE, of_a_user])
+def test_a_superposed_rotation_turns_the_force_along_and_adds_none(material, element, rng):
+    """x → Rx, v → R(v + ω × x): the force turns by R, however fast the body spins."""
+    body = small_body(material, element, "casadi")
+    x, v = (field.reshape(-1, 3) for field in state(body, rng))
+    turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
+    spinning = v + np.cross([30.0, -20.0, 10.0], x)
+    found = damping_force(body, x @ turn.T, spinning @ turn.T).reshape(-1, 3)
+    assert relative_error(found, damping_force(body, x, v).reshape(-1, 3) @ turn.T) < 1e-9
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_forces_balance_and_exert_no_torque(element, rng):
+    body = small_body(element=element)
+    x, v = state(body, rng)
+    force = damping_force(body, x, v).reshape(-1, 3)
+    assert abs(force.sum(axis=0)).max() < 1e-12 * abs(force).sum()
+    torque = np.cross(x.reshape(-1, 3), force)
+    assert abs(torque.sum(axis=0)).max() < 1e-12 * abs(torque).sum()
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("material", [*MATERIALS, of_a_user])
+def test_undeformed_it_is_rayleighs(material, element, rng):
+    """So that damping ratios of small oscillations are the same."""
+    bodies = [
+        small_body(material, element, "casadi", law) for law in ("kelvin-voigt", "rayleigh")
+    ]
+    _, v = state(bodies[0], rng)
+    found, expected = (damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies)
+    assert relative_error(found, expected) < 1e-12
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("material", [*MATERIALS, of_a_user])
+def test_it_takes_energy_out_of_every_motion_near_rest(material, element, rng):
+    body = small_body(material, element, "casadi")
+    for _ in range(5):
+        x, v = state(body, rng)
+        assert (damping_force(body, 0.3 * x + 0.7 * body.nodes_m.reshape(1, -1), v) * v).sum() < 0
+
+
+def test_a_linear_body_stays_linear(rng):
+    kelvin, rayleigh = (small_body("linear", damping=law) for law in ("kelvin-voigt", "rayleigh"))
+    x, v = state(kelvin, rng)
+    assert relative_error(damping_force(kelvin, x, v), damping_force(rayleigh, x, v)) < 1e-12
+
+
+# Derivatives ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("evaluator", ["simd", "casadi"])
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("material", ["neo-hookean", "gent", of_a_user])
+def test_linearise_gives_the_slopes_of_the_force(material, element, evaluator, rng):
+    if (material, evaluator) == ("gent", "simd"):
+        pytest.skip("compiling takes long, and shows nothing that the others do not")
+    body = small_body(material, element, evaluator)
+    theta, (x, v) = theta_for(body), state(body, rng)
+    at = body.linearise(x, v, theta)
+    none = np.zeros(0)
+    by_x, by_v = (at.by_position[0], at.by_position_skew[0]), (at.by_velocity[0], none)
+    for point, slopes, scale, moved in (
+        (x, by_x, LENGTH_M, lambda x: body.force(x, v, theta)),
+        (v, by_v, 1.0, lambda v: body.force(x, v, theta)),
+    ):
+        assert_derivative(
+            moved, lambda d, m=slopes: times(body, *m, d), point, rng, scale=scale
+        )
+    assert_derivative(
+        lambda c: body.force(x, v, c), lambda d: at.by_theta @ d, theta, rng, scale=theta
+    )
+
+
+@pytest.mark.parametrize("evaluator", ["simd", "casadi"])
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_curvature_gives_the_slopes_of_the_weighted_slopes(element, evaluator, rng):
+    body = small_body("neo-hookean", element, evaluator)
+    theta, (x, v), (_, w) = theta_for(body), state(body, rng), state(body, rng)
+    at = body.curvature(x, v, w, theta)
+    none = np.zeros(0)
+
+    def by_position(x, v, theta):
+        found = body.linearise(x, v, theta)
+        return times(body, found.by_position[0], -found.by_position_skew[0], w)  # transposed
+
+    def by_velocity(x, v, theta):
+        return times(body, body.linearise(x, v, theta).by_velocity[0], none, w)
+
+    xx, xv, skew = (
+        m[0] for m in (at.position_position, at.position_velocity, at.position_velocity_skew)
+    )
+    cases: list[tuple] = [
+        (x, LENGTH_M, lambda x: by_position(x, v, theta), lambda d: times(body, xx, none, d)),
+        (v, 1.0, lambda v: by_position(x, v, theta), lambda d: times(body, xv, skew, d)),
+        (x, LENGTH_M, lambda x: by_velocity(x, v, theta), lambda d: times(body, xv, -skew, d)),
+        (theta, theta, lambda c: by_position(x, v, c), lambda d: at.position_theta @ d),
+        (theta, theta, lambda c: by_velocity(x, v, c), lambda d: at.velocity_theta @ d),
+    ]
+    for point, scale, moved, slope in cases:
+        assert_derivative(moved, slope, point, rng, tolerance=1e-7, scale=scale)
+    np.testing.assert_allclose(
+        at.theta, np.einsum("tik,ti->tk", body.linearise(x, v, theta).by_theta, w), rtol=1e-10
+    )
+
+
+def test_only_kelvin_voigt_pays_for_what_is_not_symmetric():
+    at = small_body(damping="rayleigh").linearise(*np.zeros((2, 1, 24)), [1.0, 1.0, 1.0, 1.0])
+    assert at.by_position_skew.shape == (1, 0)
+    assert elastic(small_body())
