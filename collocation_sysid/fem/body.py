@@ -5,7 +5,8 @@ Signs: Ψ(x) elastic energy, f_e = −∂Ψ/∂x, K = ∂²Ψ/∂x² = −∂f_e
     f(x, v; θ) = f_e(x) + f_d(x, v) − γ_m M v,   f_d = −γ_r K(x) v for Rayleigh's damping law.
 
 A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
-part in turn: its material's, its damping law's, and its γ_m.
+part in turn: its material's, its damping law's, those of its memory, and its γ_m. What a body with
+memory brings from the past, see `memory`, is given beside x and v; without it, it has relaxed.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ from .damping import Damping
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
 from .materials import Energy, Material
+from .memory import Carried, Prony, point_places
 from .mesh import TetMesh
 from .model import Model, Theta
 from .nodes import Nodes
 from .pattern import SymmetricPattern, element_destinations
 from .regions import Part, Region, parts_of
 from .selection import Selection
+from .stress import Stresses
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +93,8 @@ class Body(Model):
         A name in `damping.DAMPINGS`.
     regions : sequence of Region
         Parts that differ.
+    prony : sequence of str or Prony
+        Names of the branches of the material's memory.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
         for a material that vector code cannot evaluate.
@@ -125,12 +130,18 @@ class Body(Model):
         mass_kg: float | None = None,
         damping: str | Damping = "rayleigh",
         regions: Sequence[Region] = (),
+        prony: Sequence[str | Prony] = (),
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
-        super().__init__(parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions))
+        super().__init__(parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony))
         self.mesh = mesh
         self.element: Element = element_named(element)
+        if self.remembers and self.element.mean_dilatation:
+            raise InputError(
+                f"element '{element}' averages the dilatation and cannot have a memory (prony); "
+                "expected tet10 or tet4"
+            )
         self.nodes = Nodes.of_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
         self.cells: Index = self.nodes.cells
@@ -195,6 +206,16 @@ class Body(Model):
         return numbers
 
     @property
+    def remembers(self) -> bool:
+        """Whether any part has a memory."""
+        return any(part.prony for part in self.parts)
+
+    @cached_property
+    def stresses(self) -> Stresses:
+        """Those of the parts with memory, point by point."""
+        return Stresses(self)
+
+    @property
     def mass_kg(self) -> float:
         """Total mass."""
         return float(self.node_mass.sum())
@@ -241,6 +262,7 @@ class Body(Model):
         velocities: ArrayLike,
         theta: Theta,
         dof_mass: Array | None = None,
+        carried: Carried | None = None,
     ) -> Array:
         """Internal force f(x, v; θ), (T, 3n) [N].
 
@@ -250,10 +272,14 @@ class Body(Model):
         theta : (k,) in the order of `constants`
         dof_mass : (3n,) or (T, 3n), optional
             The M that γ_m damps, where more than the body's own mass moves [kg].
+        carried : Carried, optional
+            What the states of a body with memory bring from the past; nothing by default.
         """
         x, v = self._states(positions, velocities)
         mass = self.dof_mass if dof_mass is None else dof_mass
-        return self._evaluate("force", [x, v], theta) - self._drag(theta) * mass * v
+        return (
+            self._evaluate("force", [x, v], theta, carried=carried) - self._drag(theta) * mass * v
+        )
 
     def linearise(
         self,
@@ -262,13 +288,16 @@ class Body(Model):
         theta: Theta,
         out: Array | None = None,
         dof_mass: Array | None = None,
+        carried: Carried | None = None,
     ) -> Linearisation:
         """Internal force and first derivatives at T states, see `Linearisation` and `force`.
+
+        They are those at a given H; its own derivatives are the memory's.
 
         The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
         """
         x, v = self._states(positions, velocities)
-        rows = self._evaluate("linearisation", [x, v], theta, out)
+        rows = self._evaluate("linearisation", [x, v], theta, out, carried)
         size, entries = self.pattern.size, self.pattern.entries
         force, by_position, by_velocity, by_theta = np.split(
             rows, np.cumsum([size, entries, entries]), axis=1
@@ -280,7 +309,19 @@ class Body(Model):
         by_theta = by_theta.reshape(len(x), size, -1)
         for column, share in self._drag_shares.items():
             by_theta[:, :, column] = -share * moving * v
+        self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta)
+
+    def _spread_stiffening(self, by_theta: Array, carried: Carried | None) -> None:
+        """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""
+        for part, start in zip(self.parts, self.starts, strict=False):
+            first = start + part.of_law
+            columns = slice(first, first + 2 * len(part.prony))
+            if part.prony and carried is None:
+                by_theta[..., columns] = 0.0
+            elif part.prony and carried is not None:
+                slopes = carried.slopes[:, None, columns]
+                by_theta[..., columns] = by_theta[..., first, None] * slopes
 
     @property
     def linearisation_width(self) -> int:
@@ -366,7 +407,12 @@ class Body(Model):
         return states
 
     def _evaluate(
-        self, name: str, fields: Sequence[Array], theta: Theta, out: Array | None = None
+        self,
+        name: str,
+        fields: Sequence[Array],
+        theta: Theta,
+        out: Array | None = None,
+        carried: Carried | None = None,
     ) -> Array:
         if len(theta) != len(self.constants):
             raise InputError(
@@ -385,7 +431,13 @@ class Body(Model):
         shares = self.split(np.asarray(theta, dtype=float))
         for k, evaluate in enumerate(self._evaluators[name]):
             values = shares[k][: self.parts[k].of_points].copy()
-            evaluate(fields, values, out, self.threads, add=k > 0)
+            if not self.parts[k].prony or name == "energy":
+                evaluate(fields, values, out, self.threads, add=k > 0)
+                continue
+            past = carried or Carried.nothing(self, len(out))
+            for rows, values[-1] in past.runs(k):
+                here, own = [field[rows] for field in fields], past.overstress[rows]
+                evaluate(here, values, out[rows], self.threads, k > 0, own)
         return out
 
     def _width(self, name: str) -> int:
@@ -399,7 +451,8 @@ class Body(Model):
     def _batch(self, name: str, number: int) -> Batch:
         """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
         part = self.parts[number]
-        kernel = KERNELS[name](self.element, Law(part.material, part.damping))
+        memory = bool(part.prony) and name != "energy"
+        kernel = KERNELS[name](self.element, Law(part.material, part.damping, memory))
         cells = self.cells[part.cells]
         vector, lower = element_destinations(self.pattern, cells)
         total, count = len(self.constants), len(cells)
@@ -426,4 +479,6 @@ class Body(Model):
         destinations = np.hstack(
             [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
         )
-        return Batch(kernel, cells, self.geometry[part.cells], destinations, self._width(name))
+        own = point_places(self, number) if memory else None
+        geometry = self.geometry[part.cells]
+        return Batch(kernel, cells, geometry, destinations, self._width(name), own)

@@ -8,6 +8,7 @@ from ..arrays import Array
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
+from .memory import start_carried
 from .newton import NewtonFailure, Solver, simulation_error
 
 
@@ -21,7 +22,7 @@ def rest_state(
 ) -> Array:
     """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
 
-    Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails
+    A body with memory has relaxed, or has been loaded for as long as the experiment says. Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails
     the load is applied in steps.
 
     Raises
@@ -34,15 +35,16 @@ def rest_state(
     body = experiment.body
     load = external_force(experiment, float(t_s[0]))
     still = np.zeros((1, body.pattern.size))
+    carried = start_carried(body, theta, experiment.loaded_since_s)
     x = experiment.rigid_positions(t_s).ravel() if start is None else start.copy()
     x[solver.held] = experiment.grasped(t_s)[1].ravel()[solver.held]
 
     def solve(x: Array, share: float) -> Array:
         def residual(state: Array) -> Array:
-            return body.force(state, still, theta)[0] + share * load
+            return body.force(state, still, theta, carried=carried)[0] + share * load
 
         def linearise(state: Array) -> tuple[Array, Array]:
-            forces = body.linearise(state, still, theta)
+            forces = body.linearise(state, still, theta, carried=carried)
             return forces.force[0] + share * load, -forces.by_position[0]
 
         return solver.newton(x, residual, linearise, keep_definite=True)
