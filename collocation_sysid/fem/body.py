@@ -215,6 +215,15 @@ class Body(Model):
         """Those of the parts with memory, point by point."""
         return Stresses(self)
 
+    @cached_property
+    def elastic_places(self) -> list[int]:
+        """Where in θ the constants of the materials are."""
+        return [
+            start + k
+            for part, start in zip(self.parts, self.starts, strict=False)
+            for k in range(len(part.material.constants))
+        ]
+
     @property
     def mass_kg(self) -> float:
         """Total mass."""

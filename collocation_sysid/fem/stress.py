@@ -31,12 +31,18 @@ if TYPE_CHECKING:
 UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
+def _first_piola(point: Point, law: Law) -> ca.SX:
+    """P (9,) = ∂ψ/∂F."""
+    return ca.gradient(law.psi(point.felt, point.theta), point.gradients["x"])
+
+
+def _six(matrix: ca.SX) -> ca.SX:
+    return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
+
+
 def _stress(point: Point, law: Law) -> ca.SX:
-    """S (6,) = F⁻¹ ∂ψ/∂F."""
-    F = point.felt
-    first = ca.reshape(ca.gradient(law.psi(F, point.theta), point.gradients["x"]), 3, 3)
-    stress = ca.inv_minor(F) @ first
-    return ca.vertcat(*[stress[a, b] for a, b in UPPER])
+    """S (6,) = F⁻¹ P."""
+    return _six(ca.inv_minor(point.felt) @ ca.reshape(_first_piola(point, law), 3, 3))
 
 
 def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
@@ -58,10 +64,13 @@ def stress_by_theta_kernel(element: Element, law: Law) -> PointKernel:
 
 
 def stress_along_kernel(element: Element, law: Law) -> PointKernel:
-    """∂S/∂x v."""
+    """∂S/∂x v: dS = F⁻¹ (dP − dF S)."""
     point = Point.of(element, law.constants, "x", "v")
-    along = ca.jtimes(_stress(point, law), point.gradients["x"], point.gradients["v"])
-    return _kernel("stress_along", point, {"stress_along": ("none", along)})
+    F, first, rate = point.gradients["x"], _first_piola(point, law), point.gradients["v"]
+    inverse = ca.inv_minor(point.felt)
+    stress = inverse @ ca.reshape(first, 3, 3)
+    change = ca.reshape(ca.jtimes(first, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
+    return _kernel("stress_along", point, {"stress_along": ("none", _six(inverse @ change))})
 
 
 def pulled_kernel(element: Element, law: Law) -> PointKernel:
@@ -132,9 +141,11 @@ class Stresses:
                 )
         return found
 
-    def along(self, x: Array, direction: Array, theta: Array) -> Array:
+    def along(
+        self, x: Array, direction: Array, theta: Array, out: Array | None = None
+    ) -> Array:
         """∂S/∂x along a direction, (T, width)."""
-        return self._of_points("stress_along", [x, direction], theta)
+        return self._of_points("stress_along", [x, direction], theta, out)
 
     def pulled(self, x: Array, weights: Array, theta: Array) -> Array:
         """(∂S/∂x)ᵀ weights, (T, 3n)."""
@@ -148,8 +159,13 @@ class Stresses:
         """(∂f_H/∂H)ᵀ direction, (T, width)."""
         return self._of_points("against", [x, direction], theta)
 
-    def _of_points(self, name: str, fields: list[Array], theta: Array) -> Array:
-        out = np.zeros((len(fields[0]), self.width))
+    def _of_points(
+        self, name: str, fields: list[Array], theta: Array, out: Array | None = None
+    ) -> Array:
+        if out is None:
+            out = np.zeros((len(fields[0]), self.width))
+        else:
+            out.fill(0.0)
         for number, part in enumerate(self.body.parts):
             if part.prony:
                 self._run(name, number, fields, theta, out, add=True)

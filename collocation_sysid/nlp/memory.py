@@ -238,41 +238,47 @@ class Slopes:
         self.history, self.theta_q, self.next = history, theta_q, done
         self.stresses, self.theta = history.body.stresses, history.theta
         count = theta_q.shape[1]
-        self.columns = list(known) or [
+        # (columns, …) of each branch
+        self.columns = [each.copy() for each in known] or [
             np.zeros((count, m.shape[1])) for m in history.brought
-        ]  # (columns, …) of each branch
-        self._of_theta = np.flatnonzero(theta_q.any(axis=0))
+        ]
+        # Work space, kept: fresh pages would cost as much as the numbers in them.
+        self._stress = np.zeros((count, self.stresses.width))
+        self._total, self._scratch = np.zeros_like(self._stress), np.zeros_like(self._stress)
+        self._state = np.zeros((count, history.xi.shape[1]))
+        self._direction = np.zeros_like(self._state)
+        self._moduli = np.flatnonzero(theta_q[history.body.elastic_places].any(axis=0))
         self._slopes, self._first = np.zeros((0, 0, 0)), 0
 
     def force(self) -> Array:
         """What they add to dF at the next evaluation, (3n, columns)."""
-        total = np.zeros((self.theta_q.shape[1], self.stresses.width))
+        total = self._total
+        total.fill(0.0)
         for r, columns in zip(self.history.recursions, self.columns, strict=True):
             total[:, r.branch.points] += columns
-        return self.stresses.force(self._state(), total, self.theta).T
+        self._state[:] = self.history.xi[self.next]
+        return self.stresses.force(self._state, total, self.theta).T
 
     def advance(self, of_state: Array) -> None:
         """Go past the next evaluation, whose state changes by (3n, columns)."""
-        k, history = self.next, self.history
-        stress = self.stresses.along(self._state(), of_state.T, self.theta)
-        if len(self._of_theta):
-            stress[self._of_theta] += self._by_theta(k)
-        for b, (r, m) in enumerate(zip(history.recursions, history.brought, strict=True)):
+        k, history, stress = self.next, self.history, self._stress
+        self._state[:], self._direction[:] = history.xi[k], of_state.T
+        self.stresses.along(self._state, self._direction, self.theta, stress)
+        if len(self._moduli):
+            for column, slope in zip(self._moduli, self._by_moduli(k), strict=True):
+                stress[column] += slope
+        for r, m, columns in zip(history.recursions, history.brought, self.columns, strict=True):
             points, own = r.branch.points, self.theta_q[[r.branch.share, r.branch.tau]]
-            columns = r.d[k] * self.columns[b]
-            columns += r.a[k] * stress[:, points]
+            columns *= r.d[k]
+            columns += np.multiply(stress[:, points], r.a[k], out=self._scratch[:, points])
             for j in np.flatnonzero(own.any(axis=0)):
                 columns[j] += (r.d_by[:, k] @ own[:, j]) * m[k]
                 columns[j] += (r.a_by[:, k] @ own[:, j]) * history.stress[k, points]
-            self.columns[b] = columns
         self.next += 1
 
-    def _state(self) -> Array:
-        return np.tile(self.history.xi[self.next], (self.theta_q.shape[1], 1))
-
-    def _by_theta(self, k: int) -> Array:
+    def _by_moduli(self, k: int) -> Array:
         if not self._first <= k < self._first + len(self._slopes):
-            xi, theta_q = self.history.xi[k : k + CHUNK], self.theta_q[:, self._of_theta]
+            xi, theta_q = self.history.xi[k : k + CHUNK], self.theta_q[:, self._moduli]
             self._slopes, self._first = self.stresses.stress_by(xi, self.theta, theta_q), k
         return self._slopes[k - self._first]
 
