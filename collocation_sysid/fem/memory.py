@@ -8,9 +8,9 @@ which turns with the body. Between evaluation states h apart, S linear in time, 
 
     Q_k = e Q_{k−1} + c (S_k − S_{k−1}),   e = exp(−h/τ),   c = g (τ/h) (1 − e).
 
-So with m_k = e_{k+1} Q_k − c_{k+1} S_k, six numbers of a point and branch, Q_k = m_{k−1} + c_k S_k: at
-a given H = Σ m_{k−1} and s = Σ c_k, sums over branches, a step's stress (1 + s) S + H has the energy
-(1 + s) ψ + ½ H : FᵀF. (Simo & Hughes 1998, ch. 10.)
+So with m_k = e_{k+1} Q_k − c_{k+1} S_k, six numbers of a point and branch, Q_k = m_{k−1} + c_k S_k.
+At given H = Σ m_{k−1} and s = Σ c_k, sums over branches, a step's stress (1 + s) S + H has the
+energy (1 + s) ψ + ½ H : FᵀF. (Simo & Hughes 1998, ch. 10.)
 
 What all points of a body carry is one row: part after part, and of each the entries xx, yy, zz, xy,
 xz, yz of all its points.
@@ -18,6 +18,7 @@ xz, yz of all its points.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -106,7 +107,7 @@ class Carried:
         """Rows that follow one another with the same s of a part, and that."""
         values = self.stiffening[:, part]
         starts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
-        for start, stop in zip(starts[:-1], starts[1:], strict=True):
+        for start, stop in itertools.pairwise(starts):
             if stop > start:
                 yield slice(start, stop), float(values[start])
 

@@ -141,9 +141,7 @@ class Stresses:
                 )
         return found
 
-    def along(
-        self, x: Array, direction: Array, theta: Array, out: Array | None = None
-    ) -> Array:
+    def along(self, x: Array, direction: Array, theta: Array, out: Array | None = None) -> Array:
         """∂S/∂x along a direction, (T, width)."""
         return self._of_points("stress_along", [x, direction], theta, out)
 

@@ -4,9 +4,9 @@ Of each branch (see `fem.memory`) what is carried from evaluation k to the next 
 
     m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − c_{k+1},
 
-and evaluation k has H_k = Σ m_{k−1} and s_k = Σ c_k. It begins with S_0 and Q_0 = c_0 S_0 in the start
-shape, c_0 = g exp(−t/τ) of a load that came at once and has been there for a time t: none where the
-body has relaxed. Columns of derivatives follow by the chain rule,
+and evaluation k has H_k = Σ m_{k−1} and s_k = Σ c_k. It begins with S_0 and Q_0 = c_0 S_0 in the
+start shape, c_0 = g exp(−t/τ) of a load that came at once and has been there for a time t: none
+where the body has relaxed. Columns of derivatives follow by the chain rule,
 
     dF_k ∋ ∂f_H/∂H Σ dm_{k−1},   dm_k = d_k dm_{k−1} + a_k dS_k + dd_k m_{k−1} + da_k S_k,
 

@@ -104,11 +104,11 @@ class Parameter:
         if self.fixed:
             self._check_fixed()
             return
-        least = 0.0 if self.scale == "log" else -np.inf
+        least = max(0.0 if self.scale == "log" else -np.inf, constant_named(self.name).least)
         if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
             raise InputError(
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
-                f"{'0 < ' if self.scale == 'log' else ''}lower < upper",
+                f"{'0 < ' if self.scale == 'log' else '0 <= ' if least == 0 else ''}lower < upper",
                 None,
                 self.name,
             )

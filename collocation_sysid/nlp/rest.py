@@ -22,8 +22,9 @@ def rest_state(
 ) -> Array:
     """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
 
-    A body with memory has relaxed, or has been loaded for as long as the experiment says. Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails
-    the load is applied in steps.
+    Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails
+    the load is applied in steps. A body with memory has relaxed, or has been loaded for as long
+    as the experiment says.
 
     Raises
     ------

@@ -9,8 +9,8 @@ step of the scheme:
     F' = F_R + G Σ_{i≥1} p_i Y_{t−i} + C Σ_{i≥1} q_i Y_{t−i} / Δt,
     −A = −∂c_t/∂x_t = −w_0 (p_0 G + q_0 C / Δt) + s_0 M / Δt²,
 
-and dF_t follows from the row itself. With memory F' has what it brings, see `nlp.memory`. For the feasibility step p, R is c and F_R is zero; for
-Z = dx/dq, R is zero and F_R is ∂F/∂q.
+and dF_t follows from the row itself. For the feasibility step p, R is c and F_R is zero; for
+Z = dx/dq, R is zero and F_R is ∂F/∂q. With memory F' has what it brings, see `nlp.memory`.
 """
 
 from __future__ import annotations

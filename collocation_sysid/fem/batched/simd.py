@@ -131,7 +131,10 @@ class _Layout:
 
 
 class _Emitter:
-    """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out, …)``."""
+    """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out, …)``.
+
+    What points carry comes last: the length of its row, where its numbers are, and itself.
+    """
 
     def __init__(self, kernel: PointKernel, points: int, lanes: int) -> None:
         self.fields = len(kernel.fields)
