@@ -87,6 +87,9 @@ SHARE = Constant(
     at_least=0.0,
 )  # fmt: skip
 TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
+INSTANTANEOUS = Constant(
+    "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
+)
 
 # The constants that have a symbol, by name: what tables and pictures look up.
 KNOWN: Mapping[str, Constant] = {
@@ -107,6 +110,7 @@ KNOWN: Mapping[str, Constant] = {
         CHAIN_STRETCH,
         SHARE,
         TAU,
+        INSTANTANEOUS,
     )
 }
 
