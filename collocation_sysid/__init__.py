@@ -22,6 +22,7 @@ from .experiment import (
 )
 from .fem.body import Body
 from .fem.materials import Material
+from .fem.memory import Prony
 from .fem.mesh import TetMesh
 from .fem.regions import Region
 from .fem.selection import Ball, Box, Indices, Named
@@ -66,6 +67,7 @@ __all__ = [
     "PointMass",
     "PoseSequence",
     "Problem",
+    "Prony",
     "ReducedSpace",
     "Region",
     "RolloutOptions",

@@ -58,6 +58,9 @@ class Experiment:
         Inertia of the first step: from the starting velocity, or zero acceleration.
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
+    loaded_since_s : float
+        How long the body has been in the shape of its equilibrium since its loads came at once; a
+        body with memory has relaxed by default.
     validation : bool
         Predicted only, not fitted.
     masses : sequence of PointMass
@@ -84,6 +87,7 @@ class Experiment:
     start_rule: StartRule
     start_positions_m: Array | None
     start_velocities_m_s: Array | None
+    loaded_since_s: float
     validation: bool
     masses: tuple[PointMass, ...]
     forces: tuple[Force, ...]
@@ -102,6 +106,7 @@ class Experiment:
         start_rule: StartRule = "standard",
         start_positions_m: ArrayLike | None = None,
         start_velocities_m_s: ArrayLike | None = None,
+        loaded_since_s: float = np.inf,
         validation: bool = False,
         masses: Iterable[PointMass] = (),
         forces: Iterable[Force] = (),
@@ -121,6 +126,7 @@ class Experiment:
                 start_rule=start_rule,
                 start_positions_m=_state(start_positions_m, n, "start_positions_m"),
                 start_velocities_m_s=_state(start_velocities_m_s, n, "start_velocities_m_s"),
+                loaded_since_s=float(loaded_since_s),
                 validation=validation,
                 masses=tuple(mass.on(body) for mass in masses),
                 forces=tuple(force.on(body) for force in forces),
@@ -276,6 +282,15 @@ class Experiment:
             if getattr(self, key) not in get_args(choices):
                 expected = ", ".join(get_args(choices))
                 raise InputError(f"{key} is {getattr(self, key)!r}; expected one of {expected}")
+        if not self.loaded_since_s >= 0:
+            raise InputError(
+                f"loaded_since_s = {self.loaded_since_s:g}; expected a time of zero or more"
+            )
+        if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
+            raise InputError(
+                f"loaded_since_s is given, but start is '{self.start}'; it says how long a body "
+                "that starts in equilibrium has been loaded"
+            )
         given = self.start_positions_m is not None or self.start_velocities_m_s is not None
         if self.start == "given":
             if self.start_positions_m is None:

@@ -8,7 +8,8 @@ The slopes of a damping law that is a stress, not a potential, are not symmetric
 are arrays of their own, which are empty, (T, 0), where no part of the body has any.
 
 A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
-part in turn: its material's, its damping law's, and its γ_m.
+part in turn: its material's, its damping law's, those of its memory, and its γ_m. What a body with
+memory brings from the past, see `memory`, is given beside x and v; without it, it has relaxed.
 """
 
 from __future__ import annotations
@@ -28,12 +29,14 @@ from .damping import Damping
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
 from .materials import Energy, Material
+from .memory import Carried, Prony, point_places
 from .mesh import TetMesh
 from .model import Model, Theta
 from .nodes import Nodes
 from .pattern import SymmetricPattern, element_destinations, in_ascending_order
 from .regions import Part, Region, parts_of
 from .selection import Selection
+from .stress import Stresses
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +101,8 @@ class Body(Model):
         A name in `damping.DAMPINGS`; "rayleigh" is the paper's law.
     regions : sequence of Region
         Parts that differ.
+    prony : sequence of str or Prony
+        Names of the branches of the material's memory.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
         for a material that vector code cannot evaluate.
@@ -133,12 +138,18 @@ class Body(Model):
         mass_kg: float | None = None,
         damping: str | Damping = "kelvin-voigt",
         regions: Sequence[Region] = (),
+        prony: Sequence[str | Prony] = (),
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
-        super().__init__(parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions))
+        super().__init__(parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony))
         self.mesh = mesh
         self.element: Element = element_named(element)
+        if self.remembers and self.element.mean_dilatation:
+            raise InputError(
+                f"element '{element}' averages the dilatation and cannot have a memory (prony); "
+                "expected tet10 or tet4"
+            )
         self.nodes = Nodes.of_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
         self.cells: Index = self.nodes.cells
@@ -203,6 +214,25 @@ class Body(Model):
         return numbers
 
     @property
+    def remembers(self) -> bool:
+        """Whether any part has a memory."""
+        return any(part.prony for part in self.parts)
+
+    @cached_property
+    def stresses(self) -> Stresses:
+        """Those of the parts with memory, point by point."""
+        return Stresses(self)
+
+    @cached_property
+    def elastic_places(self) -> list[int]:
+        """Where in θ the constants of the materials are."""
+        return [
+            start + k
+            for part, start in zip(self.parts, self.starts, strict=False)
+            for k in range(len(part.material.constants))
+        ]
+
+    @property
     def mass_kg(self) -> float:
         """Total mass."""
         return float(self.node_mass.sum())
@@ -254,6 +284,7 @@ class Body(Model):
         velocities: ArrayLike,
         theta: Theta,
         dof_mass: Array | None = None,
+        carried: Carried | None = None,
     ) -> Array:
         """Internal force f(x, v; θ), (T, 3n) [N].
 
@@ -263,10 +294,14 @@ class Body(Model):
         theta : (k,) in the order of `constants`
         dof_mass : (3n,) or (T, 3n), optional
             The M that γ_m damps, where more than the body's own mass moves [kg].
+        carried : Carried, optional
+            What the states of a body with memory bring from the past; nothing by default.
         """
         x, v = self._states(positions, velocities)
         mass = self.dof_mass if dof_mass is None else dof_mass
-        return self._evaluate("force", [x, v], theta) - self._drag(theta) * mass * v
+        return (
+            self._evaluate("force", [x, v], theta, carried=carried) - self._drag(theta) * mass * v
+        )
 
     def linearise(
         self,
@@ -275,13 +310,16 @@ class Body(Model):
         theta: Theta,
         out: Array | None = None,
         dof_mass: Array | None = None,
+        carried: Carried | None = None,
     ) -> Linearisation:
         """Internal force and first derivatives at T states, see `Linearisation` and `force`.
+
+        They are those at a given H; its own derivatives are the memory's.
 
         The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
         """
         x, v = self._states(positions, velocities)
-        rows = self._evaluate("linearisation", [x, v], theta, out)
+        rows = self._evaluate("linearisation", [x, v], theta, out, carried)
         size, entries = self.pattern.size, self.pattern.entries
         width = len(self.constants) * size
         force, by_position, by_velocity, by_theta, skew = np.split(
@@ -294,7 +332,19 @@ class Body(Model):
         by_theta = by_theta.reshape(len(x), size, -1)
         for column, share in self._drag_shares.items():
             by_theta[:, :, column] = -share * moving * v
+        self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew)
+
+    def _spread_stiffening(self, by_theta: Array, carried: Carried | None) -> None:
+        """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""
+        for part, start in zip(self.parts, self.starts, strict=False):
+            first = start + part.of_law
+            columns = slice(first, first + 2 * len(part.prony))
+            if part.prony and carried is None:
+                by_theta[..., columns] = 0.0
+            elif part.prony and carried is not None:
+                slopes = carried.slopes[:, None, columns]
+                by_theta[..., columns] = by_theta[..., first, None] * slopes
 
     @property
     def linearisation_width(self) -> int:
@@ -383,7 +433,12 @@ class Body(Model):
         return states
 
     def _evaluate(
-        self, name: str, fields: Sequence[Array], theta: Theta, out: Array | None = None
+        self,
+        name: str,
+        fields: Sequence[Array],
+        theta: Theta,
+        out: Array | None = None,
+        carried: Carried | None = None,
     ) -> Array:
         if len(theta) != len(self.constants):
             raise InputError(
@@ -402,7 +457,13 @@ class Body(Model):
         shares = self.split(np.asarray(theta, dtype=float))
         for k, evaluate in enumerate(self._evaluators[name]):
             values = shares[k][: self.parts[k].of_points].copy()
-            evaluate(fields, values, out, self.threads, add=k > 0)
+            if not self.parts[k].prony or name == "energy":
+                evaluate(fields, values, out, self.threads, add=k > 0)
+                continue
+            past = carried or Carried.nothing(self, len(out))
+            for rows, values[-1] in past.runs(k):
+                here, own = [field[rows] for field in fields], past.overstress[rows]
+                evaluate(here, values, out[rows], self.threads, k > 0, own)
         return out
 
     def _width(self, name: str) -> int:
@@ -416,7 +477,8 @@ class Body(Model):
     def _batch(self, name: str, number: int) -> Batch:
         """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
         part = self.parts[number]
-        kernel = KERNELS[name](self.element, Law(part.material, part.damping))
+        memory = bool(part.prony) and name != "energy"
+        kernel = KERNELS[name](self.element, Law(part.material, part.damping, memory))
         cells, geometry = self.cells[part.cells], self.geometry[part.cells]
         if part.damping.stress is not None:
             # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
@@ -449,4 +511,5 @@ class Body(Model):
         destinations = np.hstack(
             [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
         )
-        return Batch(kernel, cells, geometry, destinations, self._width(name))
+        own = point_places(self, number) if memory else None
+        return Batch(kernel, cells, geometry, destinations, self._width(name), own)

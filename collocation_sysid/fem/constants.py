@@ -45,6 +45,8 @@ class Constant:
         Value in a soft foam or rubber, where there is no guess; moduli follow the stiffness.
     below : float
         Values are less than this.
+    at_least : float
+        Smallest value of a linear one.
     """
 
     name: str
@@ -55,11 +57,12 @@ class Constant:
     typical: float | None = None
     usual: float | None = None
     below: float = float("inf")
+    at_least: float = -float("inf")
 
     @property
     def least(self) -> float:
         """Smallest value that makes sense."""
-        return 0.0 if self.scale == "log" else -float("inf")
+        return 0.0 if self.scale == "log" else self.at_least
 
 
 STIFFNESS = (1.0, 1e9)
@@ -77,6 +80,15 @@ C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "l
 GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), usual=50.0)
 CHAIN_STRETCH = Constant(
     "chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0), usual=5.0
+)
+# Of a branch of the memory, whose name goes in front: ``prony_1.share``.
+SHARE = Constant(
+    "share", "g", "stiffness that relaxes, over the long-term one", (0.0, 20.0), "linear", 0.1, 0.1,
+    at_least=0.0,
+)  # fmt: skip
+TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
+INSTANTANEOUS = Constant(
+    "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
 )
 
 # The constants that have a symbol, by name: what tables and pictures look up.
@@ -96,6 +108,9 @@ KNOWN: Mapping[str, Constant] = {
         C30,
         GENT_LIMIT,
         CHAIN_STRETCH,
+        SHARE,
+        TAU,
+        INSTANTANEOUS,
     )
 }
 

@@ -7,7 +7,8 @@ x        3·nodes       node positions, node-major xyz [m]
 v        3·nodes       node velocities [m/s]
 w        3·nodes       weights on the node forces (Lagrange multipliers)
 geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume [m³]
-theta    k             constants of the material, then of the damping law
+theta    k             constants of the material, then of the damping law, then s
+carried  6             H
 ======== ============= ==============================================================
 
 and outputs that are summed over points and elements. Matrices are given by the lower triangles of
@@ -16,7 +17,8 @@ their symmetric part and, where they have one, of their skew part, column after 
 All of them are derivatives of two scalars: an energy Θ(x, v) = Σ_q V_q (ψ + ψ_d), with the
 potential of a damping law that has one, and half the power that one with a stress dissipates,
 D(x, v) = ½ Σ_q V_q P_v:Ḟ. The internal force is −∂Θ/∂x − ∂D/∂v. For Rayleigh's law that is
-−∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N.
+−∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N. With memory, see `memory`,
+the point has the energy V_q ((1 + s) ψ + ½ H : FᵀF), and the damping law that of ψ.
 """
 
 from __future__ import annotations
@@ -36,18 +38,24 @@ from .point import Outputs, Pieces, Point, Term
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """What a quadrature point obeys: a material and a damping law.
+    """What a quadrature point obeys: a material and a damping law, with or without memory.
 
-    θ holds the material's constants, then those of the damping law.
+    θ holds the material's constants, those of the damping law and, with memory, the stiffening s.
     """
 
     material: Material
     damping: Damping
+    memory: bool = False
 
     @property
     def constants(self) -> int:
         """Length of θ."""
-        return len(self.material.constants) + len(self.damping.constants)
+        return len(self.material.constants) + len(self.damping.constants) + self.memory
+
+    @property
+    def carried(self) -> int:
+        """How many numbers a point brings from the past."""
+        return 6 if self.memory else 0
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
         """Energy density at F (3, 3)."""
@@ -96,7 +104,22 @@ def _energy(point: Point, law: Law) -> ca.SX:
 def _potential(point: Point, law: Law) -> ca.SX:
     """Θ of one point, whose slope by x is an internal force but for the sign."""
     energy = _energy(point, law)
-    return energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
+    damped = energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
+    if not law.memory:
+        return damped
+    return damped + point.theta[-1] * energy + carried_energy(point)
+
+
+def carried_energy(point: Point) -> ca.SX:
+    """½ V H : FᵀF, whose slope by F is V F H."""
+    F = point.felt
+    return point.volume * ca.trace(symmetric(point.carried) @ F.T @ F) / 2
+
+
+def symmetric(six: ca.SX) -> ca.SX:
+    """A symmetric matrix from its entries xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz, xy, xz, yz = ca.vertsplit(six)
+    return ca.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _stress(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
@@ -113,7 +136,7 @@ def energy_kernel(element: Element, law: Law) -> PointKernel:
 
 def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
-    point = Point.of(element, law.constants, "x", "v")
+    point = Point.of(element, law.constants, "x", "v", carried=law.carried)
     force = (Term(-_potential(point, law), ("x",)),)
     if found := _stress(point, law):
         stress = -found[0]
@@ -123,7 +146,7 @@ def force_kernel(element: Element, law: Law) -> PointKernel:
 
 def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
-    point = Point.of(element, law.constants, "x", "v")
+    point = Point.of(element, law.constants, "x", "v", carried=law.carried)
     potential = -_potential(point, law)
     outputs: Outputs = {
         "force": (Term(potential, ("x",)),),
@@ -151,7 +174,7 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
     ∂²φ/∂v² vanishes. ∂²φ/∂x∂v is symmetric where the force follows from a potential (Rayleigh:
     −γ_r D_wK).
     """
-    point = Point.of(element, law.constants, "x", "v", "w")
+    point = Point.of(element, law.constants, "x", "v", "w", carried=law.carried)
     power = -point.along_w(_potential(point, law))
     if found := _stress(point, law):
         power -= ca.dot(found[0], point.felt_weight)

@@ -22,6 +22,8 @@ import casadi as ca
 # What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
 # to the lower triangle of (3·nodes, 3·nodes).
 Contraction = Literal["none", "nodes", "pairs"]
+# Inputs that differ between the points of an element.
+OF_POINTS = ("geometry", "carried")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +33,9 @@ class Phase:
     Attributes
     ----------
     pieces : casadi.Function
-        Of the fields, geometry, θ and, unless it is the first phase, one vector of all outputs
-        of earlier phases that are not contracted; one output for each piece.
+        Of the fields, geometry, θ, what a point carries if it has a memory and, unless it is the
+        first phase, one vector of all outputs of earlier phases that are not contracted; one
+        output for each piece.
     contractions : dict of str to Contraction
         For each output.
     """
@@ -60,11 +63,13 @@ class Phase:
         return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
 
     def over_points(self, *inputs: Any) -> list[Any]:
-        """The sums, each in one column; the geometry has a column for every point."""
-        place = self.pieces.name_in().index("geometry")
+        """The sums, each in one column; what differs between points has a column for each."""
+        names = self.pieces.name_in()
+        own = {k: ca.horzsplit(inputs[k]) for k, name in enumerate(names) if name in OF_POINTS}
+        count = len(own[names.index("geometry")])
         points = [
-            self.function.call([*inputs[:place], geometry, *inputs[place + 1 :]])
-            for geometry in ca.horzsplit(inputs[place])
+            self.function.call([own[k][p] if k in own else each for k, each in enumerate(inputs)])
+            for p in range(count)
         ]
         return [sum(outputs[1:], outputs[0]) for outputs in zip(*points, strict=True)]
 
@@ -94,17 +99,23 @@ class PointKernel:
     coupled: dict[str, Contraction] = field(default_factory=dict)
     coupling: ca.Function | None = None
 
+    @property
+    def carried(self) -> int:
+        """How many numbers a point carries from the past."""
+        names = self.pieces.name_in()
+        return self.pieces.nnz_in(names.index("carried")) if "carried" in names else 0
+
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """All of them, the last one included."""
         return (*self.earlier, Phase(self.pieces, self.contractions | self.coupled))
 
     def element_function(self, points: int) -> ca.Function:
-        """The sum over an element, of fields, geometry (3·nodes + 1, points) and θ."""
+        """The sum over an element, of fields, geometry (3·nodes + 1, points), θ and the like."""
         names = self.phases[0].pieces.name_in()
         inputs = [ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)]
-        place = names.index("geometry")
-        inputs[place] = ca.MX.sym("geometry", self.pieces.size1_in(place), points)
+        for place in (k for k, name in enumerate(names) if name in OF_POINTS):
+            inputs[place] = ca.MX.sym(names[place], self.pieces.size1_in(place), points)
         size = 3 * self.phases[0].nodes
         sums, vectors = ca.MX(0, 1), ca.MX(size, 0)
         outputs: list[ca.MX] = []

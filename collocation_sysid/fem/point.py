@@ -48,7 +48,9 @@ class Term:
         if self.part == "whole":
             return mirrored(piece)
         # Contracted in pairs, a piece gives the lower triangle of its transpose.
-        return mirrored((piece + piece.T) / 2) if self.part == "symmetric" else (piece.T - piece) / 2
+        return (
+            mirrored((piece + piece.T) / 2) if self.part == "symmetric" else (piece.T - piece) / 2
+        )
 
 
 # The terms of each output.
@@ -73,6 +75,8 @@ class Point:
     stretches : tuple of SX
         Where the element averages the dilatation, the logarithm m of the stretch that does so and,
         with v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
+    carried : SX
+        What the point brings from the past, see `memory`.
     """
 
     nodes: int
@@ -81,10 +85,11 @@ class Point:
     theta: ca.SX
     gradients: dict[str, ca.SX]
     stretches: tuple[ca.SX, ...]
+    carried: ca.SX
 
     @classmethod
-    def of(cls, element: Element, constants: int, *fields: str) -> Point:
-        """A point of an element, with θ of so many constants."""
+    def of(cls, element: Element, constants: int, *fields: str, carried: int = 0) -> Point:
+        """A point of an element, with θ of so many constants, that carries so many numbers."""
         stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
         return cls(
             element.nodes,
@@ -93,6 +98,7 @@ class Point:
             ca.SX.sym("theta", constants),
             {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
             tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
+            ca.SX.sym("carried", carried),
         )
 
     @property
@@ -144,6 +150,8 @@ class Point:
     def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """A phase of these pieces, which may depend on sums of earlier ones."""
         inputs = {**self.fields, "geometry": self.geometry, "theta": self.theta}
+        if self.carried.numel():
+            inputs["carried"] = self.carried
         if sums is not None:
             inputs["sums"] = sums
         shape_gradients = node_gradients(self.geometry, self.nodes)

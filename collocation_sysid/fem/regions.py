@@ -14,6 +14,7 @@ from ..errors import InputError
 from .constants import GAMMA_M, Constant
 from .damping import Damping, as_damping
 from .materials import Energy, Material, as_material
+from .memory import Prony, as_branches
 from .mesh import TetMesh
 from .selection import Selection
 
@@ -27,7 +28,7 @@ class Region:
     name : str
         Stands before the names of its constants: ``core.mu_pa``.
     cells : selection of cells, or (E,) bool, or (k,) int array
-    material, damping, density_kg_m3
+    material, damping, density_kg_m3, prony
         The body's where they are left out.
     """
 
@@ -36,6 +37,7 @@ class Region:
     material: str | Energy | Material | None = None
     density_kg_m3: float | None = None
     damping: str | Damping | None = None
+    prony: Sequence[str | Prony] | None = None
 
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
@@ -57,6 +59,8 @@ class Part:
     material : Material
     damping : Damping
     density_kg_m3 : float
+    prony : tuple of Prony
+        The branches of its memory.
     """
 
     name: str
@@ -64,16 +68,23 @@ class Part:
     material: Material
     damping: Damping
     density_kg_m3: float
+    prony: tuple[Prony, ...] = ()
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
-        """Of the material, the damping law, and the mass, as they follow one another in θ."""
-        return (*self.material.constants, *self.damping.constants, GAMMA_M)
+        """Of material, damping law, memory, and the mass, as they follow one another in θ."""
+        of_memory = [constant for branch in self.prony for constant in branch.constants]
+        return (*self.material.constants, *self.damping.constants, *of_memory, GAMMA_M)
+
+    @property
+    def of_law(self) -> int:
+        """How many of them are the material's and the damping law's."""
+        return len(self.material.constants) + len(self.damping.constants)
 
     @property
     def of_points(self) -> int:
-        """How many of them the quadrature points need: all but the mass's."""
-        return len(self.constants) - 1
+        """How many numbers the quadrature points need: those, and the stiffening by memory."""
+        return self.of_law + bool(self.prony)
 
     def full_name(self, own: str) -> str:
         """The name of a constant with the region in front."""
@@ -87,6 +98,7 @@ def parts_of(
     density_kg_m3: float | None,
     mass_kg: float | None,
     regions: Sequence[Region],
+    prony: Sequence[str | Prony] = (),
 ) -> tuple[Part, ...]:
     """The parts of a body: what no region claims, where there is any, then the regions.
 
@@ -100,15 +112,17 @@ def parts_of(
     rest = np.setdiff1d(
         np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
     )
-    whole = Part("", rest, as_material(material), as_damping(damping), own[0])
+    branches = as_branches(prony)
+    whole = Part("", rest, as_material(material), as_damping(damping), own[0], branches)
     parts = [whole] if rest.size else []
     for region, cells, density in zip(regions, claimed, own[1:], strict=True):
         try:
             law = whole.material if region.material is None else as_material(region.material)
             drag = whole.damping if region.damping is None else as_damping(region.damping)
+            memory = branches if region.prony is None else as_branches(region.prony)
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-        parts.append(Part(region.name, cells, law, drag, density))
+        parts.append(Part(region.name, cells, law, drag, density, memory))
     return tuple(parts)
 
 

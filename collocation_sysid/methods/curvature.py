@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array
+from ..errors import InputError
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
 from .horizon import Point
@@ -24,6 +25,11 @@ def exact_curvature(
     SimulationError
         Where a timestep's equations are singular.
     """
+    if collocation.remembers:
+        raise InputError(
+            "hessian = 'exact' has no second derivatives of materials with memory (prony); "
+            "expected 'gauss-newton'"
+        )
     projected = [x + tangent.step for x, tangent in zip(point.x, point.tangents, strict=True)]
     z = collocation.pack(point.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)

@@ -37,7 +37,7 @@ def constraint_multipliers(
 
 def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
     """Give the grasp rows, which are unit rows, what is left of the gradient."""
-    slope = collocation.gradient(z) + collocation.jacobian(z).T @ multipliers
+    slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
     for part in collocation.parts(slope):
         segment, grasped = part.segment, part.segment.grasp_rows
         multipliers[segment.rows][grasped] = -segment.of_rows(part.x)[grasped] / segment.length_m

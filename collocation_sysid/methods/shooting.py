@@ -116,7 +116,7 @@ def adjoint_gradient(
         Where a timestep's equations are singular.
     """
     multipliers = constraint_multipliers(collocation, z, stopwatch)
-    slope = collocation.gradient(z) + collocation.jacobian(z).T @ multipliers
+    slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
     return collocation.parameters_of(slope)
 
 

@@ -348,10 +348,26 @@ class Collocation:
         return rows, values
 
     def jacobian(self, z: Array) -> sp.csc_array:
-        """∂g/∂z as a sparse matrix."""
+        """∂g/∂z as a sparse matrix; of bodies with memory, at the memory as it is."""
         indptr, indices = self.jacobian_structure
         shape = (self.constraints, self.variables)
         return sp.csc_array((self.jacobian_values(z), indices, indptr), shape=shape)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether any body has a memory: then ∂g/∂z has more than `jacobian` holds."""
+        return any(segment.body.remembers for segment in self.segments)
+
+    def pulled_back(self, z: Array, multipliers: Array) -> Array:
+        """(∂g/∂z)ᵀ multipliers, through the memory of bodies too."""
+        slope = self.jacobian(z).T @ multipliers
+        for part in self.parts(z) if self.remembers else ():
+            segment = part.segment
+            of_rows = multipliers[segment.rows]
+            by_x, by_q = segment.through_memory(part.x, part.setting, of_rows)
+            slope[segment.columns] += by_x.ravel()
+            slope[: self.nq] += by_q
+        return slope
 
     # Lagrangian -------------------------------------------------------------------------------
 
@@ -421,10 +437,8 @@ class Collocation:
         Stationarity of objective + multipliers · g in every variable that is not given; a
         parameter at a bound may only push against it. And feasibility.
         """
-        rows, values = self.constraints_and_jacobian(z)
-        indptr, indices = self.jacobian_structure
-        jacobian = sp.csc_array((values, indices, indptr), shape=(len(rows), len(z)))
-        slope = self.gradient(z) + jacobian.T @ multipliers
+        rows = self.constraint_values(z)
+        slope = self.gradient(z) + self.pulled_back(z, multipliers)
         lower, upper = self.bounds()
         slope[lower == upper] = 0
         near = 1e-6

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
+from ..fem.memory import Carried
+from .memory import History
 from .schemes import Scheme, as_scheme
 
 
@@ -57,6 +59,8 @@ class Dynamics:
         there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
         first step, from the velocity it has.
     start_velocity_m_s : (3n,)
+    loaded_since_s : float
+        How long the body has been in its start shape; infinite where its memory has relaxed.
     """
 
     body: Body
@@ -68,6 +72,7 @@ class Dynamics:
     external_force_n: Array
     taken: NDArray[np.bool_]
     start_velocity_m_s: Array
+    loaded_since_s: float = np.inf
 
     @classmethod
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
@@ -93,6 +98,7 @@ class Dynamics:
             external_force_n=_compact(weight + forces),
             taken=_taken(experiment, t_s),
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
+            loaded_since_s=experiment.loaded_since_s,
         )
 
     def under_gravity(self, change_m_s2: Array) -> Dynamics:
@@ -134,6 +140,26 @@ class Dynamics:
         nu = self.combine(self.tables.q, x) / self.step_s
         return xi[self.first_row :], nu[self.first_row :]
 
+    @property
+    def until_next_s(self) -> Array:
+        """(N,) time from each evaluation to the next."""
+        lags = self.tables.p @ np.arange(self.reach + 1.0)
+        return self.step_s * np.append(np.diff(np.arange(self.rows) - lags), 1.0)
+
+    def history(self, x: Array, theta: Array) -> History | None:
+        """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing."""
+        if not self.body.remembers:
+            return None
+        xi = self.combine(self.tables.p[: len(x)], x)
+        xi[: self.first_row] = x[: self.first_row]
+        intervals = self.until_next_s[: len(x)]
+        return History.of(self.body, xi, theta, intervals, self.loaded_since_s)
+
+    def carried(self, history: History | None, rows: slice | None = None) -> Carried | None:
+        """What rows `first_row`…, or some, bring from the past."""
+        rows = slice(self.first_row, self.rows) if rows is None else rows
+        return None if history is None else history.carried(rows)
+
     def combine(self, table: Array, rows: Array) -> Array:
         """Σ_i table[t, i] rows[t − i] for every t; `rows` is (N, …)."""
         result = np.zeros_like(rows)
@@ -161,7 +187,8 @@ class Dynamics:
     def internal_force(self, x: Array, theta: Array) -> Array:
         """Internal forces (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
         damped = self.weighed_kg[self.first_row :]
-        return self.body.force(*self.evaluation_states(x), theta, damped)
+        carried = self.carried(self.history(x, theta))
+        return self.body.force(*self.evaluation_states(x), theta, damped, carried)
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """The same from the internal forces (N − first_row, 3n) at the evaluation states."""
@@ -181,9 +208,10 @@ class Dynamics:
         return acceleration * self.mass_kg
 
     def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
-        """Forces and derivatives at the evaluation states of x (N, 3n)."""
+        """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
         damped = self.weighed_kg[self.first_row :]
-        return self.body.linearise(*self.evaluation_states(x), theta, out, damped)
+        carried = self.carried(self.history(x, theta))
+        return self.body.linearise(*self.evaluation_states(x), theta, out, damped, carried)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
         """The force part of ∂c_t/∂x_{t−lag} as Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.

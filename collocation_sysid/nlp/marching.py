@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
+from ..fem.memory import Carried
 from .dynamics import Dynamics
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
@@ -78,13 +79,17 @@ def march_on(
     forces = np.zeros_like(x)  # total force at every evaluation so far
     xi, nu = dynamics.evaluation_states(x)
     first, seen = dynamics.first_row, done - dynamics.first_row
+    history = dynamics.history(x[:done], theta)
     if seen > 0:
         damped = dynamics.weighed_kg[first:done]
-        internal = dynamics.body.force(xi[:seen], nu[:seen], theta, damped)
+        carried = dynamics.carried(history, slice(first, done))
+        internal = dynamics.body.force(xi[:seen], nu[:seen], theta, damped, carried)
         forces[first:done] = internal + dynamics.external_force_n[first:done]
     dynamics.without_taken(forces)
+    memory, intervals = history.last if history else None, dynamics.until_next_s
     for t in range(done, dynamics.rows):
-        row = _Step(dynamics, theta, x, forces, t)
+        carried = memory.ahead(intervals[t - 1]) if memory else None
+        row = _Step(dynamics, theta, x, forces, t, carried)
         solver = solvers.holding(held[t])
         guess = _predicted(x[:t], dynamics.step_s * v0)
         goal = held_positions[t].ravel()[solver.held]
@@ -95,6 +100,8 @@ def march_on(
             return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
         forces[t] = row.force(x[t])
         forces[t, dynamics.taken[t]] = 0
+        if memory:
+            memory = memory.after(row.states(x[t])[0][0], intervals[t - 1])
         if progress:
             progress(t / (dynamics.rows - 1))
     return x, None
@@ -110,9 +117,18 @@ def _predicted(x: Array, first_step: Array) -> Array:
 class _Step:
     """Row t of the discrete equations as a function of x_t alone."""
 
-    def __init__(self, dynamics: Dynamics, theta: Array, x: Array, forces: Array, t: int) -> None:
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        theta: Array,
+        x: Array,
+        forces: Array,
+        t: int,
+        carried: Carried | None = None,
+    ) -> None:
         self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t)
         row, damped = self.row, dynamics.weighed_kg[t]
+        self.carried = carried
         self.damped, self.load = damped, dynamics.external_force_n[t]
         first, shape = max(0, t - dynamics.reach), x.shape[1:]
         past, past_forces = x[first:t][::-1], forces[first:t][::-1]
@@ -124,10 +140,11 @@ class _Step:
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        states, body = self._states(x), self.dynamics.body
-        return body.force(*states, self.theta, self.damped)[0] + self.load
+        states, body = self.states(x), self.dynamics.body
+        return body.force(*states, self.theta, self.damped, self.carried)[0] + self.load
 
-    def _states(self, x: Array) -> tuple[Array, Array]:
+    def states(self, x: Array) -> tuple[Array, Array]:
+        """ξ_t and ν_t, (1, 3n) each."""
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
     def _balanced(self, force: Array, x: Array) -> Array:
@@ -141,7 +158,7 @@ class _Step:
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
         body = self.dynamics.body
-        at = body.linearise(*self._states(x), self.theta, dof_mass=self.damped)
+        at = body.linearise(*self.states(x), self.theta, dof_mass=self.damped, carried=self.carried)
         matrix = self.row.block(at.by_position[0], at.by_velocity[0], body.pattern)
         skew = self.row.skew_block(at.by_position_skew[0])
         return self._balanced(at.force[0] + self.load, x), matrix, skew

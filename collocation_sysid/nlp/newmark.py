@@ -12,6 +12,7 @@ from ..arrays import Array
 from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .lapack import one_blas_thread
+from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
 
@@ -26,6 +27,7 @@ class _State:
     x: Array
     v: Array
     a: Array
+    memory: Remembered | None = None
 
 
 @one_blas_thread()
@@ -66,7 +68,12 @@ class _Stepper:
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
         x, v = start_state(self.experiment, self.theta, solver)
-        return self._balanced(_State(time_s, x, v, np.zeros_like(x)), time_s, solver.free)
+        memory = None
+        if self.body.remembers:
+            loaded_s = self.experiment.loaded_since_s
+            memory = Remembered.at_start(self.body, x, self.theta, loaded_s)
+        state = _State(time_s, x, v, np.zeros_like(x), memory)
+        return self._balanced(state, time_s, solver.free)
 
     def advance(self, state: _State, goal_s: float) -> _State:
         """Advance to `goal_s`, in halves where Newton fails."""
@@ -104,7 +111,8 @@ class _Stepper:
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""
         mass = self._mass(load_s)
-        force = self.body.force(state.x, state.v, self.theta, mass)[0]
+        now = state.memory.now if state.memory else None
+        force = self.body.force(state.x, state.v, self.theta, mass, now)[0]
         force += external_force(self.experiment, load_s)
         acceleration = state.a.copy()
         acceleration[dofs] = (force / mass)[dofs]
@@ -114,6 +122,7 @@ class _Stepper:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
         body, theta, h = self.body, self.theta, end_s - state.t_s
         load, mass = external_force(self.experiment, load_s), self._mass(load_s)
+        carried = state.memory.ahead(h) if state.memory else None
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
         known_v = -slope * state.x - state.v
@@ -127,11 +136,11 @@ class _Stepper:
 
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            return body.force(x, v, theta, mass)[0] + load - mass * a
+            return body.force(x, v, theta, mass, carried)[0] + load - mass * a
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
-            at = body.linearise(x, v, theta, dof_mass=mass)
+            at = body.linearise(x, v, theta, dof_mass=mass, carried=carried)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
             matrix[body.pattern.diagonal] += slope**2 * mass
             return at.force[0] + load - mass * a, matrix, -at.by_position_skew[0]
@@ -142,7 +151,8 @@ class _Stepper:
             guess = state.x.copy()
             guess[solver.held] = x_held
         x = solver.newton(guess, residual, linearise)
-        return _State(end_s, x, *kinematics(x))
+        memory = state.memory.after(x, h) if state.memory else None
+        return _State(end_s, x, *kinematics(x), memory)
 
     def _held_motion(
         self, solver: Solver, time_s: float, h: float, holding_s: float

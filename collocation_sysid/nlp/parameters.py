@@ -18,7 +18,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, hint_at
 from ..fem.body import Body
-from ..fem.constants import Scale, bare, constant_named, is_modulus, usual_value
+from ..fem.constants import INSTANTANEOUS, Scale, bare, constant_named, is_modulus, usual_value
 from ..fem.moduli import ENGINEERING, engineering
 
 
@@ -104,11 +104,11 @@ class Parameter:
         if self.fixed:
             self._check_fixed()
             return
-        least = 0.0 if self.scale == "log" else -np.inf
+        least = max(0.0 if self.scale == "log" else -np.inf, constant_named(self.name).least)
         if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
             raise InputError(
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
-                f"{'0 < ' if self.scale == 'log' else ''}lower < upper",
+                f"{'0 < ' if self.scale == 'log' else '0 <= ' if least == 0 else ''}lower < upper",
                 None,
                 self.name,
             )
@@ -432,7 +432,10 @@ def _with_derivatives(name: str, q: ca.SX, values: ca.SX) -> ca.Function:
 
 
 def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str, ...], ca.SX]:
-    """(E, ν) of every part at small strain; (λ, μ) of those that are given by (E, ν)."""
+    """(E, ν) of every part at small strain; (λ, μ) of those that are given by (E, ν).
+
+    With memory these are the long-term moduli, and E(1 + Σg) is the instantaneous one.
+    """
     found: dict[str, ca.SX] = {}
     shares = body.split(theta)
     for part, share, source in zip(body.parts, shares, body.sources(names), strict=True):
@@ -440,12 +443,16 @@ def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str,
         young, poisson = engineering(lame[0], lame[1])
         moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
         by_young = "young_pa" in source.names
-        shares_all = all("." not in name for name in source.names.values())
+        front = f"{part.name}."
+        shares_all = not any(name.startswith(front) for name in source.names.values())
         if found and shares_all:
             continue  # it has the moduli of the rest
         for own, value in moduli.items():
             if own not in source.names and (own in ENGINEERING or by_young):
                 found[part.full_name(own)] = value
+        if part.prony:
+            of_memory = share[part.of_law : part.of_law + 2 * len(part.prony)]
+            found[part.full_name(INSTANTANEOUS.name)] = young * (1 + ca.sum1(of_memory[::2]))
     return tuple(found), ca.vertcat(*found.values()) if found else ca.SX(0, 1)
 
 

@@ -10,6 +10,7 @@ from ..experiment.experiment import Experiment
 from .dynamics import external_force
 from .factorisation import NONE
 from .lapack import one_blas_thread
+from .memory import start_carried
 from .newton import NewtonFailure, Solver, simulation_error
 
 
@@ -24,7 +25,8 @@ def rest_state(
     """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
 
     Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails, the
-    load is applied and the other grasps are moved in steps, from the shape carried.
+    load is applied and the other grasps are moved in steps, from the shape carried. A body with
+    memory has relaxed, or has been loaded for as long as the experiment says.
 
     Raises
     ------
@@ -36,22 +38,23 @@ def rest_state(
     body = experiment.body
     load = external_force(experiment, at_s)
     still = np.zeros((1, body.pattern.size))
-    carried = experiment.rigid_positions([at_s])[0]
+    shape = experiment.rigid_positions([at_s])[0]
+    carried = start_carried(body, theta, experiment.loaded_since_s)
 
     def solve(x: Array, share: float) -> Array:
         def residual(state: Array) -> Array:
-            return body.force(state, still, theta)[0] + share * load
+            return body.force(state, still, theta, carried=carried)[0] + share * load
 
         def linearise(state: Array) -> tuple[Array, Array, Array]:
             # Nothing moves: there is no skew part.
-            forces = body.linearise(state, still, theta)
+            forces = body.linearise(state, still, theta, carried=carried)
             return forces.force[0] + share * load, -forces.by_position[0], NONE
 
         moved = x.copy()
-        moved[solver.held] = _on_the_way(experiment, carried, at_s, share).ravel()[solver.held]
+        moved[solver.held] = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
         return solver.newton(moved, residual, linearise, keep_definite=True)
 
-    x = carried.ravel() if start is None else start
+    x = shape.ravel() if start is None else start
     rate, reached, increment = np.zeros_like(x), 0.0, 1.0
     while reached < 1.0:
         step = min(increment, 1.0 - reached)
@@ -61,7 +64,7 @@ def rest_state(
             increment = step / 2
             if increment < 0.5**solver.options.halvings:
                 raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
-            x = carried.ravel() if reached == 0 else x
+            x = shape.ravel() if reached == 0 else x
         else:
             x, rate, reached = found, (found - x) / step, reached + step
     return x

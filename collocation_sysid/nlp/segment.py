@@ -418,7 +418,7 @@ class Segment:
     def constraints_and_jacobian(
         self, x: Array, setting: Setting, values: Array
     ) -> tuple[Array, Array]:
-        """Write ∂c/∂x into `values` (jacobian.nnz,).
+        """Write ∂c/∂x into `values` (jacobian.nnz,), at the memory as it is.
 
         Parameters
         ----------
@@ -451,6 +451,28 @@ class Segment:
         by_p = by_p[dynamics.first_row :, self.row_dofs]
         rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
+
+    def _force_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
+        dynamics = self.dynamics
+        row_weights = np.zeros((self.grid_rows, self.dofs))
+        by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
+        row_weights[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
+        row_weights[:, self.held_dofs] = 0
+        dynamics.without_taken(row_weights)
+        return dynamics.without_taken(dynamics.combine_transposed(dynamics.tables.w, row_weights))
+
+    def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
+        """Derivatives of multipliers · c through the memory, by scaled x (N, 3n) and by q."""
+        dynamics = setting.dynamics
+        history = dynamics.history(x, setting.theta)
+        if history is None:
+            return np.zeros_like(x), np.zeros(self.nq)
+        weights = self._force_weights(multipliers)
+        by_xi, by_q = history.pulled(weights, setting.theta_q)
+        by_x = dynamics.combine_transposed(dynamics.tables.p, by_xi)
+        by_x[: dynamics.first_row] += by_xi[: dynamics.first_row]
+        return self.length_m * by_x, by_q
 
     @cached_property
     def linearisation_rows(self) -> Array:
@@ -536,13 +558,8 @@ class Segment:
         """
         dynamics, band = setting.dynamics, self.hessian
         first = dynamics.first_row
-        row_weights = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
-        row_weights[first:, self.row_dofs] = by_time / self.force_n
-        row_weights[:, self.held_dofs] = 0
-        dynamics.without_taken(row_weights)
-        weights = dynamics.combine_transposed(dynamics.tables.w, row_weights)
-        weights = dynamics.without_taken(weights)[first:]
+        weights = self._force_weights(multipliers)[first:]
         curvature = self.body.curvature(
             *dynamics.evaluation_states(x),
             weights,

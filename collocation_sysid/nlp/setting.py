@@ -34,6 +34,12 @@ class Setting:
     gravity_phi_phi: Array
     held: Held
 
+    def columns(self, count: int, first: int = 1) -> Array:
+        """(k, count) θ's derivatives by what columns stand for, those of q from `first` on."""
+        found = np.zeros((len(self.theta), count))
+        found[:, first : first + self.theta_q.shape[1]] = self.theta_q
+        return found
+
     def force_slopes(self, by_theta: Array, weighed_kg: Array) -> Array:
         """∂F/∂(q, φ) of total forces, (…, 3n, nq + m).
 

@@ -10,7 +10,7 @@ step of the scheme:
     −A = −∂c_t/∂x_t = −w_0 (p_0 G + q_0 C / Δt) + s_0 M / Δt²,
 
 and dF_t follows from the row itself. For the feasibility step p, R is c and F_R is zero; for
-Z = dx/dq, R is zero and F_R is ∂F/∂q.
+Z = dx/dq, R is zero and F_R is ∂F/∂q. With memory F' has what it brings, see `nlp.memory`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ..errors import SimulationError
 from ..fem.body import Linearisation
 from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
+from .memory import History, Slopes, Weights
 from .row import Row, weighted
 from .segment import Segment
 from .setting import Setting
@@ -70,11 +71,13 @@ class Memory:
     solutions : Y_{t−i}
     increments : dF_{t−j}
     forces : (3n,) total forces F_{t−j} at the evaluations
+    overstress : dm of each branch
     """
 
     solutions: tuple[Array, ...]
     increments: tuple[Array, ...]
     forces: tuple[Array, ...]
+    overstress: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,14 +160,17 @@ class BlockSolver:
         """
         count = 1 + len(self.segment.moving)
         columns = np.zeros((*x.shape, count))
-        march = _Forward(self, setting, (len(self.free), count), known.memory if known else None)
+        history, theta_q = self.dynamics.history(x, setting.theta), setting.columns(count)
         violation, indefinite, done = 0.0, 0, 0
         if known is not None:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
         inertia = self.dynamics.inertia(x)
         given = GivenMotion.of(self, setting, x)
-        for step in self._steps(x, setting.theta, first=done):
+        memory = known.memory if known else None
+        march = _Forward(self, setting, (len(self.free), count), memory)
+        march.remember(history, theta_q, done)
+        for step in self._steps(x, setting.theta, first=done, history=history):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
             residual = march.residual(step, inertia[step.t])
@@ -187,9 +193,10 @@ class BlockSolver:
         """
         shape = (x.shape[1], len(self.segment.moving))
         march = _Forward(self, setting, (len(self.free), shape[1]))
-        given = GivenMotion.of(self, setting)
+        given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
+        march.remember(history, setting.columns(shape[1], first=0))
         yield from np.zeros((self.dynamics.first_row, *shape))
-        for step in self._steps(x, setting.theta):
+        for step in self._steps(x, setting.theta, history=history):
             row, right = np.zeros(shape), np.zeros(march.shape)
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
@@ -207,8 +214,10 @@ class BlockSolver:
         count = moved.shape[2]
         given = GivenMotion.along(self, setting.held.dofs, moved)
         march = _Forward(self, setting, (len(self.free), count))
+        history = self.dynamics.history(x, setting.theta)
+        march.remember(history, np.zeros((len(setting.theta), count)))
         yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
-        for step in self._steps(x, setting.theta):
+        for step in self._steps(x, setting.theta, history=history):
             row, nothing = np.zeros((x.shape[1], count)), np.zeros((2, *march.shape))
             row[self.free] = march.advance(step, nothing[0], nothing[1], given)
             row[given.held_dofs] = given.of_held[step.t]
@@ -224,8 +233,11 @@ class BlockSolver:
         rows = [Row.of(dynamics, t) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
-        for step in self._steps(x, theta, backward=True):
+        history = dynamics.history(x, theta)
+        weights = Weights(history) if history else None
+        for step in self._steps(x, theta, backward=True, history=history):
             t = step.t
+            through_stress = weights.pulled()[self.free] if weights else 0.0
             lags = range(min(reach, t) + 1)
             mass = dynamics.mass_kg[t, self.free]
             later = [j for j in range(1, reach + 1) if t + j < dynamics.rows]
@@ -238,6 +250,7 @@ class BlockSolver:
             )
             row = rows[t]
             p, q, w = row.p, row.q, row.w[0]
+            pulled[t] -= p[0] * through_stress
             by_position, by_velocity = None, None
             if known.any():
                 by_position = self.apply(step.by_position, known, -step.skew)
@@ -247,8 +260,12 @@ class BlockSolver:
             right = self.without_taken(t, pulled[t])
             y[t] = -step.factor.solve(right, transposed=True)
             force_weight = known + w * y[t]
-            by_position = self.apply(step.by_position, force_weight, -step.skew)
+            by_position = self.apply(step.by_position, force_weight, -step.skew) + through_stress
             by_velocity = self.apply(step.by_velocity, force_weight)
+            if weights:
+                whole = np.zeros(x.shape[1])
+                whole[self.free] = force_weight
+                weights.retreat(whole)
             for i in lags:
                 if i > 0:
                     pulled[t - i] -= p[i] * by_position + q[i] * by_velocity
@@ -293,7 +310,12 @@ class BlockSolver:
         return self._held @ columns
 
     def _steps(
-        self, x: Array, theta: Array, backward: bool = False, first: int = 0
+        self,
+        x: Array,
+        theta: Array,
+        backward: bool = False,
+        first: int = 0,
+        history: History | None = None,
     ) -> Iterator[_Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
         dynamics, body = self.dynamics, self.body
@@ -304,7 +326,8 @@ class BlockSolver:
             here = slice(start - dynamics.first_row, stop - dynamics.first_row)
             with self.stopwatch.evaluating():
                 damped = dynamics.weighed_kg[start:stop]
-                at = body.linearise(xi[here], nu[here], theta, dof_mass=damped)
+                carried = dynamics.carried(history, slice(start, stop))
+                at = body.linearise(xi[here], nu[here], theta, dof_mass=damped, carried=carried)
             with self.stopwatch.solving():
                 factors = self._factorise(at, slice(start, stop))
             order = range(stop - start)
@@ -443,11 +466,25 @@ class _Forward:
         self.past_forces = deque(memory.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
+        self.slopes: Slopes | None = None
+        self._overstress = memory.overstress
 
     @property
     def memory(self) -> Memory:
         """What later rows depend on."""
-        return Memory(tuple(self.past), tuple(self.past_increments), tuple(self.past_forces))
+        overstress = tuple(self.slopes.columns) if self.slopes else ()
+        return Memory(
+            tuple(self.past), tuple(self.past_increments), tuple(self.past_forces), overstress
+        )
+
+    def remember(self, history: History | None, theta_q: Array, done: int = 0) -> None:
+        """Follow the memory of a body that has one, after rows that are done."""
+        if history is None:
+            return
+        self.slopes = Slopes(history, theta_q, done, self._overstress)
+        if not done and self.solver.dynamics.first_row:
+            # The start is given.
+            self.slopes.advance(np.zeros((self.solver.body.pattern.size, theta_q.shape[1])))
 
     def residual(self, step: _Step, inertia: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
@@ -475,6 +512,8 @@ class _Forward:
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)
         force += self._of_past(step, row)
+        if self.slopes is not None:
+            force += self.slopes.force()[solver.free]
         if given is not None:
             force += given.force(solver, step)
         solver.without_taken(t, right)
@@ -484,6 +523,12 @@ class _Forward:
             self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
         if given is not None:
             given.place_taken(t, solution)
+        if self.slopes is not None:
+            of_state = np.zeros((solver.body.pattern.size, self.shape[1]))
+            of_state[solver.free] = row.p[0] * solution + weighted(row.p, self.past, self.shape)
+            if given is not None:
+                of_state[given.held_dofs] = given.of_evaluations[0][t, given.places < 0]
+            self.slopes.advance(of_state)
         self.past.appendleft(solution)
         return solution
 

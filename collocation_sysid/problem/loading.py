@@ -119,6 +119,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: 
             None if region.material is None else material(region.material, f"region.{k}.material"),
             region.density_kg_m3,
             region.damping,
+            _branches(section, region.name) or None,
         )
         for k, region in enumerate(section.region)
     ]
@@ -130,8 +131,13 @@ def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: 
         element=section.element,
         damping=section.damping,
         regions=regions,
+        prony=_branches(section, None),
         evaluator=section.evaluator,
     )
+
+
+def _branches(section: ObjectSection, region: str | None) -> list[str]:
+    return [branch.name for branch in section.prony if branch.region == region]
 
 
 def _load_parameters(given: Mapping[str, ParameterSection | float], body: Body) -> Parameters:

@@ -140,6 +140,7 @@ class RecordingReader:
                 gravity_m_s2=np.array(section.gravity_m_s2),
                 start=section.start,
                 start_rule=section.start_rule,
+                loaded_since_s=np.inf if section.loaded_since_s is None else section.loaded_since_s,
                 validation=section.validation,
                 masses=masses,
                 forces=forces,

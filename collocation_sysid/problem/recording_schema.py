@@ -395,6 +395,11 @@ class ExperimentSection(Section):
     markers: MarkersSection
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     start_rule: Literal["standard", "paper"] = "standard"
+    loaded_since_s: NotNegative | None = Field(
+        None,
+        description="How long a body with memory has been in the shape of its equilibrium; it has "
+        "relaxed by default.",
+    )
     gravity_m_s2: Vector = Field(
         (0.0, 0.0, -9.81), description="Acceleration of gravity [x, y, z]."
     )

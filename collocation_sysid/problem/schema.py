@@ -56,6 +56,18 @@ class RegionSection(Section):
     density_kg_m3: Positive | None = None
 
 
+class PronySection(Section):
+    """A branch of the material's memory; its parameters are prony_1.share and prony_1.tau_s."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(
+        description="Letters, digits, - and _."
+    )
+    region: Text | None = Field(
+        None,
+        description="Region that it belongs to; all without their own by default.",
+    )
+
+
 class ObjectSection(Section):
     """The soft object: its mesh or surface, mass and material."""
 
@@ -73,6 +85,10 @@ class ObjectSection(Section):
     region: list[RegionSection] = Field(
         default_factory=list, description="[[object.region]] tables: cells that differ."
     )
+    prony: list[PronySection] = Field(
+        default_factory=list,
+        description="[[object.prony]] tables: a material with memory, branch by branch.",
+    )
     evaluator: Literal["auto", "simd", "casadi"] = Field(
         "auto", description="How element kernels are evaluated."
     )
@@ -83,6 +99,13 @@ class ObjectSection(Section):
         if (self.surface is None) != (self.edge_length_m is None):
             raise ValueError("edge_length_m belongs to surface; expected both or neither")
         require_one(self, "mass_kg", "density_kg_m3")
+        regions = [region.name for region in self.region]
+        for branch in self.prony:
+            if branch.region is not None and branch.region not in regions:
+                there = ", ".join(regions) or "none"
+                raise ValueError(
+                    f"prony '{branch.name}' is of region {branch.region!r}; there are: {there}"
+                )
         return self
 
 

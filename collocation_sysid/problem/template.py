@@ -25,6 +25,9 @@ element = "tet4"               # or tet10 if it bends or is slender; tet10-p0, p
 # cells = {{ ball_m = [[0, 0, 0.1], 0.02] }}
 # density_kg_m3 = 200.0
 
+# [[object.prony]]             # memory: parameters "prony_1.share" and "prony_1.tau_s", as {{}}
+# name = "prony_1"             # one such table a branch; region = "core" if not of all
+
 [parameters]                   # {{}} is estimated, a number alone is fixed
 young_pa    = {{}}               # no guess is needed; {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
 poisson     = {{ lower = 0.05, upper = 0.45 }}
@@ -36,6 +39,7 @@ gamma_m_1_s = {{}}
 name = "swing"
 start = "equilibrium"          # at rest in the grasps that hold then; or "undeformed"
 gravity_m_s2 = [0.0, 0.0, -9.81]
+# loaded_since_s = 10.0        # with memory: how long at rest; it has relaxed by default
 # window_s = [0.5, 2.0]        # use only this span of time
 # every = 2                    # and every second sample
 # resample_hz = 100.0          # if the markers' times are uneven; poses are always interpolated

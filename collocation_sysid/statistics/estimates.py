@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..fem.constants import bare
+from ..fem.constants import bare, constant_named
 from ..nlp.parameters import Parameter, Parameters
 from .linearised import Derived
 
@@ -140,7 +140,10 @@ def _of_parameter(item: Parameter, value: float, deviation: float, quantile: flo
     if not deviation <= UNDETERMINED:
         return Estimate(value, reason="the data do not determine it")
     spread = deviation * item.unit
-    return Estimate(value, spread, (value - quantile * spread, value + quantile * spread))
+    least = constant_named(item.name).least
+    return Estimate(
+        value, spread, (max(least, value - quantile * spread), value + quantile * spread)
+    )
 
 
 def _multiplied(estimate: Estimate, ratio: float) -> Estimate:

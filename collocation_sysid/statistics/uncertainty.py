@@ -39,6 +39,7 @@ from .estimates import (
 )
 from .information import Information, information
 from .linearised import AT_BOUND, LinearisedFit, linearised_fit
+from .memory_notes import memory_notes
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
 from .pose_noise import pose_noise_draws
 from .sensitivity import marker_sensitivities, sensitivities
@@ -232,6 +233,7 @@ def uncertainty_of(
         degrees_of_freedom=freedom,
         notes=(
             *_parameter_notes(parameters, q, bounded, estimates),
+            *memory_notes(estimates, max((float(np.ptp(b.t_s)) for b in fit.blocks), default=0.0)),
             *_size_notes(noise, kind, level, used),
             *_correlation_notes(used, found, forced=errors == "independent"),
         ),

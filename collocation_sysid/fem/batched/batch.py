@@ -29,6 +29,8 @@ class Batch:
         (E, outputs) position of every output entry in the result row of its timestep.
     width : int
         Length of that row.
+    carried : ndarray, optional
+        (E, q, m) where in a timestep's row of what points carry the numbers of each point are.
     """
 
     kernel: PointKernel
@@ -36,15 +38,25 @@ class Batch:
     geometry: Array
     destinations: NDArray[np.int64]
     width: int
+    carried: NDArray[np.int64] | None = None
 
 
 class Evaluator(Protocol):
     """Sums a batch's kernel over elements and quadrature points, for each timestep."""
 
     def __call__(
-        self, fields: Sequence[Array], theta: Array, out: Array, threads: int, add: bool = False
+        self,
+        fields: Sequence[Array],
+        theta: Array,
+        out: Array,
+        threads: int,
+        add: bool = False,
+        carried: Array | None = None,
     ) -> None:
-        """Overwrite `out` (T, width), or add to it, from `fields`, each (T, 3n), and θ (k,)."""
+        """Overwrite `out` (T, width), or add to it.
+
+        From `fields`, each (T, 3n), θ (k,) and, for points with a memory, `carried` (T, any).
+        """
         ...
 
 

@@ -49,13 +49,19 @@ class SimdEvaluator:
         self._width = batch.width
         self._points = batch.geometry.shape[1]
         self._fields = len(kernel.fields)
+        self._carried = None
+        if batch.carried is not None:
+            self._carried = _block_major(batch.carried[lane_element], by_block)
         functions = [phase.pieces for phase in kernel.phases]
         if kernel.coupling:
             functions.append(kernel.coupling)
         source = f"{[phase.contractions for phase in kernel.phases]}"
         source += " ".join(function.serialize() for function in functions)
         key = f"{lanes} {self._points} {hashlib.sha256(source.encode()).hexdigest()}"
+        # What points carry adds the length of its row, its places and itself.
         signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
+        if kernel.carried:
+            signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         self._run = CompiledFunction(
             lambda: _Emitter(kernel, self._points, lanes).emit(),
             "run",
@@ -64,7 +70,13 @@ class SimdEvaluator:
         )
 
     def __call__(
-        self, fields: Sequence[Array], theta: Array, out: Array, threads: int, add: bool = False
+        self,
+        fields: Sequence[Array],
+        theta: Array,
+        out: Array,
+        threads: int,
+        add: bool = False,
+        carried: Array | None = None,
     ) -> None:
         """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         addresses = [field.ctypes.data for field in fields]
@@ -75,6 +87,8 @@ class SimdEvaluator:
             theta.ctypes.data,
             out.ctypes.data,
         ]
+        if self._carried is not None and carried is not None:
+            constants += [carried.shape[1], self._carried.ctypes.data, carried.ctypes.data]
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
@@ -117,7 +131,10 @@ class _Layout:
 
 
 class _Emitter:
-    """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out)``."""
+    """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out, …)``.
+
+    What points carry comes last: the length of its row, where its numbers are, and itself.
+    """
 
     def __init__(self, kernel: PointKernel, points: int, lanes: int) -> None:
         self.fields = len(kernel.fields)
@@ -140,6 +157,9 @@ class _Emitter:
         self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
+        self.carried = kernel.carried
+        if self.carried:
+            constants += [I64, I32S, DOUBLES]
         kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
         self.run = ir.Function(self.module, kind, "run")
         for argument in self.run.args:
@@ -151,7 +171,7 @@ class _Emitter:
         b, args = self.builder, self.run.args
         t0, t1, blocks, field_stride, out_stride, add = args[:6]
         field_rows = args[6 : 6 + self.fields]
-        geometry, nodes, destinations, theta, out = args[6 + self.fields :]
+        geometry, nodes, destinations, theta, out, *memory = args[6 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         phases = [*self.earlier, self.last]
         outputs, total = self.last.outputs[self.own], max(phase.outputs[-1] for phase in phases)
@@ -175,7 +195,8 @@ class _Emitter:
                 for phase in phases:
                     with counting(b, first, b.add(first, I64(self.points)), "point") as point:
                         here = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
-                        self._pieces(phase, [*gathered, here, parameters, totals], pieces)
+                        own = [self._carried(memory, t, point)] if memory else []
+                        self._pieces(phase, [*gathered, here, parameters, *own, totals], pieces)
                         self._contract(phase, pieces, here, half, totals)
                 if self.coupling:
                     self._couple(self.coupling, totals, combined)
@@ -246,13 +267,29 @@ class _Emitter:
             address = b.gep(row, [target])
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
+    def _carried(self, memory: list, t: Value, point: Value) -> list:
+        """What a quadrature point of W elements carries at timestep t."""
+        b = self.builder
+        length, places, rows = memory
+        row = b.gep(rows, [b.mul(t, length)])
+        first = b.mul(point, I64(self.carried * self.lanes))
+        found = []
+        for entry in range(self.carried):
+            value: Value = ir.Constant(self.vector, ir.Undefined)
+            for lane in range(self.lanes):
+                at = b.gep(places, [b.add(first, I64(entry * self.lanes + lane))])
+                scalar = b.load(b.gep(row, [b.sext(b.load(at), I64)]))
+                value = b.insert_element(value, scalar, I32(lane))
+            found.append(value)
+        return found
+
     def _pieces(self, phase: _Layout, inputs: list, pieces: Value) -> None:
         """Find the pieces of one quadrature point."""
 
         def read(slot: int, entry: int) -> Value:
-            if slot == self.fields + 1:
+            if isinstance(inputs[slot], list):
                 return inputs[slot][entry]
-            place = self.sums[entry] if slot == self.fields + 2 else entry
+            place = self.sums[entry] if slot == len(inputs) - 1 else entry
             return self._load(inputs[slot], I64(place))
 
         for piece, entry, value in function_values(self.builder, phase.sx, self.vector, read):

@@ -1,0 +1,226 @@
+"""Stresses of quadrature points, point by point: what the memory of a material works with.
+
+Fields (T, 3n), and rows (T, width) of what points carry, see `memory`. With S the second
+Piola–Kirchhoff stress of the long-term energy, and E Green's strain,
+
+    dS = ∂S/∂x dx,   the force of H: f_H = −∂/∂x Σ V ½ H : FᵀF,   ∂f_H/∂H = −Vᵀ(∂E/∂x),
+
+S, H and E by their entries xx, yy, zz, xy, xz, yz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from ..arrays import Array
+from .batched import Batch, Evaluator
+from .elements import Element
+from .expressions import Law, carried_energy
+from .kernel import PointKernel
+from .memory import point_places, width
+from .pattern import dofs_of
+from .point import Pieces, Point
+
+if TYPE_CHECKING:
+    from .body import Body
+
+UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _first_piola(point: Point, law: Law) -> ca.SX:
+    """P (9,) = ∂ψ/∂F."""
+    return ca.gradient(law.psi(point.felt, point.theta), point.gradients["x"])
+
+
+def _six(matrix: ca.SX) -> ca.SX:
+    return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
+
+
+def _stress(point: Point, law: Law) -> ca.SX:
+    """S (6,) = F⁻¹ P."""
+    return _six(ca.inv_minor(point.felt) @ ca.reshape(_first_piola(point, law), 3, 3))
+
+
+def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
+    last = point.phase(name, pieces)
+    return PointKernel(last.pieces, tuple(point.fields), last.contractions)
+
+
+def stress_kernel(element: Element, law: Law) -> PointKernel:
+    """S."""
+    point = Point.of(element, law.constants, "x")
+    return _kernel("stress", point, {"stress": ("none", _stress(point, law))})
+
+
+def stress_by_theta_kernel(element: Element, law: Law) -> PointKernel:
+    """∂S/∂θ by the material's constants, column after column."""
+    point = Point.of(element, law.constants, "x")
+    by_theta = ca.jacobian(_stress(point, law), point.theta)[:, : len(law.material.constants)]
+    return _kernel("stress_by_theta", point, {"stress_by_theta": ("none", ca.vec(by_theta))})
+
+
+def stress_along_kernel(element: Element, law: Law) -> PointKernel:
+    """∂S/∂x v: dS = F⁻¹ (dP − dF S)."""
+    point = Point.of(element, law.constants, "x", "v")
+    F, first, rate = point.gradients["x"], _first_piola(point, law), point.gradients["v"]
+    inverse = ca.inv_minor(point.felt)
+    stress = inverse @ ca.reshape(first, 3, 3)
+    change = ca.reshape(ca.jtimes(first, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
+    return _kernel("stress_along", point, {"stress_along": ("none", _six(inverse @ change))})
+
+
+def pulled_kernel(element: Element, law: Law) -> PointKernel:
+    """(∂S/∂x)ᵀ σ of what the points carry."""
+    point = Point.of(element, law.constants, "x", carried=6)
+    slope = ca.gradient(ca.dot(point.carried, _stress(point, law)), point.gradients["x"])
+    return _kernel("pulled", point, {"pulled": ("nodes", slope)})
+
+
+def carried_force_kernel(element: Element, law: Law) -> PointKernel:
+    """f_H of what the points carry."""
+    point = Point.of(element, law.constants, "x", carried=6)
+    slope = -ca.gradient(carried_energy(point), point.gradients["x"])
+    return _kernel("carried_force", point, {"carried_force": ("nodes", slope)})
+
+
+def against_kernel(element: Element, law: Law) -> PointKernel:
+    """(∂f_H/∂H)ᵀ v."""
+    point = Point.of(element, law.constants, "x", "v", carried=6)
+    power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
+    by_carried = ca.gradient(power, point.carried)
+    bare = Point(
+        point.nodes, point.fields, point.geometry, point.theta, point.gradients, (), ca.SX(0, 1)
+    )
+    return _kernel("against", bare, {"against": ("none", by_carried)})
+
+
+KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {
+    "stress": stress_kernel,
+    "stress_by_theta": stress_by_theta_kernel,
+    "stress_along": stress_along_kernel,
+    "pulled": pulled_kernel,
+    "carried_force": carried_force_kernel,
+    "against": against_kernel,
+}
+
+
+class Stresses:
+    """The stresses of a body, and their transposed derivatives.
+
+    Kernels are compiled when they are first needed.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.width = width(body)
+        self._evaluators: dict[tuple[str, int], Evaluator] = {}
+
+    def stress(self, x: Array, theta: Array) -> Array:
+        """S, (T, width) [Pa]."""
+        return self._of_points("stress", [x], theta)
+
+    def stress_by(self, x: Array, theta: Array, theta_q: Array) -> Array:
+        """∂S/∂θ θ_q, (T, q, width), for θ_q (k, q)."""
+        body, found = self.body, np.zeros((len(x), theta_q.shape[1], self.width))
+        for number, part in enumerate(body.parts):
+            if part.prony:
+                count, places = len(part.material.constants), point_places(body, number)
+                out = np.zeros((len(x), count * places.size))
+                self._run("stress_by_theta", number, [x], theta, out, add=False)
+                first = body.starts[number]
+                here = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
+                found[:, :, here] = np.einsum(
+                    "tkp,kq->tqp",
+                    out.reshape(len(x), count, places.size),
+                    theta_q[first : first + count],
+                    optimize=True,
+                )
+        return found
+
+    def along(self, x: Array, direction: Array, theta: Array, out: Array | None = None) -> Array:
+        """∂S/∂x along a direction, (T, width)."""
+        return self._of_points("stress_along", [x, direction], theta, out)
+
+    def pulled(self, x: Array, weights: Array, theta: Array) -> Array:
+        """(∂S/∂x)ᵀ weights, (T, 3n)."""
+        return self._of_nodes("pulled", [x], theta, weights)
+
+    def force(self, x: Array, overstress: Array, theta: Array) -> Array:
+        """f_H, (T, 3n) [N]; it is linear in H."""
+        return self._of_nodes("carried_force", [x], theta, overstress)
+
+    def against(self, x: Array, direction: Array, theta: Array) -> Array:
+        """(∂f_H/∂H)ᵀ direction, (T, width)."""
+        return self._of_points("against", [x, direction], theta)
+
+    def _of_points(
+        self, name: str, fields: list[Array], theta: Array, out: Array | None = None
+    ) -> Array:
+        if out is None:
+            out = np.zeros((len(fields[0]), self.width))
+        else:
+            out.fill(0.0)
+        for number, part in enumerate(self.body.parts):
+            if part.prony:
+                self._run(name, number, fields, theta, out, add=True)
+        return out
+
+    def _of_nodes(self, name: str, fields: list[Array], theta: Array, carried: Array) -> Array:
+        out = np.zeros_like(fields[0])
+        for number, part in enumerate(self.body.parts):
+            if part.prony:
+                self._run(name, number, fields, theta, out, add=True, carried=carried)
+        return out
+
+    def _run(
+        self,
+        name: str,
+        number: int,
+        fields: list[Array],
+        theta: Array,
+        out: Array,
+        add: bool,
+        carried: Array | None = None,
+    ) -> None:
+        body, key = self.body, (name, number)
+        if key not in self._evaluators:
+            self._evaluators[key] = body.make_evaluator(self._batch(name, number))
+        first = body.starts[number]
+        values = np.array(theta[first : first + body.parts[number].of_law], dtype=float)
+        threads = body.threads if len(out) > FEW else 1
+        self._evaluators[key](
+            [np.ascontiguousarray(field) for field in fields],
+            values,
+            out,
+            threads,
+            add,
+            None if carried is None else np.ascontiguousarray(carried),
+        )
+
+    def _batch(self, name: str, number: int) -> Batch:
+        """Every point as an element of its own."""
+        body = self.body
+        part, places = body.parts[number], point_places(body, number)
+        kernel = KERNELS[name](body.element, Law(part.material, part.damping))
+        points = body.geometry.shape[1]
+        cells = np.repeat(body.cells[part.cells], points, axis=0)
+        geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)
+        own = places.reshape(len(cells), 1, 6)
+        if "nodes" in kernel.contractions.values():
+            destinations, length = dofs_of(cells), body.pattern.size
+        elif name == "stress_by_theta":
+            columns = places.size * np.arange(len(part.material.constants))
+            destinations = (columns[:, None] + own - places[0, 0, 0]).reshape(len(cells), -1)
+            length = places.size * len(columns)
+        else:
+            destinations, length = own.reshape(len(cells), 6), self.width
+        carried = own if kernel.carried else None
+        return Batch(kernel, cells, geometry, destinations, length, carried)
+
+
+# Fewer states than this are not worth a second thread.
+FEW = 16

@@ -1,0 +1,308 @@
+"""The memory of a body along a trajectory, with derivatives forward and backward in time.
+
+Of each branch (see `fem.memory`) what is carried from evaluation k to the next is
+
+    m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − c_{k+1},
+
+and evaluation k has H_k = Σ m_{k−1} and s_k = Σ c_k. It begins with S_0 and Q_0 = c_0 S_0 in the
+start shape, c_0 = g exp(−t/τ) of a load that came at once and has been there for a time t: none
+where the body has relaxed. Columns of derivatives follow by the chain rule,
+
+    dF_k ∋ ∂f_H/∂H Σ dm_{k−1},   dm_k = d_k dm_{k−1} + a_k dS_k + dd_k m_{k−1} + da_k S_k,
+
+and backward, with weights λ_k of the forces and μ_k of m_k,
+
+    μ_{k−1} = d_k μ_k + (∂f_H/∂H)ᵀ λ_k,   ξ_k gets (∂S_k/∂ξ_k)ᵀ Σ a_k μ_k.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Array
+from ..fem.body import Body
+from ..fem.memory import Branch, Carried, Fading, branches_of
+
+# Stress slopes of so many evaluations are kept at a time.
+CHUNK = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Recursion:
+    """c, d and a of one branch at every evaluation, with their derivatives by g and τ.
+
+    Attributes
+    ----------
+    branch : Branch
+    c, d, a : (N,)
+    c_by, d_by, a_by : (2, N)
+    """
+
+    branch: Branch
+    c: Array
+    d: Array
+    a: Array
+    c_by: Array
+    d_by: Array
+    a_by: Array
+
+    @classmethod
+    def of(cls, branch: Branch, theta: Array, until_next_s: Array, loaded_s: float) -> Recursion:
+        """Of a branch, from the times (N,) from each evaluation to the next."""
+        share, tau_s = float(theta[branch.share]), float(theta[branch.tau])
+        begun = Fading.after(share, tau_s, loaded_s)
+        on = Fading.over(share, tau_s, until_next_s)
+        c = np.concatenate([begun.c, on.c[:-1]])
+        c_by = np.concatenate([begun.c_by, on.c_by[:, :-1]], axis=1)
+        a_by = on.e_by * c + on.e * c_by - on.c_by
+        return cls(branch, c, on.e, on.e * c - on.c, c_by, on.e_by, a_by)
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What the evaluations of a trajectory have been through.
+
+    Attributes
+    ----------
+    body : Body
+    theta : (k,)
+    xi : (N, 3n) evaluation states
+    stress : (N, width) S
+    recursions : tuple of Recursion
+    brought : tuple of (N, …), m_{k−1} of each branch
+    """
+
+    body: Body
+    theta: Array
+    xi: Array
+    stress: Array
+    recursions: tuple[Recursion, ...]
+    brought: tuple[Array, ...]
+
+    @classmethod
+    def of(
+        cls, body: Body, xi: Array, theta: Array, until_next_s: Array, loaded_s: float
+    ) -> History:
+        """Of the states xi (N, 3n), the first of which is the start."""
+        stress = body.stresses.stress(xi, theta)
+        recursions = [Recursion.of(b, theta, until_next_s, loaded_s) for b in branches_of(body)]
+        brought = []
+        for r in recursions:
+            own = stress[:, r.branch.points]
+            m = np.zeros_like(own)
+            for k in range(len(m) - 1):
+                m[k + 1] = r.d[k] * m[k] + r.a[k] * own[k]
+            brought.append(m)
+        return cls(body, theta, xi, stress, tuple(recursions), tuple(brought))
+
+    def carried(self, rows: slice) -> Carried:
+        """What some of the evaluations bring from the past."""
+        found = Carried.nothing(self.body, len(self.xi[rows]))
+        for r, m in zip(self.recursions, self.brought, strict=True):
+            found.overstress[:, r.branch.points] += m[rows]
+            found.stiffening[:, r.branch.part] += r.c[rows]
+            found.slopes[:, r.branch.share] = r.c_by[0, rows]
+            found.slopes[:, r.branch.tau] = r.c_by[1, rows]
+        return found
+
+    @property
+    def last(self) -> Remembered:
+        """After the last evaluation."""
+        overstress = [
+            m[-1] + r.c[-1] * self.stress[-1, r.branch.points]
+            for r, m in zip(self.recursions, self.brought, strict=True)
+        ]
+        branches = [r.branch for r in self.recursions]
+        return Remembered(self.body, self.theta, branches, self.stress[-1], overstress)
+
+    def weights(self, pushes: Array) -> list[Array]:
+        """μ_k (N, …) of each branch from (∂f_H/∂H)ᵀ λ_k (N, width)."""
+        found = []
+        for r in self.recursions:
+            own = pushes[:, r.branch.points]
+            mu = np.zeros_like(own)
+            for k in range(len(mu) - 1, 0, -1):
+                mu[k - 1] = r.d[k] * mu[k] + own[k]
+            found.append(mu)
+        return found
+
+    def pulled(self, force_weights: Array, theta_q: Array) -> tuple[Array, Array]:
+        """Derivatives of Σ λ_k f_H(H_k) through H, by ξ (N, 3n) and by q.
+
+        Parameters
+        ----------
+        force_weights : (N, 3n) λ
+        theta_q : (k, q) derivatives of θ
+        """
+        stresses, by_q = self.body.stresses, np.zeros(theta_q.shape[1])
+        mus = self.weights(stresses.against(self.xi, force_weights, self.theta))
+        of_stress = np.zeros_like(self.stress)
+        for r, m, mu in zip(self.recursions, self.brought, mus, strict=True):
+            own = self.stress[:, r.branch.points]
+            of_stress[:, r.branch.points] += r.a[:, None] * mu
+            along = r.d_by @ np.sum(mu * m, axis=1) + r.a_by @ np.sum(mu * own, axis=1)
+            by_q += along @ theta_q[[r.branch.share, r.branch.tau]]
+        for start in range(0, len(self.xi), CHUNK):
+            rows = slice(start, start + CHUNK)
+            slopes = stresses.stress_by(self.xi[rows], self.theta, theta_q)
+            by_q += np.einsum("tqp,tp->q", slopes, of_stress[rows])
+        return stresses.pulled(self.xi, of_stress, self.theta), by_q
+
+
+@dataclass(frozen=True, eq=False)
+class Remembered:
+    """The state of the memory at one time.
+
+    Attributes
+    ----------
+    body, theta
+    branches : sequence of Branch
+    stress : (width,) S
+    overstress : sequence of (…,) Q of each branch
+    """
+
+    body: Body
+    theta: Array
+    branches: Sequence[Branch]
+    stress: Array
+    overstress: Sequence[Array]
+
+    @classmethod
+    def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> Remembered:
+        """In the start shape x (3n,)."""
+        return History.of(body, x[None], theta, np.ones(1), loaded_s).last
+
+    @property
+    def now(self) -> Carried:
+        """What this very state bears beside S."""
+        found = Carried.nothing(self.body, 1)
+        for branch, overstress in zip(self.branches, self.overstress, strict=True):
+            found.overstress[0, branch.points] += overstress
+        return found
+
+    def ahead(self, interval_s: float) -> Carried:
+        """What a state after an interval brings from this one."""
+        found = Carried.nothing(self.body, 1)
+        for branch, overstress in zip(self.branches, self.overstress, strict=True):
+            e, c = self._fading(branch, interval_s)
+            brought = e * overstress - c * self.stress[branch.points]
+            found.overstress[0, branch.points] += brought
+            found.stiffening[0, branch.part] += c
+        return found
+
+    def after(self, x: Array, interval_s: float) -> Remembered:
+        """At the state x (3n,) an interval later."""
+        stress, overstress = self.body.stresses.stress(x[None], self.theta)[0], []
+        for branch, before in zip(self.branches, self.overstress, strict=True):
+            e, c = self._fading(branch, interval_s)
+            change = stress[branch.points] - self.stress[branch.points]
+            overstress.append(e * before + c * change)
+        return Remembered(self.body, self.theta, self.branches, stress, overstress)
+
+    def _fading(self, branch: Branch, interval_s: float) -> tuple[float, float]:
+        share, tau_s = float(self.theta[branch.share]), float(self.theta[branch.tau])
+        over = Fading.over(share, tau_s, np.array([interval_s]))
+        return float(over.e[0]), float(over.c[0])
+
+
+def start_carried(body: Body, theta: Array, loaded_s: float) -> Carried | None:
+    """What the start shape bears beside S, where a load has not been there for long."""
+    if not body.remembers or np.isinf(loaded_s):
+        return None
+    found = Carried.nothing(body, 1)
+    for branch in branches_of(body):
+        begun = Fading.after(float(theta[branch.share]), float(theta[branch.tau]), loaded_s)
+        found.stiffening[:, branch.part] += begun.c
+    return found
+
+
+class Slopes:
+    """Columns dm of a history, evaluation after evaluation.
+
+    Parameters
+    ----------
+    history : History
+    theta_q : (k, columns) derivatives of θ
+    done : int
+        Evaluations that are known.
+    known : sequence of arrays, optional
+        `columns` after the last of them.
+    """
+
+    def __init__(
+        self, history: History, theta_q: Array, done: int = 0, known: Sequence[Array] = ()
+    ) -> None:
+        self.history, self.theta_q, self.next = history, theta_q, done
+        self.stresses, self.theta = history.body.stresses, history.theta
+        count = theta_q.shape[1]
+        # (columns, …) of each branch
+        self.columns = [each.copy() for each in known] or [
+            np.zeros((count, m.shape[1])) for m in history.brought
+        ]
+        # Work space, kept: fresh pages would cost as much as the numbers in them.
+        self._stress = np.zeros((count, self.stresses.width))
+        self._total, self._scratch = np.zeros_like(self._stress), np.zeros_like(self._stress)
+        self._state = np.zeros((count, history.xi.shape[1]))
+        self._direction = np.zeros_like(self._state)
+        self._moduli = np.flatnonzero(theta_q[history.body.elastic_places].any(axis=0))
+        self._slopes, self._first = np.zeros((0, 0, 0)), 0
+
+    def force(self) -> Array:
+        """What they add to dF at the next evaluation, (3n, columns)."""
+        total = self._total
+        total.fill(0.0)
+        for r, columns in zip(self.history.recursions, self.columns, strict=True):
+            total[:, r.branch.points] += columns
+        self._state[:] = self.history.xi[self.next]
+        return self.stresses.force(self._state, total, self.theta).T
+
+    def advance(self, of_state: Array) -> None:
+        """Go past the next evaluation, whose state changes by (3n, columns)."""
+        k, history, stress = self.next, self.history, self._stress
+        self._state[:], self._direction[:] = history.xi[k], of_state.T
+        self.stresses.along(self._state, self._direction, self.theta, stress)
+        if len(self._moduli):
+            for column, slope in zip(self._moduli, self._by_moduli(k), strict=True):
+                stress[column] += slope
+        for r, m, columns in zip(history.recursions, history.brought, self.columns, strict=True):
+            points, own = r.branch.points, self.theta_q[[r.branch.share, r.branch.tau]]
+            columns *= r.d[k]
+            columns += np.multiply(stress[:, points], r.a[k], out=self._scratch[:, points])
+            for j in np.flatnonzero(own.any(axis=0)):
+                columns[j] += (r.d_by[:, k] @ own[:, j]) * m[k]
+                columns[j] += (r.a_by[:, k] @ own[:, j]) * history.stress[k, points]
+        self.next += 1
+
+    def _by_moduli(self, k: int) -> Array:
+        if not self._first <= k < self._first + len(self._slopes):
+            xi, theta_q = self.history.xi[k : k + CHUNK], self.theta_q[:, self._moduli]
+            self._slopes, self._first = self.stresses.stress_by(xi, self.theta, theta_q), k
+        return self._slopes[k - self._first]
+
+
+class Weights:
+    """μ of a history, evaluation before evaluation."""
+
+    def __init__(self, history: History) -> None:
+        self.history, self.next = history, len(history.xi) - 1
+        self.columns = [np.zeros(m.shape[1]) for m in history.brought]
+
+    def pulled(self) -> Array:
+        """What the state of the evaluation gets through S, (3n,)."""
+        history, k = self.history, self.next
+        weights = np.zeros((1, history.stress.shape[1]))
+        for r, mu in zip(history.recursions, self.columns, strict=True):
+            weights[0, r.branch.points] += r.a[k] * mu
+        return history.body.stresses.pulled(history.xi[k][None], weights, history.theta)[0]
+
+    def retreat(self, force_weight: Array) -> None:
+        """Go before the evaluation, whose force has weights (3n,)."""
+        history, k = self.history, self.next
+        state, weight = history.xi[k][None], force_weight[None]
+        push = history.body.stresses.against(state, weight, history.theta)[0]
+        for b, r in enumerate(history.recursions):
+            self.columns[b] = r.d[k] * self.columns[b] + push[r.branch.points]
+        self.next -= 1
