@@ -9,6 +9,7 @@ import numpy as np
 from .check.motion import Motion, motion_of
 from .errors import SimulationError
 from .experiment.turning import TOO_FAST, fastest_turn
+from .fem.plausible import odd_material, oddities
 from .methods.solution import Solution, Status
 from .nlp.schemes import as_scheme
 from .problem import Problem
@@ -37,6 +38,7 @@ def concerns(
 ) -> Iterator[Concern]:
     """What speaks against an answer."""
     status = solution.status
+    yield from body_concerns(solution)
     if not status.converged:
         yield f"the solve did not converge: {solution.message}", "doubtful"
         return
@@ -70,6 +72,15 @@ def concerns(
                 motion.first.numerical_damping_ratio,
                 motion.first.period_error,
             )
+
+
+def body_concerns(solution: Solution) -> Iterator[Concern]:
+    """Bodies of a size or a density that is hardly meant, or not with the stiffness found."""
+    for body in dict.fromkeys(segment.body for segment in solution.collocation.segments):
+        said = [oddity.sentence for oddity in oddities(body)]
+        if not said and (odd := odd_material(body, body.theta(solution.parameters))) is not None:
+            said = [odd]
+        yield from ((sentence, "doubtful") for sentence in said)
 
 
 def _of_rollout(

@@ -1,7 +1,7 @@
 """What it costs to know nothing: a run at the paper's size without guess and places of markers.
 
 The same recording is identified with both (a guess a factor of two off, places known to 1 mm) and
-without either, in turn, and the ratio of the medians is printed. A run is the whole of it: start,
+without either, in turn, with the default nuisance parameters, and the ratio of the medians is printed. A run is the whole of it: start,
 solve, roll-out, error bars and verdict. Compiling the element's code comes before.
 """
 
@@ -22,8 +22,11 @@ def main() -> None:
     parser.add_argument("--body", default="cylinder", choices=list(CASES))
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    known = with_noise(CASES[arguments.body](), 1e-3, 0)
-    unknown = described(known, unplaced=True, ideal=False)
+    case = CASES[arguments.body]()
+    known, unknown = (
+        with_noise(described(case, unplaced, ideal=False), case.noise_m, 0)
+        for unplaced in (False, True)
+    )
     truth = np.array(list(known.truth.values()))
     problems = {
         "with guess and places": problem_of(known, 2 * truth),

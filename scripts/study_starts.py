@@ -191,15 +191,14 @@ def measured(
 
 
 def described(case: Case, unplaced: bool, ideal: bool) -> Case:
-    """The case without the places of its markers, or without nuisance parameters."""
+    """The case with the default nuisance parameters or none, maybe without its markers' places."""
     experiment = case.experiment
     if unplaced:
         markers = experiment.markers
         unknown = Markers(markers.t_s, markers.positions_m, markers.sigma_m, markers.names)
         experiment = replace(experiment, markers=unknown)
-    if ideal:
-        experiment = replace(experiment, nuisance=Nuisance.none())
-    return replace(case, experiment=experiment)
+    nuisance = Nuisance.none() if ideal else Nuisance()
+    return replace(case, experiment=replace(experiment, nuisance=nuisance))
 
 
 def with_noise(case: Case, noise_m: float, seed: int) -> Case:

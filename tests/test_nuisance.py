@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.nlp.charts import Chart
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.nuisance import NuisanceMap
 from collocation_sysid.nlp.simulation import simulate, with_markers
@@ -302,6 +303,31 @@ def test_places_on_the_surface_stay_there():
         off_m.append(np.abs([places[0, 2], places[1, 0]]).max())
     assert off_m[0] > 1e-3
     assert off_m[1] < 1e-12
+
+
+def test_a_place_beyond_an_edge_of_the_surface_settles():
+    """The planes of the faces of a ball that stands off a corner lead away from each other."""
+    cube = hung_cube(3)
+    given, ball = np.array([[0.097, 1e-4, 0.1]]), np.array([0.1247, 1e-4, 0.107])
+    markers = Markers(
+        cube.t_s,
+        np.zeros((len(cube.t_s), 1, 3)),
+        2e-4,
+        None,
+        given,
+        places_sigma_m=0.01,
+        on_surface=True,
+    )
+    chart, found = Chart.of(replace(cube, markers=markers)), []
+    for _ in range(8):
+        nearest = chart.axes[0].T @ (ball - chart.points_m[0]) / chart.sigma_m[0]
+        before, (chart, phi) = chart, chart.following(chart.centre + nearest, 0.0)
+        found.append(chart.places_m(phi)[0])
+    assert chart is before
+    np.testing.assert_allclose(found[-1], found[-2])
+    # As near as the plane of one of the three faces comes.
+    distance_m = np.linalg.norm(ball - found[-1])
+    assert np.isclose(distance_m, [1e-4, 0.007, 0.0247], atol=1e-9).any()
 
 
 def test_nuisance_parameters_widen_the_error_bars_of_the_material():

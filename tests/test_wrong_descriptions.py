@@ -17,7 +17,7 @@ from collocation_sysid.check.hold import hold_warnings, holds_of
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Grasp
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.plausible import oddities
+from collocation_sysid.fem.plausible import odd_material, oddities
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.run import run, solve
@@ -109,6 +109,18 @@ def test_the_sentence_says_by_how_much_and_which_key(rng):
 def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
     assert [oddity.cause for oddity in oddities(body)] == expected
+
+
+def test_a_metal_as_soft_as_rubber_is_odd():
+    theta = {"young_pa": 5e5, "poisson": 0.4, "gamma_r_s": 0.01, "gamma_m_1_s": 0.0}
+
+    def found(density_kg_m3: float, young_pa: float) -> str | None:
+        body = Body(box_mesh((0.1,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
+        return odd_material(body, body.theta(theta | {"young_pa": young_pa}))
+
+    assert found(1100.0, 5e5) is None
+    assert found(7850.0, 2e11) is None
+    assert "if the mass was in g" in (found(2e4, 5e5) or "")
 
 
 @pytest.mark.parametrize(("edge_m", "density_kg_m3"), [(2e3, 1e3), (0.1, 0.03), (0.1, 1e7)])

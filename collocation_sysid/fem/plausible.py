@@ -6,11 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError
 from .body import Body
+from .moduli import engineering
 
 DENSITIES_KG_M3 = (10.0, 25_000.0)
 SIZES_M = (1e-4, 10.0)
+# What is as dense as this is metal or full of it, and no metal is softer than this.
+METAL_KG_M3, SOFTEST_METAL_PA = 5e3, 1e9
 # So many times outside these ranges nothing can be meant.
 IMPOSSIBLE = 100.0
 
@@ -52,6 +56,22 @@ def oddities(body: Body) -> tuple[Oddity, ...]:
     if impossible:
         raise InputError(impossible[0], None, "object")
     return tuple(found)
+
+
+def odd_material(body: Body, theta: Array) -> str | None:
+    """Why no material is as dense and as soft as a body with constants θ; None where one may be.
+
+    Tracks and poses tell the stiffness over the density, so a wrong density leaves no other trace.
+    """
+    density_kg_m3 = body.mass_kg / body.mesh.volume_m3
+    young_pa = max(float(engineering(*lame)[0]) for lame in body.lame(theta).values())
+    if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
+        return None
+    return (
+        f"the body is as dense as metal, {density_kg_m3:.4g} kg/m³, and as soft as rubber, "
+        f"E = {young_pa:.3g} Pa: a thousandth of both, if the mass was in g; check "
+        "object.density_kg_m3 or mass_kg"
+    )
 
 
 def _outside(value: float, limits: tuple[float, float]) -> float:

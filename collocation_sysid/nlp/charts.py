@@ -21,6 +21,9 @@ from ..fem.body import Body
 # A place leaves its element when another holds it better by this, in barycentric coordinates: so
 # it cannot swing between two. The clock leaves its sample when it is off by more than this.
 BETTER, SAMPLES_OFF = 0.01, 1.0
+# A place that leaves the surface across an edge where it did before, so many times more, keeps to the
+# plane it is in. What is nearer than this, over an edge of the mesh, is the same.
+AGAIN, SAME = 2, 1e-6
 
 
 class Reading(NamedTuple):
@@ -51,6 +54,9 @@ class Chart:
     axes : (M, 3, k) orthonormal directions that places may move in
     samples : int
         Whole samples of the time shift.
+    crossed : (M, 2, 3) a point and the direction of the edge that each place last left the surface
+        across, NaN where it did not
+    again : (M,) how often it left there before
     """
 
     body: Body
@@ -62,6 +68,8 @@ class Chart:
     cells: Index
     points_m: Array
     axes: Array
+    crossed: Array
+    again: Index
     samples: int = 0
 
     @classmethod
@@ -81,6 +89,8 @@ class Chart:
             np.zeros(len(points), dtype=np.int64),
             points,
             np.zeros((len(points), 3, k)),
+            np.full((len(points), 2, 3), np.nan),
+            np.zeros(len(points), dtype=np.int64),
         )
         return chart.about(points)
 
@@ -157,8 +167,34 @@ class Chart:
             samples = round(shift_samples)
         if not left:
             return (self if samples == self.samples else replace(self, samples=samples)), phi
-        chart = replace(self.about(points), samples=samples)
+        chart = replace(self._settled(points), samples=samples)
         return chart, chart.centre
+
+    def _settled(self, points_m: Array) -> Chart:
+        """The chart about places (M, 3), of which none alternates between two faces for ever.
+
+        Beyond an edge, as of a marker that stands off it, the plane of each face may lead back to
+        the other. Such a place stays in one of the planes, also where that has left the surface.
+        """
+        found = self.about(points_m)
+        if not self.on_surface:
+            return found
+        points, axes, cells = found.points_m.copy(), found.axes.copy(), found.cells.copy()
+        crossed, again = self.crossed.copy(), self.again.copy()
+        same_m = SAME * self._shape.mean_edge_m
+        for m in self.estimated:
+            beyond = points_m[m] - points[m]
+            if again[m] < AGAIN and np.linalg.norm(beyond) > same_m:
+                edge = np.cross(np.cross(*self.axes[m].T), beyond)
+                off_m = np.linalg.norm(np.cross(points[m] - crossed[m, 0], crossed[m, 1]))
+                again[m] = again[m] + 1 if off_m < same_m else 0
+                crossed[m] = points[m], edge / np.linalg.norm(edge)
+            if again[m] == AGAIN:
+                points[m], axes[m] = points_m[m], self.axes[m]
+                cells[m], _ = self._shape.cell_of(points_m[m])
+        return replace(
+            found, points_m=points, axes=axes, cells=cells, crossed=crossed, again=again
+        )
 
     def _has_left(self, point: Array, cell: int) -> bool:
         if not np.isfinite(point).all():
