@@ -158,7 +158,15 @@ def parameter_table(finished: Run) -> Table:
 
 def refinement_table(found: Refinement) -> Table:
     """What step and mesh change, and intervals for noise and discretisation."""
-    heads = ("", "half the step", "order", "half the edges", "order", "limit", "95 % interval with it")
+    heads = (
+        "",
+        "half the step",
+        "order",
+        "half the edges",
+        "order",
+        "limit",
+        "95 % interval with it",
+    )
     table = Table(*heads, box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"

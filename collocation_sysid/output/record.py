@@ -334,6 +334,7 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
         "covariance": found.covariance.tolist(),
         "quantiles": found.quantiles.tolist(),
         "verdicts": list(verdicts(found)),
+        "recordings": _recordings(finished),
         "profiles": {
             profile.parameter: {
                 "interval": list(profile.interval),
@@ -344,6 +345,30 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
             }
             for profile in finished.profiles
         },
+    }
+
+
+def _recordings(finished: Run) -> dict[str, Any] | None:
+    """What each recording says by itself of the parameters, to first order, and how they agree."""
+    found = finished.uncertainty
+    if found is None or found.scatter is None:
+        return None
+    scatter, free = found.scatter, finished.solution.collocation.parameters.free
+    q = finished.solution.q
+    return {
+        item.name: {
+            "values": {
+                name: item.value(float(q[k] + away)) if np.isfinite(away) else None
+                for name, away in zip(scatter.recordings, scatter.away[:, k], strict=True)
+            },
+            "deviations": dict(
+                zip(scatter.recordings, scatter.deviations[:, k].tolist(), strict=True)
+            ),
+            "chi_squared": float(scatter.chi_squared[k]),
+            "degrees_of_freedom": int(scatter.freedom[k]),
+            "disagree": bool(scatter.disagreeing[k]),
+        }
+        for k, item in enumerate(free)
     }
 
 

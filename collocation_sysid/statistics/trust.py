@@ -115,7 +115,17 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         concerns.append(
             (f"sigma_m seems {1 / factor:.2g} times too large for these residuals", "check")
         )
-    return concerns + _uneven_concerns(uncertainty.level)
+    return concerns + _uneven_concerns(uncertainty.level) + _scatter_concerns(uncertainty)
+
+
+def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
+    """Recordings that disagree on what they share."""
+    scatter = uncertainty.scatter
+    if scatter is None or not scatter.disagreeing.any():
+        return []
+    which = [uncertainty.names[k] for k in np.flatnonzero(scatter.disagreeing)]
+    said = f"the recordings disagree on {_listed(which)}: model error decides, not noise"
+    return [(said, "check")]
 
 
 def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
