@@ -38,6 +38,7 @@ from .nlp.parameters import Parameter, Parameters, Tied, Unknown
 from .nlp.schemes import Scheme, Stencil
 from .nlp.simulation import Trajectory, simulate, with_markers
 from .problem import Problem, RolloutOptions, UncertaintyOptions
+from .refine import refine
 from .run import Run, run, solve
 
 __version__ = version("collocation-sysid")
@@ -86,6 +87,7 @@ __all__ = [
     "UncertaintyOptions",
     "Unknown",
     "place_markers",
+    "refine",
     "run",
     "simulate",
     "solve",

@@ -360,6 +360,36 @@ def check(
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 
+@app.command(epilog=_examples("refine runs/swing", "refine runs/swing --levels 3"))
+def refine(
+    run_folder: RunFolder,
+    levels: Annotated[int, typer.Option(help="2, or 3 to observe the orders: much longer.")] = 2,
+    allow_code: AllowCode = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Solve again with half the step and a finer mesh: the numerical error.
+
+    Each starts from the run's answer. The folder gets refinement.json, and result.json the
+    numerical error of each parameter, with an interval for noise and discretisation.
+    """
+    from .output.record import as_json as json_text
+    from .output.refined import refine_run
+    from .terminal import refinement_table
+
+    def say(what: str) -> None:
+        if not quiet:
+            errors.print(Text(what, style="dim"), soft_wrap=True)
+
+    found, result = refine_run(run_folder, levels, allow_code, say)
+    if as_json:
+        typer.echo(json_text({**found.as_dict(), "trust": result["trust"]}))
+    else:
+        _show(refinement_table(found))
+        for reason in result["trust"]["reasons"]:
+            _show(Text(f"{result['trust']['verdict']}: {reason}"))
+
+
 @app.command(epilog=_examples("plot runs/swing"))
 def plot(
     run_folder: RunFolder,

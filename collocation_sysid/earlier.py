@@ -11,10 +11,12 @@ import numpy as np
 
 from .arrays import Array
 from .errors import InputError
+from .methods.solution import Solution
 from .methods.start import marched
 from .nlp.collocation import Collocation
 from .nlp.segment import Segment
 from .problem import Problem
+from .statistics.linearised import Derived
 
 RESULT_FILE = "result.json"
 
@@ -65,6 +67,24 @@ class Earlier:
             what = f"is damaged ({type(error).__name__}: {error}); solve that problem again"
             raise InputError(what, file) from error
         return cls(Path(folder), values, nuisance, places_m)
+
+    @classmethod
+    def of(cls, solution: Solution) -> Earlier:
+        """What was just found."""
+        collocation, nuisance, places_m = solution.collocation, {}, {}
+        for part in collocation.parts(solution.z):
+            segment = part.segment
+            kinds, names, scales = (
+                getattr(segment.nuisance, key) for key in ("kinds", "names", "scales")
+            )
+            for kind, name, phi, scale in zip(kinds, names, part.phi, scales, strict=True):
+                if kind != "place":
+                    nuisance[name] = float(phi * scale)
+            markers = segment.experiment.markers.names
+            places = segment.places_m(part.phi)
+            places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))
+        moduli = Derived.of((s.constants for s in collocation.segments), solution.q).values
+        return cls(Path(), {**moduli, **solution.parameters}, nuisance, places_m)
 
     def started(self, problem: Problem) -> Problem:
         """The problem with what was found as its guesses, clipped to its bounds.

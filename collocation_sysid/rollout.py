@@ -16,6 +16,8 @@ from .nlp.parameters import Parameters
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem
+from .statistics.linearised import Derived, LinearisedFit
+from .statistics.numerical import changes_towards
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,3 +91,39 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     (segment,) = alone.segments
     # All that is left to estimate is φ.
     return segment, alone.parameters_of(ReducedSpace()(alone).z) if alone.nphi else np.zeros(0)
+
+
+def step_changes(
+    problem: Problem,
+    solution: Solution,
+    fit: LinearisedFit,
+    rollouts: Mapping[str, Rollout | str],
+) -> dict[str, float] | None:
+    """Change of every parameter and modulus that a finer step would bring, to first order.
+
+    A Gauss–Newton step towards the roll-outs; None where these are missing or no finer.
+    """
+    apart: list[Array] = []
+    parts = zip(solution.collocation.segments, solution.readings_m, strict=True)
+    for segment, readings in parts:
+        experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)
+        if not isinstance(rollout, Rollout) or not _finer(problem, experiment.timestep_s):
+            return None
+        way = rollout.trajectory.markers_m - readings
+        apart.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
+    collocation = solution.collocation
+    q, change = solution.q, changes_towards(fit, apart)[: collocation.nq]
+    parameters = collocation.parameters
+    after, before = (parameters.values(q + way) for way in (change, 0 * change))
+    moduli = Derived.of((s.constants for s in collocation.segments), q).by_q
+    return {
+        **{name: after[name] - value for name, value in before.items() if after[name] != value},
+        **{name: float(slopes @ change) for name, slopes in moduli.items() if slopes.any()},
+    }
+
+
+def _finer(problem: Problem, interval_s: float) -> bool:
+    """Whether roll-outs have at most half the step of the fit."""
+    options = problem.rollout
+    step_s = options.timestep_s or interval_s / 4
+    return options.integrator == "newmark" and step_s <= 0.501 * interval_s / problem.substeps

@@ -24,18 +24,19 @@ from .methods.start import placed_at_guess
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
 from .problem import Problem
-from .rollout import Rollout, roll_out
+from .rollout import Rollout, roll_out, step_changes
 from .statistics.cause import Cause
 from .statistics.causes import likely_causes
 from .statistics.diagnostics import MarkerDiagnosis, diagnose
 from .statistics.estimates import Estimate
 from .statistics.identifiability import verdicts
 from .statistics.linearised import Derived, linearised_fit
+from .statistics.numerical import Refinement
 from .statistics.places import Place, places_of
 from .statistics.pose_noise import pose_noise_draws
 from .statistics.profile import Profile
 from .statistics.profiling import profile_of
-from .statistics.trust import Trust, cause_concerns
+from .statistics.trust import Trust, cause_concerns, numerical_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
 from .verdict import concerns, expected_rms_m, motions_of
 
@@ -69,6 +70,11 @@ class Run:
         What went wrong after the solve.
     causes : tuple of Cause
         What is likely described wrongly, likeliest first.
+    step_changes : mapping of name to float, or None
+        What a finer step would change of parameters and moduli, to first order; None where the
+        roll-outs have no finer step.
+    refinement : Refinement or None
+        The answer at finer discretisations, where it was asked for.
     """
 
     problem: Problem
@@ -79,6 +85,8 @@ class Run:
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
+    step_changes: Mapping[str, float] | None = None
+    refinement: Refinement | None = None
 
     def __repr__(self) -> str:
         solution = self.solution
@@ -124,7 +132,8 @@ class Run:
         found = concerns(
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
-        return Trust.of((*cause_concerns(self.causes), *found))
+        numerical = numerical_concerns(self.estimates, self.step_changes, self.refinement)
+        return Trust.of((*cause_concerns(self.causes), *found, *numerical))
 
     @cached_property
     def motions(self) -> dict[str, Motion]:
@@ -226,7 +235,7 @@ def solve(
     problem: Problem,
     method: str | Method | None = None,
     watch: Watch | None = None,
-    start: str | Path | None = None,
+    start: str | Path | Earlier | None = None,
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
 
@@ -238,9 +247,9 @@ def solve(
         problem's own by default.
     watch : callable, optional
         Called with every `Iteration`.
-    start : str or Path, optional
-        The folder of an earlier run, of any mesh or timestep, whose answer takes the place of the
-        guesses where names match.
+    start : str, Path or Earlier, optional
+        An earlier answer or the folder of its run, of any mesh or timestep; it takes the place of
+        the guesses where names match.
 
     Raises
     ------
@@ -249,7 +258,7 @@ def solve(
         is found, and when the solver refuses the problem.
     """
     solver = problem.solver(method)
-    earlier = None if start is None else Earlier.read(start)
+    earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start
     problem = problem if earlier is None else earlier.started(problem)
     try:
         whole = getattr(solver, "needs_whole_start", False)
@@ -304,7 +313,7 @@ def run(
     method: str | Method | None = None,
     watch: Watch | None = None,
     log: Log | None = None,
-    start: str | Path | None = None,
+    start: str | Path | Earlier | None = None,
     seek_causes: bool = True,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
@@ -333,7 +342,12 @@ def run(
         return found
     say("looking for causes of the misfit")
     turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
-    return replace(found, notes=(*turns, *found.notes), causes=likely_causes(solution))
+    found = replace(found, notes=(*turns, *found.notes), causes=likely_causes(solution))
+    if problem.uncertainty.numerical and found.uncertainty is not None:
+        from .refine import refine  # which solves, as this module does
+
+        return refine(found, say=say)
+    return found
 
 
 def _checked(
@@ -364,4 +378,14 @@ def _checked(
             profiles.append(profile_of(solution, fit, uncertainty, name))
     except InputError as error:
         raise error.located(problem.path) from error
-    return Run(problem, solution, rollouts, uncertainty, diagnoses, tuple(profiles), notes)
+    changes = step_changes(problem, solution, fit, rollouts)
+    return Run(
+        problem,
+        solution,
+        rollouts,
+        uncertainty,
+        diagnoses,
+        tuple(profiles),
+        notes,
+        step_changes=changes,
+    )

@@ -22,6 +22,7 @@ from .nlp.parameters import Parameter
 from .problem import Problem
 from .rollout import Rollout
 from .run import Run
+from .statistics.numerical import Refinement
 from .statistics.places import Place
 from .statistics.uncertainty import Estimate
 
@@ -129,7 +130,8 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [parameter_table(finished), *_verdict(finished), *_nuisance(finished)]
+    parts += [parameter_table(finished), *_numerical(finished)]
+    parts += [*_verdict(finished), *_nuisance(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
     parts.append(Text(f"written to {folder}"))
@@ -152,6 +154,55 @@ def parameter_table(finished: Run) -> Table:
     for name, estimate in finished.estimates.items():
         table.add_row(*_estimate_cells(name, estimate), guesses.get(name, ""))
     return table
+
+
+def refinement_table(found: Refinement) -> Table:
+    """What step and mesh change, and intervals for noise and discretisation."""
+    heads = (
+        "",
+        "half the step",
+        "order",
+        "half the edges",
+        "order",
+        "limit",
+        "95 % interval with it",
+    )
+    table = Table(*heads, box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, error in found.errors.items():
+        interval = "" if error.ci95 is None else "{:.5g} … {:.5g}".format(*error.ci95)
+        table.add_row(
+            f"{symbol_of(name)} {unit_of(name)}".strip(),
+            *(_change(error.step), _order(error.step_order)),
+            *(_change(error.mesh), _order(error.mesh_order)),
+            f"{error.extrapolated:.5g}",
+            interval,
+        )
+    return table
+
+
+def _change(change: float | None) -> str:
+    return "" if change is None else f"{change:+.3g}"
+
+
+def _order(order: float | None) -> str:
+    return "" if order is None else f"{order:.1f}"
+
+
+def _numerical(finished: Run) -> list[RenderableType]:
+    """What is known of the numerical error."""
+    if finished.refinement is not None:
+        return [refinement_table(finished.refinement)]
+    values, changes = finished.estimates, finished.step_changes
+    if not changes:
+        return []
+    said = [
+        f"{symbol_of(name)} {100 * change / values[name].value:+.2g} %"
+        for name, change in changes.items()
+        if values[name].value and not values[name].at_bound
+    ]
+    return [Text(f"a finer step would change, to first order: {', '.join(said)}")]
 
 
 def _guess(item: Parameter) -> str:

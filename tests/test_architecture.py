@@ -21,7 +21,7 @@ LAYERS = (
     {"methods"},
     {"statistics"},
     {"problem"},
-    {"check", "earlier", "rollout", "verdict", "run"},
+    {"check", "earlier", "rollout", "verdict", "run", "refine"},
     {"output", "synthesis"},
     {"terminal", "method_tables"},
     {"study"},

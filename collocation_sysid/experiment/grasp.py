@@ -36,6 +36,8 @@ class Grasp:
     sigma_m, sigma_rad : float, optional
         Standard deviations of the noise of each pose, which widen the error bars; judged by how
         rough the poses are where they are not given.
+    selection : Selection, optional
+        What selected the nodes, where something did: on a finer mesh it selects others.
     """
 
     nodes: Index
@@ -44,6 +46,7 @@ class Grasp:
     until_s: float
     sigma_m: float | None
     sigma_rad: float | None
+    selection: Selection | None
 
     def __init__(
         self,
@@ -53,6 +56,7 @@ class Grasp:
         until_s: float = np.inf,
         sigma_m: float | None = None,
         sigma_rad: float | None = None,
+        selection: Selection | None = None,
     ) -> None:
         if not from_s <= until_s:
             raise InputError(
@@ -69,6 +73,7 @@ class Grasp:
             until_s=until_s,
             sigma_m=sigma_m,
             sigma_rad=sigma_rad,
+            selection=held if isinstance(held, Selection) else selection,
         )
 
     def on(self, body: Body, t_s: Array) -> Grasp:

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
+from ..fem.selection import Selection
 from .arrays import on_body, read_only_floats, some_nodes
 from .clock import TIME_TOLERANCE_S, first_time_fault
 
 if TYPE_CHECKING:
     from ..fem.body import Body
-    from ..fem.selection import Selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,19 +32,27 @@ class PointMass:
         Of all nodes together.
     from_s : float
         When it joins the body; it then moves at the body's velocity. Always, by default.
+    selection : Selection, optional
+        What selected the nodes, where something did: on a finer mesh it selects others.
     """
 
     nodes: Index
     mass_kg: float
     from_s: float
+    selection: Selection | None
 
     def __init__(
-        self, nodes: ArrayLike | Selection, mass_kg: float, from_s: float = -np.inf
+        self,
+        nodes: ArrayLike | Selection,
+        mass_kg: float,
+        from_s: float = -np.inf,
+        selection: Selection | None = None,
     ) -> None:
         if not (np.isfinite(mass_kg) and mass_kg > 0):
             raise InputError(f"mass_kg of a point mass is {mass_kg:g}; expected more than 0")
         tied = some_nodes(nodes, "the point mass")
-        vars(self).update(nodes=tied, mass_kg=mass_kg, from_s=from_s)
+        chosen = tied if isinstance(tied, Selection) else selection
+        vars(self).update(nodes=tied, mass_kg=mass_kg, from_s=from_s, selection=chosen)
 
     def on(self, body: Body) -> PointMass:
         """The same mass on the nodes of a body that are selected."""
@@ -72,14 +80,21 @@ class Force:
         Total force [N], in the frame of the measurements.
     t_s : (m,) array, optional
         Times of the rows; the force is zero outside them. A single row without a time is constant.
+    selection : Selection, optional
+        What selected the nodes, where something did: on a finer mesh it selects others.
     """
 
     nodes: Index
     force_n: Array
     t_s: Array | None
+    selection: Selection | None
 
     def __init__(
-        self, nodes: ArrayLike | Selection, force_n: ArrayLike, t_s: ArrayLike | None = None
+        self,
+        nodes: ArrayLike | Selection,
+        force_n: ArrayLike,
+        t_s: ArrayLike | None = None,
+        selection: Selection | None = None,
     ) -> None:
         pulled = some_nodes(nodes, "the force")
         rows = read_only_floats(np.atleast_2d(force_n), (None, 3), "force_n")
@@ -89,7 +104,8 @@ class Force:
             t_s = read_only_floats(t_s, (len(rows),), "t_s of the force")
             if fault := first_time_fault(t_s):
                 raise InputError(fault[1], where=f"row {fault[0] + 1}")
-        vars(self).update(nodes=pulled, force_n=rows, t_s=t_s)
+        chosen = pulled if isinstance(pulled, Selection) else selection
+        vars(self).update(nodes=pulled, force_n=rows, t_s=t_s, selection=chosen)
 
     def on(self, body: Body) -> Force:
         """The same force on the nodes of a body that are selected."""

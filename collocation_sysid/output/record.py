@@ -28,6 +28,7 @@ from .replay import Replay
 from .writers import run_folder, write_frames
 
 SCHEMA_VERSION = 2
+REFINEMENT_FILE = "refinement.json"
 
 
 def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
@@ -43,6 +44,9 @@ def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
         if origin is not None:
             (place / "problem.toml").write_text(origin.text, encoding="utf-8")
         (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
+        if finished.refinement is not None:
+            text = as_json(finished.refinement.as_dict())
+            (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
         seen = replays(finished)
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
         _write_pictures(finished, seen, place)
@@ -147,7 +151,7 @@ def result(finished: Run) -> dict[str, Any]:
         "method": solution.method,
         "title": problem.title,
         "parameters": _parameters(finished),
-        "derived": {name: _with_error_bar(finished.estimates[name]) for name in finished.derived},
+        "derived": {name: _with_errors(finished, name) for name in finished.derived},
         "places": _places(finished),
         "nuisance": _nuisance(finished),
         "uncertainty": _uncertainty(finished),
@@ -240,9 +244,19 @@ def _parameters(finished: Run) -> dict[str, Any]:
         item.name: {
             "guess": item.guess,
             "fixed": item.fixed or item.tied is not None,
-            **_with_error_bar(finished.estimates[item.name]),
+            **_with_errors(finished, item.name),
         }
         for item in finished.started_from.items
+    }
+
+
+def _with_errors(finished: Run, name: str) -> dict[str, Any]:
+    changes, refined = finished.step_changes or {}, finished.refinement
+    measured = None if refined is None else refined.errors.get(name)
+    numerical = {"step": changes[name]} if name in changes else None
+    return {
+        **_with_error_bar(finished.estimates[name]),
+        "numerical_error": asdict(measured) if measured is not None else numerical,
     }
 
 
@@ -320,6 +334,7 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
         "covariance": found.covariance.tolist(),
         "quantiles": found.quantiles.tolist(),
         "verdicts": list(verdicts(found)),
+        "recordings": _recordings(finished),
         "profiles": {
             profile.parameter: {
                 "interval": list(profile.interval),
@@ -330,6 +345,30 @@ def _uncertainty(finished: Run) -> dict[str, Any] | None:
             }
             for profile in finished.profiles
         },
+    }
+
+
+def _recordings(finished: Run) -> dict[str, Any] | None:
+    """What each recording says by itself of the parameters, to first order, and how they agree."""
+    found = finished.uncertainty
+    if found is None or found.scatter is None:
+        return None
+    scatter, free = found.scatter, finished.solution.collocation.parameters.free
+    q = finished.solution.q
+    return {
+        item.name: {
+            "values": {
+                name: item.value(float(q[k] + away)) if np.isfinite(away) else None
+                for name, away in zip(scatter.recordings, scatter.away[:, k], strict=True)
+            },
+            "deviations": dict(
+                zip(scatter.recordings, scatter.deviations[:, k].tolist(), strict=True)
+            ),
+            "chi_squared": float(scatter.chi_squared[k]),
+            "degrees_of_freedom": int(scatter.freedom[k]),
+            "disagree": bool(scatter.disagreeing[k]),
+        }
+        for k, item in enumerate(free)
     }
 
 

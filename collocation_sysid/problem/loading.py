@@ -25,7 +25,11 @@ T = TypeVar("T")
 
 
 def read_problem(
-    path: str | Path, overrides: Sequence[str], allow_code: bool, simulation: bool
+    path: str | Path,
+    overrides: Sequence[str],
+    allow_code: bool,
+    simulation: bool,
+    folder: str | Path | None = None,
 ) -> Problem:
     """Read a problem file and the files it names, see `Problem.read`."""
     path = Path(path)
@@ -34,7 +38,7 @@ def read_problem(
         raise InputError(
             "every experiment has validation = true; expected at least one to fit", path
         )
-    folder = path.parent
+    folder = path.parent if folder is None else Path(folder)
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
     body = _located(path, "object", lambda: _load_body(file.object, mesh, folder, allow_code))
     parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))

@@ -50,11 +50,14 @@ class UncertaintyOptions(Options):
         What to assume of the errors; "auto" tests the residuals.
     profile : tuple of str
         Parameters whose profile likelihood is wanted.
+    numerical : bool
+        Solve again with half the step and on a mesh twice as fine, and tell what that changes.
     """
 
     noise: NoiseOption = "auto"
     errors: ErrorsOption = "auto"
     profile: tuple[str, ...] = ()
+    numerical: bool = False
 
 
 @dataclass(frozen=True)
@@ -173,6 +176,7 @@ class Problem:
         overrides: Sequence[str] = (),
         allow_code: bool = False,
         simulation: bool = False,
+        folder: str | Path | None = None,
     ) -> Problem:
         """Read a problem file (TOML) and the files it names.
 
@@ -185,6 +189,8 @@ class Problem:
         simulation : bool
             Markers need no file then: those with a `reference_m` are sampled at the poses' times.
             And every experiment may be for validation.
+        folder : str or Path, optional
+            Where the files that it names are sought; next to it by default.
 
         Raises
         ------
@@ -193,7 +199,7 @@ class Problem:
         """
         from .loading import read_problem  # files are one way to make a problem
 
-        return read_problem(path, overrides, allow_code, simulation)
+        return read_problem(path, overrides, allow_code, simulation, folder)
 
     @property
     def path(self) -> Path | None:

@@ -216,19 +216,21 @@ class RecordingReader:
             **grasp.model_dump(
                 include={"from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
             ),
+            selection=selection(grasp.nodes),
         )
 
     def _mass(self, k: int, mass: MassSection) -> PointMass:
         nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")
-        return PointMass(nodes, **mass.model_dump(include={"mass_kg", "from_s"}, exclude_none=True))
+        given = mass.model_dump(include={"mass_kg", "from_s"}, exclude_none=True)
+        return PointMass(nodes, **given, selection=selection(mass.nodes))
 
     def _force(self, k: int, force: ForceSection) -> Force:
-        nodes = self._nodes(force.nodes, f"force.{k}.nodes")
+        nodes, chosen = self._nodes(force.nodes, f"force.{k}.nodes"), selection(force.nodes)
         if force.force_n is not None:
-            return Force(nodes, np.array(force.force_n))
+            return Force(nodes, np.array(force.force_n), selection=chosen)
         assert force.file is not None  # by the schema
         t_s, force_n = read_forces(existing_file(self.folder, force.file, f"force.{k}.file"))
-        return Force(nodes, force_n, t_s)
+        return Force(nodes, force_n, t_s, chosen)
 
     def _nodes(self, nodes: NodesSection | str, key: str) -> NDArray[np.int64]:
         try:

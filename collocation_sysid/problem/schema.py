@@ -219,6 +219,10 @@ class UncertaintySection(Section):
         default_factory=list,
         description="List of the parameters whose profile likelihood is wanted.",
     )
+    numerical: bool = Field(
+        default=False,
+        description="Solve again with half the step and on a finer mesh: the numerical error.",
+    )
 
 
 class RolloutSection(Section):

@@ -71,6 +71,7 @@ def information(fit: LinearisedFit) -> Information:
     values, vectors = np.linalg.eigh(matrix / np.outer(units, units))
     known = values > SINGULAR
     root = vectors[:, known] / np.sqrt(values[known]) / units[:, None]
-    undetermined = (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
+    undetermined = np.zeros(count, dtype=bool)
+    undetermined |= (np.abs(vectors[:, ~known]) > NEGLIGIBLE).any(axis=1)
     prior = root * fit.prior_slope[:, None]
     return Information(root, tuple(slope @ root for slope in slopes), prior.T @ prior, undetermined)

@@ -7,7 +7,7 @@ good, however many markers and nuisance parameters there are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +17,9 @@ from scipy.stats import norm
 from ..arrays import Array
 from .cause import Cause
 from .diagnostics import MOST_WILD, MarkerDiagnosis
+from .estimates import Estimate
 from .noise import NoiseLevel
+from .numerical import Refinement
 from .uncertainty import Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
@@ -46,6 +48,8 @@ WILD, HARDLY_TAME = MOST_WILD, 0.2
 # What a scheme adds to the damping ratio, over it; and by how much it may lengthen a period.
 DAMPING_SHARE, GROSS_DAMPING_SHARE, LITTLE_DAMPING = 0.2, 1.0, 0.005
 PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
+# How what is said of the numerical error begins: estimated, and measured.
+STEP_MOVES = "the step moves", "step and mesh move"
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,17 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         concerns.append(
             (f"sigma_m seems {1 / factor:.2g} times too large for these residuals", "check")
         )
-    return concerns + _uneven_concerns(uncertainty.level)
+    return concerns + _uneven_concerns(uncertainty.level) + _scatter_concerns(uncertainty)
+
+
+def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
+    """Recordings that disagree on what they share."""
+    scatter = uncertainty.scatter
+    if scatter is None or not scatter.disagreeing.any():
+        return []
+    which = [uncertainty.names[k] for k in np.flatnonzero(scatter.disagreeing)]
+    said = f"the recordings disagree on {_listed(which)}: model error decides, not noise"
+    return [(said, "check")]
 
 
 def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
@@ -144,6 +158,40 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
         said = f"these data do not tell {_listed(vague)}"
         concerns.append((said, "doubtful" if none else "check"))
     return concerns
+
+
+def numerical_concerns(
+    estimates: Mapping[str, Estimate],
+    step_changes: Mapping[str, float] | None,
+    refinement: Refinement | None = None,
+) -> list[Concern]:
+    """Where step or mesh matter more than the noise; what is unknown gives no concern.
+
+    Parameters
+    ----------
+    estimates : mapping of name to Estimate
+    step_changes : mapping of name to float, or None
+        What a finer step would change.
+    refinement : Refinement, optional
+        Takes their place.
+    """
+    if refinement is not None:
+        ways = {n: each.extrapolated - estimates[n].value for n, each in refinement.errors.items()}
+        what, remedy = STEP_MOVES[1], "its interval is that of refine"
+    else:
+        ways, what = step_changes or {}, STEP_MOVES[0]
+        remedy = "halve it (transcription.substeps), or see what refine says"
+    deviations = {
+        name: abs(way) / error
+        for name, way in ways.items()
+        if (error := estimates[name].std_error) is not None and error > 0
+    }
+    worst = max(deviations, key=deviations.__getitem__, default=None)
+    if worst is None or deviations[worst] <= 1:
+        return []
+    value, many = estimates[worst].value, deviations[worst]
+    said = f"{what} {worst} by {100 * ways[worst] / value:+.2g} %, {many:.2g} standard errors"
+    return [(f"{said}: {remedy}", "check")]
 
 
 def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:

@@ -42,6 +42,7 @@ from .linearised import AT_BOUND, LinearisedFit, linearised_fit
 from .memory_notes import memory_notes
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
 from .pose_noise import pose_noise_draws
+from .scatter import Scatter, scatter_of, single_fits
 from .sensitivity import marker_sensitivities, sensitivities
 
 __all__ = [
@@ -100,6 +101,8 @@ class Uncertainty:
         Measurements less parameters; one that a prior determines counts in part.
     notes : tuple of str
         What the user should know.
+    scatter : Scatter or None
+        What the recordings say one by one, where there are several.
     """
 
     names: tuple[str, ...]
@@ -117,6 +120,7 @@ class Uncertainty:
     chi_squared: float
     degrees_of_freedom: float
     notes: tuple[str, ...]
+    scatter: Scatter | None = None
 
     @property
     def reduced_chi_squared(self) -> float:
@@ -212,6 +216,14 @@ def uncertainty_of(
     lost = np.flatnonzero(np.diag(of_q) > UNDETERMINED**2)
     of_q[lost] = of_q[:, lost] = np.nan
     of_q[lost, lost] = np.inf
+    scatter = _scatter(fit, parameters, q, noise, errors, extra)
+    if scatter is not None:
+        with np.errstate(invalid="ignore"):
+            factors = np.sqrt(scatter.widened(np.diag(of_q)) / np.diag(of_q))
+        factors = np.where(scatter.disagreeing, factors, 1.0)
+        of_q *= np.outer(factors, factors)
+        of_few = t.ppf(0.975, np.maximum(scatter.freedom, 1))
+        quantiles = np.where(scatter.disagreeing, np.maximum(quantiles, of_few), quantiles)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
     sizes = relative_slopes(parameters, q)
     return Uncertainty(
@@ -236,8 +248,34 @@ def uncertainty_of(
             *memory_notes(estimates, max((float(np.ptp(b.t_s)) for b in fit.blocks), default=0.0)),
             *_size_notes(noise, kind, level, used),
             *_correlation_notes(used, found, forced=errors == "independent"),
+            *_scatter_notes(fit, scatter),
         ),
+        scatter=scatter,
     )
+
+
+def _scatter(
+    fit: LinearisedFit,
+    parameters: Parameters,
+    q: Array,
+    noise: NoiseOption,
+    errors: ErrorsOption,
+    extra: Extra | None,
+) -> Scatter | None:
+    """What recordings say one by one, with error bars of their own."""
+    if len(fit.blocks) < 2:
+        return None
+    names, steps, variances = [], [], []
+    sizes = relative_slopes(parameters, q)
+    for k, (alone, step) in enumerate(single_fits(fit)):
+        if alone.measurements <= len(alone.names):
+            continue
+        own = None if extra is None else [extra[k]]
+        found = uncertainty_of(alone, parameters, q, noise, errors, own)
+        names.append(alone.blocks[0].name)
+        steps.append(step)
+        variances.append(np.diag(found.covariance) / sizes**2)
+    return scatter_of(names, steps, variances) if len(names) > 1 else None
 
 
 def _check(noise: str, errors: str) -> None:
@@ -318,6 +356,17 @@ def _autocorrelated(
 def _widens(fit: LinearisedFit, correlated: tuple[Array, Array], independent: Array) -> bool:
     before, after = (np.diag(each)[: fit.shared] for each in (independent, correlated[0]))
     return bool((after > CONSEQUENCE**2 * before).any())
+
+
+def _scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
+    if scatter is None:
+        return []
+    return [
+        f"the recordings disagree on {fit.names[k]} (χ² {scatter.chi_squared[k]:.3g} for "
+        f"{scatter.freedom[k]} degrees of freedom): model error decides, and its interval holds "
+        "what they disagree by"
+        for k in np.flatnonzero(scatter.disagreeing).tolist()
+    ]
 
 
 def _parameter_notes(

@@ -122,6 +122,7 @@ def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
                     "reason": "fixed" if found.get("fixed") else found.get("reason"),
                     "guess": found.get("guess"),
                     "derived": group == "derived",
+                    "numerical": found.get("numerical_error"),
                 }
             )
     return rows

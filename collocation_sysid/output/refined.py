@@ -1,0 +1,83 @@
+"""A finished run and its numerical error: the run's folder gets what `refine` finds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ..earlier import RESULT_FILE, Earlier
+from ..errors import InputError
+from ..problem import Problem
+from ..refine import refinement_of
+from ..statistics.estimates import Estimate
+from ..statistics.numerical import Refinement
+from ..statistics.trust import STEP_MOVES, numerical_concerns
+from .record import REFINEMENT_FILE, as_json
+
+
+def refine_run(
+    folder: str | Path,
+    levels: int = 2,
+    allow_code: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Refinement, dict[str, Any]]:
+    """Solve the problem of a run folder again at finer discretisations, and write what that tells.
+
+    ``refinement.json`` is new; in ``result.json`` parameters and moduli get their
+    ``numerical_error``, and the verdict takes it into account.
+
+    Returns
+    -------
+    The refinement, and the content of ``result.json``
+
+    Raises
+    ------
+    InputError
+        If the folder holds no converged run of a problem file, or its files are gone.
+    """
+    file = Path(folder) / RESULT_FILE
+    answer = Earlier.read(folder)
+    result = json.loads(file.read_text(encoding="utf-8"))
+    problem_file = result["provenance"]["problem_file"]
+    if problem_file is None:
+        raise InputError("the run is of no problem file; use collocation_sysid.refine", file)
+    if not result["converged"]:
+        raise InputError("the run did not converge: there is no answer to refine", file)
+    copy, home = Path(folder) / "problem.toml", Path(problem_file).parent
+    problem = Problem.read(copy, allow_code=allow_code, folder=home)
+    groups = [result[key] for key in ("parameters", "derived")]
+    estimates = {name: _estimate(each) for group in groups for name, each in group.items()}
+    found = refinement_of(problem, answer, estimates, levels, say)
+    for group in groups:
+        for name in set(group) & set(found.errors):
+            group[name]["numerical_error"] = asdict(found.errors[name])
+    result["trust"] = _judged(result["trust"], estimates, found)
+    (file.parent / REFINEMENT_FILE).write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
+    file.write_text(as_json(result) + "\n", encoding="utf-8")
+    return found, result
+
+
+def _estimate(found: dict[str, Any]) -> Estimate:
+    interval = found["ci95"]
+    return Estimate(
+        found["value"],
+        found["std_error"],
+        None if interval is None else (interval[0], interval[1]),
+        found["at_bound"],
+        found["reason"],
+    )
+
+
+def _judged(
+    trust: dict[str, Any], estimates: dict[str, Estimate], found: Refinement
+) -> dict[str, Any]:
+    """The verdict with what was measured in place of what was estimated."""
+    kept = [reason for reason in trust["reasons"] if not reason.startswith(STEP_MOVES)]
+    reasons = [*kept, *(said for said, _ in numerical_concerns(estimates, None, found))]
+    verdict = trust["verdict"]
+    if verdict != "doubtful":
+        verdict = "check" if reasons else "good"
+    return {"verdict": verdict, "reasons": reasons}

@@ -1,0 +1,125 @@
+"""The answer again with half the step, and on a mesh twice as fine: its numerical error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from .earlier import Earlier
+from .errors import InputError
+from .experiment import refinement
+from .fem.refinement import refined
+from .methods.reduced_space import ReducedSpace
+from .methods.solution import Solution
+from .nlp.schemes import as_scheme
+from .problem import Problem
+from .run import Run, solve
+from .statistics.estimates import Estimate
+from .statistics.numerical import Refinement, numerical_error
+
+# Errors of smooth solutions fall with the square of linear elements' edges, and faster for
+# quadratic ones; where the body leaves its grasp they do not.
+MESH_ORDER = 2.0
+MOST_LEVELS = 3
+# Last step of the logarithms: far below any error bar.
+TOLERANCE = 1e-6
+
+
+def finer_step(problem: Problem) -> Problem:
+    """The problem with half the step."""
+    return replace(problem, substeps=2 * problem.substeps)
+
+
+def finer_mesh(problem: Problem) -> Problem:
+    """The problem with every tetrahedron split into eight."""
+    bodies = {id(body): refined(body) for body in problem.bodies}
+    experiments = [refinement.refined(e, bodies[id(e.body)]) for e in problem.experiments]
+    return replace(problem, experiments=experiments)
+
+
+FINER = {"step": finer_step, "mesh": finer_mesh}
+
+
+def refine(finished: Run, levels: int = 2, say: Callable[[str], None] | None = None) -> Run:
+    """A converged run with its numerical error, see `refinement_of`."""
+    answer = Earlier.of(finished.solution)
+    found = refinement_of(finished.problem, answer, finished.estimates, levels, say)
+    return replace(finished, refinement=found)
+
+
+def refinement_of(
+    problem: Problem,
+    answer: Earlier,
+    estimates: Mapping[str, Estimate],
+    levels: int = 2,
+    say: Callable[[str], None] | None = None,
+) -> Refinement:
+    """Solve again at finer discretisations, each from the answer before.
+
+    The step and the mesh are halved by themselves: their errors add up to first order. Finer
+    problems are solved by the reduced space, whatever method found the answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    answer : Earlier
+    estimates : mapping of name to Estimate
+        The answer's.
+    levels : int
+        2, or 3 to observe the orders.
+    say : callable, optional
+        Called with what is being done now.
+
+    Raises
+    ------
+    InputError
+        For another number of levels, or where a finer problem is not solved.
+    """
+    if not 2 <= levels <= MOST_LEVELS:
+        raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
+    fitted = [experiment for experiment in problem.experiments if not experiment.validation]
+    coarse = replace(problem, experiments=fitted, notes=())
+    found: dict[str, list[dict[str, Any]]] = {}
+    for kind, finer in FINER.items():
+        at, start, found[kind] = coarse, answer, []
+        for level in range(1, levels):
+            at = finer(at)
+            if say is not None:
+                say(f"solving again: {kind} halved {level}×")
+            solution = _solved(at, start, f"{kind} halved {level}×")
+            start = Earlier.of(solution)
+            found[kind].append(_level(kind, level, solution))
+    linear = {item.name for item in problem.parameters.items if item.scale == "linear"}
+    orders = as_scheme(problem.scheme).order, MESH_ORDER
+    errors = {}
+    for name, estimate in estimates.items():
+        by_step, by_mesh = ([each["values"][name] for each in found[kind]] for kind in FINER)
+        # What is fixed, or at its bound, stays.
+        if any(value != estimate.value for value in (*by_step, *by_mesh)):
+            is_linear = name in linear
+            errors[name] = numerical_error(name, estimate, by_step, by_mesh, orders, is_linear)
+    return Refinement(errors, tuple(each for kind in FINER for each in found[kind]))
+
+
+def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
+    solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
+    if not solution.status.converged:
+        raise InputError(
+            f"the problem with the {what} was not solved ({solution.status.value}: "
+            f"{solution.message}); solve it by itself to see why"
+        )
+    return solution
+
+
+def _level(kind: str, level: int, solution: Solution) -> dict[str, Any]:
+    segments = solution.collocation.segments
+    return {
+        "halved": kind,
+        "times": level,
+        "timesteps": sum(segment.grid_rows for segment in segments),
+        "nodes": sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
+        "iterations": solution.iterations,
+        "time_s": solution.timing.total,
+        "values": dict(Earlier.of(solution).values),
+    }

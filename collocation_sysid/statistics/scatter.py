@@ -1,0 +1,117 @@
+"""By how much recordings disagree on the parameters that they share.
+
+To first order the estimate from one recording alone is a Gauss–Newton step away from the joint
+answer: with S its slopes by the shared parameters and its own nuisance parameters, and P the
+slopes of the latter's priors, (SᵀS + PᵀP)⁻¹ Sᵀ r. Its covariance is found as that of any fit. For
+each parameter
+
+    χ² = Σ (x_e − x̄)² / v_e,   x̄ = Σ x_e / v_e / Σ 1 / v_e,
+
+with one degree of freedom less than there are recordings that tell it. If it is larger than chance
+allows, something but the noise differs among recordings: the model's error. Error bars are then
+√(χ² / f) times as large (Birge 1932), and intervals are Student's. The joint fit may have seen
+that error in its residuals already; not to count it twice, 1 / Σ 1 / v_e widened so is enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ..arrays import Array
+from .linearised import LinearisedFit
+
+# Probability that recordings without such an error are said to disagree, for all parameters.
+SIGNIFICANT = 0.01
+# A recording tells a parameter if the deviation of its q is below this; else a step tells nothing.
+TELLING = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """What single recordings say, in the solver's coordinates.
+
+    Attributes
+    ----------
+    recordings : (n,) names
+    away : (n, nq) estimates from each less the joint one; NaN where it does not tell
+    deviations : (n, nq) their standard deviations; NaN likewise
+    """
+
+    recordings: tuple[str, ...]
+    away: Array
+    deviations: Array
+
+    @property
+    def chi_squared(self) -> Array:
+        """(nq,) χ² of the disagreement."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            weight = np.nan_to_num(1 / self.deviations**2)
+            mean = np.nansum(weight * self.away, axis=0) / weight.sum(axis=0)
+        return np.nansum(weight * np.nan_to_num(self.away - mean) ** 2, axis=0)
+
+    @property
+    def freedom(self) -> NDArray[np.int64]:
+        """(nq,) its degrees of freedom."""
+        return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
+
+    @property
+    def disagreeing(self) -> NDArray[np.bool_]:
+        """(nq,) parameters on which the recordings disagree more than by chance."""
+        freedom = self.freedom
+        p = chi2.sf(self.chi_squared, np.maximum(freedom, 1))
+        return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
+
+    def widened(self, variances: Array) -> Array:
+        """(nq,) variances of q of the joint fit, larger where recordings disagree."""
+        ratio = self.chi_squared / np.maximum(self.freedom, 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
+            enough = np.maximum(variances, ratio * np.minimum(variances, of_all))
+        return np.where(self.disagreeing, enough, variances)
+
+
+def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
+    """The fit to each recording alone, and its shared parameters (nq,) less the joint ones.
+
+    Priors of shared parameters are no recording's, and left out.
+    """
+    for block in fit.blocks:
+        local = fit.names[fit.shared :]
+        own = fit.shared + np.flatnonzero([name.startswith(f"{block.name}: ") for name in local])
+        columns = np.concatenate([np.arange(fit.shared), own])
+        prior = np.where(columns < fit.shared, 0.0, fit.prior_slope[columns])
+        slope = block.slope[..., columns]
+        rows = np.concatenate([slope.reshape(-1, len(columns)), np.diag(prior)])
+        right = np.concatenate([block.residual.ravel(), _prior_residual(fit, columns)])
+        units = np.linalg.norm(rows, axis=0)
+        units[units == 0] = 1.0
+        step = -np.linalg.lstsq(rows / units, right)[0] / units
+        alone = replace(
+            fit,
+            blocks=(replace(block, residual=block.residual + slope @ step, slope=slope),),
+            names=tuple(fit.names[k] for k in columns),
+            prior_residual=_prior_residual(fit, columns) + prior * step,
+            prior_slope=prior,
+            at_bound=np.zeros(len(columns), dtype=bool),
+        )
+        yield alone, step[: fit.shared]
+
+
+def _prior_residual(fit: LinearisedFit, columns: NDArray[np.int64]) -> Array:
+    return np.where(columns < fit.shared, 0.0, fit.prior_residual[columns])
+
+
+def scatter_of(names: Sequence[str], steps: Sequence[Array], variances: Sequence[Array]) -> Scatter:
+    """Compare recordings by their steps (nq,) from the joint answer, and variances (nq,) of q."""
+    deviations = np.sqrt(np.array(variances))
+    told = deviations < TELLING
+    return Scatter(
+        tuple(names),
+        np.where(told, np.array(steps), np.nan),
+        np.where(told, deviations, np.nan),
+    )

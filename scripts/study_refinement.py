@@ -1,0 +1,94 @@
+"""Do intervals for noise and discretisation hold the truth of a finer mesh and step?
+
+    python scripts/study_refinement.py [twins of each body] [first seed]
+
+A block of linear and a bar of quadratic elements are moved at random; markers are simulated with
+every tetrahedron split into 64 and a quarter of the step, at random parameters, and get noise. The
+twins are fitted as they are and refined once; counted is how many of the 95 % intervals hold the
+truth, for the noise alone and with the numerical error.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+from twins import random_poses
+
+from collocation_sysid.experiment import Experiment, Grasp, Markers, Nuisance
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.parameters import Unknown
+from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.problem import Problem
+from collocation_sysid.refine import finer_mesh, refine
+from collocation_sysid.run import run
+
+NOISE_M = 5e-5
+SAMPLES, STEP_S = 30, 0.01
+BODIES = {"block": ((0.06, 0.06, 0.09), (2, 2, 2)), "bar": ((0.03, 0.03, 0.09), (1, 1, 2))}
+ELEMENTS = {"block": "tet4", "bar": "tet10"}
+YOUNG_PA = {"block": 2e3, "bar": 2e4}
+NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
+
+
+def drawn(name: str, rng: np.random.Generator) -> dict[str, float]:
+    """True parameters."""
+    young_pa = YOUNG_PA[name] * float(np.exp(rng.uniform(-0.5, 0.5)))
+    damping = {"gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)), "gamma_m_1_s": 1.0}
+    return {"young_pa": young_pa, "poisson": float(rng.uniform(0.15, 0.4)), **damping}
+
+
+def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
+    """A coarse problem with data of a fine one, and what is true."""
+    rng = np.random.default_rng(seed)
+    size_m, divisions = BODIES[name]
+    body = Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=ELEMENTS[name])
+    t_s = STEP_S * np.arange(SAMPLES)
+    held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
+    free = np.setdiff1d(np.arange(len(body.mesh.points_m)), held)
+    places = body.nodes_m[rng.choice(free, 6, replace=False)]
+    markers = Markers(t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, None, places)
+    grasp = Grasp(held, random_poses(t_s, rng))
+    still = Experiment(body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none())
+    truth = drawn(name, rng)
+    guess = {
+        "young_pa": Unknown(truth["young_pa"], 10.0, 1e6),
+        "poisson": Unknown(truth["poisson"], 0.01, 0.499),
+        "gamma_r_s": Unknown(truth["gamma_r_s"], 1e-6, 1.0),
+        "gamma_m_1_s": truth["gamma_m_1_s"],
+    }
+    coarse = Problem([still], guess)
+    (fine,) = finer_mesh(finer_mesh(coarse)).experiments
+    tracks = simulate(fine, truth, "midpoint", substeps=4).markers_m
+    noise = rng.normal(scale=NOISE_M, size=tracks.shape)
+    return replace(coarse, experiments=[with_markers(still, tracks + noise)]), truth
+
+
+def main(twins: int = 20, first: int = 0) -> None:
+    """Print every twin's intervals and the shares that hold the truth."""
+    held: dict[str, list[tuple[bool, bool]]] = {name: [] for name in NAMES[:3]}
+    for seed in range(first, first + twins):
+        for name in BODIES:
+            problem, truth = twin(name, seed)
+            found = refine(run(problem))
+            assert found.refinement is not None
+            for key in held:
+                estimate, error = found.estimates[key], found.refinement.errors.get(key)
+                if estimate.ci95 is None or error is None or error.ci95 is None:
+                    print(name, seed, key, estimate.reason, flush=True)
+                    continue
+                both = tuple(low <= truth[key] <= high for low, high in (estimate.ci95, error.ci95))
+                held[key].append((both[0], both[1]))
+                intervals = [[f"{v:.5g}" for v in pair] for pair in (estimate.ci95, error.ci95)]
+                print(name, seed, key, f"{truth[key]:.5g}", *intervals, both, flush=True)
+    for key, found in held.items():
+        shares = np.mean(found, axis=0)
+        print(f"{key}: noise {shares[0]:.0%}, with numerical error {shares[1]:.0%} of {len(found)}")
+    shares = np.mean([each for found in held.values() for each in found], axis=0)
+    print(f"all: noise {shares[0]:.0%}, with numerical error {shares[1]:.0%}")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,172 @@
+"""The numerical error of an answer: orders, extrapolation, intervals, and how it is told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem_files import run_command, write_problem
+from problems_small import GUESS, TRUTH, hung_cube, measured
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.problem import Problem
+from collocation_sysid.refine import refine
+from collocation_sysid.run import Run, run
+from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.numerical import Refinement, numerical_error
+from collocation_sysid.statistics.trust import numerical_concerns
+
+FREE = ("mu_pa", "gamma_r_s")
+
+
+def errors_of(x, order, levels=3, **options):
+    """Errors of a quantity whose logarithm is x + h^order at h = 1."""
+    values = [float(np.exp(x + 0.1 * 2.0 ** (-order * k))) for k in range(levels)]
+    answer = Estimate(values[0], 1.0, (values[0] / 1.01, values[0] * 1.01))
+    return numerical_error("mu_pa", answer, values[1:], [], **options)
+
+
+@pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
+def test_three_levels_tell_order_and_limit(order):
+    found = errors_of(5.0, order)
+    assert found.step_order == pytest.approx(order)
+    assert found.extrapolated == pytest.approx(np.exp(5.0))
+    assert found.mesh is None
+
+
+def test_two_levels_hold_the_limit_of_any_order_from_one_upwards():
+    for order in (0.85, 1.0, 2.0, 4.0):
+        low, high = errors_of(5.0, order, levels=2).ci95 or (0, 0)
+        assert low < np.exp(5.0) < high
+    assert errors_of(5.0, 2.0, levels=2).extrapolated == pytest.approx(np.exp(5.0))
+
+
+def test_without_numerical_error_the_interval_is_that_of_the_noise():
+    answer = Estimate(0.3, 0.01, (0.27, 0.33))
+    found = numerical_error("poisson", answer, [0.3, 0.3], [0.3])
+    assert found.ci95 is not None
+    odds = [v / (0.5 - v) for v in (*found.ci95, *answer.ci95)]  # type: ignore[misc]
+    assert odds[1] / odds[0] == pytest.approx(odds[3] / odds[2])
+    assert found.extrapolated == pytest.approx(0.3)
+
+
+def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
+    found = numerical_error("mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], [])
+    assert found.step_order is None
+    assert found.extrapolated == pytest.approx(121.0)
+    low, high = found.ci95 or (0, 0)
+    assert low < 110
+    assert high > 132
+
+
+def test_an_estimate_without_an_interval_gets_none():
+    assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).ci95 is None
+
+
+# On problems
+
+
+def coarse() -> Problem:
+    """Data of a step four times finer, on the same mesh."""
+    guess = GUESS.with_guess(TRUTH)
+    items = [i if i.name in FREE else replace(i, fixed=True) for i in guess.items]
+    experiment = measured(hung_cube(16, divisions=(1, 1, 2)), substeps=4)
+    sigma_m = np.full(len(experiment.markers.names), 1e-5)
+    seen = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m))
+    return Problem([seen], Parameters(tuple(items)))
+
+
+@pytest.fixture(scope="module")
+def answer() -> Run:
+    return run(coarse())
+
+
+@pytest.fixture(scope="module")
+def refined(answer) -> Run:
+    return refine(answer, levels=3)
+
+
+def test_halving_the_step_leads_to_the_truth(refined):
+    assert refined.refinement is not None
+    for name in FREE:
+        error = refined.refinement.errors[name]
+        assert error.step_order == pytest.approx(2.0, abs=0.4)
+        wrong = refined.parameters[name] - TRUTH[name]
+        by_step = numerical_error(
+            name,
+            refined.estimates[name],
+            [level["values"][name] for level in refined.refinement.levels[:2]],
+            [],
+        )
+        assert abs(by_step.extrapolated - TRUTH[name]) < 0.15 * abs(wrong)
+
+
+def test_finer_answers_start_from_the_coarser(refined):
+    assert refined.refinement is not None
+    halved = [(level["halved"], level["times"]) for level in refined.refinement.levels]
+    assert halved == [("step", 1), ("step", 2), ("mesh", 1), ("mesh", 2)]
+    assert max(level["iterations"] for level in refined.refinement.levels) <= 6
+    assert set(refined.refinement.errors) == {*FREE, "young_pa", "poisson"}
+
+
+def test_the_estimate_from_the_roll_out_is_that_of_half_the_step(answer, refined):
+    assert answer.step_changes is not None
+    assert refined.refinement is not None
+    for name in FREE:
+        measured_change = refined.refinement.errors[name].step
+        # A quarter of the step leaves a sixteenth, half of it a quarter of the error.
+        assert answer.step_changes[name] == pytest.approx(measured_change * 15 / 12, rel=0.3)
+
+
+def test_roll_outs_that_are_no_finer_tell_nothing():
+    problem = replace(coarse(), substeps=4)
+    assert run(problem).step_changes is None
+
+
+def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
+    assert any(reason.startswith("the step moves") for reason in answer.trust.reasons)
+    estimates = {"mu_pa": Estimate(100.0, 1.0, (98, 102))}
+    assert numerical_concerns(estimates, {"mu_pa": 0.9}) == []
+    assert numerical_concerns(estimates, None) == []
+    ((said, strength),) = numerical_concerns(estimates, {"mu_pa": -3.0})
+    assert strength == "check"
+    assert "mu_pa by -3 %, 3 standard errors" in said
+    measured_error = numerical_error("mu_pa", estimates["mu_pa"], [100.2], [100.1])
+    calm = Refinement({"mu_pa": measured_error}, ())
+    assert numerical_concerns(estimates, {"mu_pa": -3.0}, calm) == []
+
+
+def test_other_numbers_of_levels_are_refused(answer):
+    with pytest.raises(InputError, match="levels = 1"):
+        refine(answer, levels=1)
+
+
+def test_the_command_writes_into_the_run_folder(tmp_path):
+    problem = write_problem(tmp_path, {"swing": 8})
+    folder = tmp_path / "run"
+    assert run_command("solve", problem, "--out", folder).code == 0
+    before = json.loads((folder / "result.json").read_text())
+    ended = run_command("refine", folder)
+    assert ended.code == 0, ended
+    after = json.loads((folder / "result.json").read_text())
+    kept = json.loads((folder / "refinement.json").read_text())
+    for name, found in after["parameters"].items():
+        assert found["value"] == before["parameters"][name]["value"]
+        if not found["fixed"] and not found["at_bound"]:
+            assert found["numerical_error"] == kept["errors"][name]
+            assert "mesh" not in (before["parameters"][name]["numerical_error"] or {})
+    assert run_command("report", folder).code == 0
+    assert "Numerical error" in Path(folder / "report.html").read_text()
+
+
+def test_a_problem_may_ask_for_it(tmp_path):
+    problem = write_problem(tmp_path, {"swing": 8})
+    folder = tmp_path / "run"
+    asked = run_command("solve", problem, "--out", folder, "--set", "uncertainty.numerical=true")
+    assert asked.code == 0
+    assert "half the step" in asked.out
+    assert json.loads((folder / "refinement.json").read_text())["levels"]

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from problems_small import EDGE_M, bar_let_go, box, cube_with_gaps, hung_cube
+
+from collocation_sysid.experiment import Grasp
+from collocation_sysid.experiment.refinement import refined as refined_experiment
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.refinement import refined, split_in_eight
+from collocation_sysid.fem.regions import Region
+from collocation_sysid.fem.selection import Box
+from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
+
+TOP = Box((-1.0, -1.0, 0.6 * EDGE_M), (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("mesh", [box_mesh((0.1, 0.2, 0.3), (1, 2, 2)), cylinder_mesh(1, 2, 2, 1)])
+def test_eight_elements_fill_each_and_fit_their_neighbours(mesh):
+    finer = split_in_eight(mesh)
+    assert finer.notes == ()
+    of_parents = finer.volumes_m3.reshape(-1, 8)
+    np.testing.assert_allclose(of_parents, mesh.volumes_m3[:, None] / 8 * np.ones(8), rtol=1e-9)
+    assert len(finer.surface) == 4 * len(mesh.surface)
+    np.testing.assert_array_equal(finer.points_m[: len(mesh.points_m)], mesh.points_m)
+    assert len(finer.points_m) == len(mesh.points_m) + len(mesh.edges)
+
+
+def test_splitting_again_and_again_does_not_make_elements_worse():
+    once = split_in_eight(cylinder_mesh(1, 2, 1, 2))
+    thrice = split_in_eight(split_in_eight(once))
+    assert thrice.quality().quality_min >= 0.99 * once.quality().quality_min
+
+
+def test_masks_of_nodes_and_arrays_of_cells_are_kept():
+    coarse = box_mesh((1, 1, 1), (2, 1, 1))
+    end = (coarse.points_m[:, 0] == 0).astype(float)
+    core = np.arange(len(coarse.tetrahedra)) % 2
+    numbers = np.arange(len(coarse.points_m)) + 0.5
+    marked = TetMesh(coarse.points_m, coarse.tetrahedra, {"end": end, "x": numbers}, {"core": core})
+    finer = split_in_eight(marked)
+    np.testing.assert_array_equal(finer.point_arrays["end"], finer.points_m[:, 0] == 0)
+    assert [*finer.point_arrays] == ["end"]
+    np.testing.assert_array_equal(finer.cell_arrays["core"].reshape(-1, 8)[:, 0], core)
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10", "tet10-p0"])
+def test_a_refined_body_has_the_same_mass_and_energy(element):
+    core = Region("core", np.arange(3), density_kg_m3=100.0)
+    body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), "yeoh", 30.0, element, regions=[core])
+    finer = refined(body)
+    assert [part.name for part in finer.parts] == ["", "core"]
+    assert finer.mass_kg == pytest.approx(body.mass_kg)
+    stretch = np.array([[1.2, 0.1, 0.0], [0.0, 0.9, 0.2], [0.1, 0.0, 1.1]])
+    constants = {name: 1e3 * (1 + k) for k, name in enumerate(body.constants)}
+    energies = [b.energy(b.nodes_m @ stretch.T, **constants) for b in (body, finer)]
+    assert energies[1] == pytest.approx(energies[0])
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_grasp_holds_the_same_faces_on_the_finer_mesh(element):
+    hung = hung_cube(4)
+    body = box(element=element)
+    face = np.flatnonzero(body.nodes_m[:, 2] > EDGE_M - 1e-9)
+    poses = hung.grasps[0].poses
+    markers = replace(hung.markers, placement=None, places_m=hung.markers.observe(box().nodes_m))
+    experiment = replace(hung, body=body, grasps=[Grasp(face, poses)], markers=markers)
+    finer = refined_experiment(experiment, refined(body))
+    held = finer.body.nodes_m[:, 2] > EDGE_M - 1e-9
+    np.testing.assert_array_equal(finer.grasps[0].nodes, np.flatnonzero(held))
+
+
+def test_boxes_select_anew():
+    hung = hung_cube(4)
+    experiment = replace(hung, grasps=[Grasp(TOP, hung.grasps[0].poses)])
+    coarse, fine = experiment, refined_experiment(experiment, refined(hung.body))
+    assert coarse.body.nodes_m[coarse.grasps[0].nodes, 2].min() == pytest.approx(EDGE_M)
+    assert fine.body.nodes_m[fine.grasps[0].nodes, 2].min() == pytest.approx(0.75 * EDGE_M)
+
+
+def test_markers_stay_at_their_material_points():
+    for experiment in (cube_with_gaps(4), bar_let_go(6)):
+        finer = refined_experiment(experiment, refined(experiment.body))
+        before, after = (e.markers.observe(e.body.nodes_m) for e in (experiment, finer))
+        np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_loads_keep_their_size():
+    bar = bar_let_go(6)
+    finer = refined_experiment(bar, refined(bar.body))
+    for t_s in bar.t_s:
+        assert finer.node_mass_kg([t_s]).sum() == pytest.approx(bar.node_mass_kg([t_s]).sum())
+        np.testing.assert_allclose(
+            finer.node_forces_n([t_s]).sum(axis=1), bar.node_forces_n([t_s]).sum(axis=1)
+        )
+
+
+def test_a_given_start_is_carried_over():
+    hung = hung_cube(4)
+    bent = hung.body.nodes_m * [1.0, 1.0, 1.1]
+    given = replace(hung, start="given", start_positions_m=bent, start_velocities_m_s=0.1 * bent)
+    finer = refined_experiment(given, refined(hung.body))
+    np.testing.assert_allclose(
+        finer.start_positions_m, finer.body.nodes_m * [1.0, 1.0, 1.1], atol=1e-12
+    )
+    np.testing.assert_allclose(finer.start_velocities_m_s, 0.1 * finer.start_positions_m)
