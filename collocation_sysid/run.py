@@ -338,11 +338,12 @@ def run(
     say("checking the answer by a forward simulation")
     rollouts = {e.name: roll_out(problem, e, solution) for e in problem.experiments}
     found = _checked(problem, solution, rollouts, say)
+    turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
+    found = replace(found, notes=(*turns, *found.notes))
     if not seek_causes:
         return found
     say("looking for causes of the misfit")
-    turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
-    found = replace(found, notes=(*turns, *found.notes), causes=likely_causes(solution))
+    found = replace(found, causes=likely_causes(solution))
     if problem.uncertainty.numerical and found.uncertainty is not None:
         from .refine import refine  # which solves, as this module does
 

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from .check import BodyFinding, Findings
 from .check.hold import hold_sentence
-from .fem.constants import symbol_of, unit_of
+from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
 from .nlp.collocation import Part
 from .nlp.parameters import Parameter
@@ -130,7 +130,7 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [parameter_table(finished), *_numerical(finished)]
+    parts += [parameter_table(finished), *_damping(finished), *_numerical(finished)]
     parts += [*_verdict(finished), *_nuisance(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
@@ -203,6 +203,14 @@ def _numerical(finished: Run) -> list[RenderableType]:
         if values[name].value and not values[name].at_bound
     ]
     return [Text(f"a finer step would change, to first order: {', '.join(said)}")]
+
+
+def _damping(finished: Run) -> list[Text]:
+    """The law that γ_r belongs to."""
+    parts = [part for body in finished.problem.bodies for part in body.parts]
+    laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
+    said = [law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws]
+    return [Text(f"{GAMMA_R.symbol} is that of damping = {' and '.join(said)}")] if laws else []
 
 
 def _guess(item: Parameter) -> str:

@@ -52,6 +52,7 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
         body = Body(
             problem.bodies[0].mesh,
             density_kg_m3=problem.bodies[0].mass_kg / problem.bodies[0].mesh.volume_m3,
+            damping="rayleigh",
             evaluator=evaluator,
             threads=count,
         )

@@ -84,7 +84,8 @@ class Row:
 def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) -> Experiment:
     """A hung and swung cylinder with tracks from the midpoint scheme."""
     rings, layers = map(int, mesh.split("x"))
-    body = Body(cylinder_mesh(0.04, 0.16, rings, layers), density_kg_m3=20.0)
+    shape = cylinder_mesh(0.04, 0.16, rings, layers)
+    body = Body(shape, density_kg_m3=20.0, damping="rayleigh")
     t_s = np.arange(steps, dtype=np.float64) * STEP_S
     poses = swing(
         t_s,

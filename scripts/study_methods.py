@@ -50,6 +50,7 @@ title = "A small cylinder, hung and swung"
 [object]
 mesh = "cylinder.vtu"
 density_kg_m3 = 20.0
+damping = "rayleigh"
 
 [parameters]
 lambda_pa   = { guess = 400.0, lower = 10.0, upper = 1e5 }

@@ -132,7 +132,7 @@ def cylinder() -> Case:
 
 def soft_bar() -> Case:
     """A bar of 220 × 35 × 50 mm of E = 2 kPa and 95 kg/m³, clamped: its tip hangs down."""
-    body = Body(box_mesh((0.22, 0.035, 0.05), (11, 2, 3)), density_kg_m3=95.0)
+    body = Body(box_mesh((0.22, 0.035, 0.05), (11, 2, 3)), density_kg_m3=95.0, damping="rayleigh")
     motion = Swing(
         duration_s=1.0,
         amplitude_m=(0.03, 0.04, 0.03),
@@ -151,7 +151,7 @@ def silicone_block() -> Case:
     It sways by some tenths of a millimetre, so its markers are seen as well as that: noise of 1 mm
     would tell nothing of its damping.
     """
-    body = Body(box_mesh((0.06, 0.06, 0.1), (3, 3, 5)), density_kg_m3=1100.0)
+    body = Body(box_mesh((0.06, 0.06, 0.1), (3, 3, 5)), density_kg_m3=1100.0, damping="rayleigh")
     motion = Swing(
         duration_s=1.0,
         amplitude_m=(0.05, 0.04, 0.03),
@@ -216,7 +216,9 @@ CASES: dict[str, Callable[[], Case]] = {
 
 def hanging_cylinder(layers: int, steps: int, scheme: str, rings: int = 1) -> Experiment:
     """A cylinder held at one end, hanging and swung, with tracks of its own scheme."""
-    body = Body(cylinder_mesh(RADIUS_M, HEIGHT_M, rings, layers), density_kg_m3=20.0)
+    body = Body(
+        cylinder_mesh(RADIUS_M, HEIGHT_M, rings, layers), density_kg_m3=20.0, damping="rayleigh"
+    )
     t_s = STEP_S * np.arange(steps, dtype=np.float64)
     poses = swing(
         t_s,

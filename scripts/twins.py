@@ -31,7 +31,7 @@ STIFF = SOFT | {"lambda_pa": 16e3, "mu_pa": 12e3, "gamma_r_s": 0.002}
 @cache
 def block(size_m: tuple[float, ...], divisions: tuple[int, ...]) -> Body:
     """Bodies are shared: their kernels compile once."""
-    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0)
+    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, damping="rayleigh")
 
 
 def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:

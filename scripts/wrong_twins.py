@@ -47,7 +47,13 @@ def _with_body(experiment: Experiment, points_m: np.ndarray, density: float = 1.
     old = experiment.body
     density_kg_m3 = density * old.mass_kg / old.mesh.volume_m3
     mesh = TetMesh(points_m, old.mesh.tetrahedra)
-    body = Body(mesh, old.parts[0].material, density_kg_m3=density_kg_m3, element=old.element.name)
+    body = Body(
+        mesh,
+        old.parts[0].material,
+        density_kg_m3=density_kg_m3,
+        element=old.element.name,
+        damping=old.parts[0].damping,
+    )
     return replace(experiment, body=body)
 
 

@@ -52,7 +52,7 @@ def relative_error(found: ArrayLike, expected: ArrayLike) -> float:
     """Return the largest error of an entry, relative to the largest expected entry."""
     found, expected = np.asarray(found), np.asarray(expected)
     assert found.shape == expected.shape
-    return float(np.abs(found - expected).max() / np.abs(expected).max())
+    return float(np.abs(found - expected).max() / np.abs(expected).max()) if expected.size else 0.0
 
 
 def observed_order(steps: ArrayLike, errors: ArrayLike) -> float:

@@ -31,11 +31,14 @@ def small_mesh() -> TetMesh:
 
 @pytest.fixture(scope="session")
 def make_body(small_mesh: TetMesh) -> BodyFactory:
-    """``make_body(material, evaluator)`` on the small mesh; kernels are built once a session."""
+    """``make_body(material, evaluator)`` on the small mesh; kernels are built once a session.
+
+    It has the paper's damping, whose slopes are symmetric; see `test_kelvin_voigt` for the other.
+    """
 
     @cache
     def make(material: str = "neo-hookean", evaluator: str = "auto") -> Body:
-        return Body(small_mesh, material, density_kg_m3=30.0, evaluator=evaluator)
+        return Body(small_mesh, material, 30.0, damping="rayleigh", evaluator=evaluator)
 
     return make
 

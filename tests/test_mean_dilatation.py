@@ -45,7 +45,7 @@ def small_body(material: str | Callable = "neo-hookean", evaluator="auto", eleme
     mesh = box_mesh((0.10, 0.12, 0.09), (1, 1, 1))
     jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
     mesh = TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
-    return Body(mesh, material, 30.0, element, evaluator=evaluator)
+    return Body(mesh, material, 30.0, element, damping="rayleigh", evaluator=evaluator)
 
 
 def deformed(body: Body, rng: np.random.Generator, states: int = 1) -> np.ndarray:

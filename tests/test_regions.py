@@ -11,11 +11,12 @@ from checks import assert_derivative, directional_derivative, relative_error
 from materials_small import CONSTANTS, theta_for
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.body import Body, Linearisation
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Ball, Box, Indices, Named
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.unsymmetric import whole
 
 EVALUATORS = ["simd", "casadi"]
 LENGTH_M = 0.03  # a large change of a position
@@ -31,14 +32,18 @@ def of_region(name: str, values: Mapping[str, float]) -> dict[str, float]:
 
 @pytest.fixture(scope="session")
 def make_two(small_mesh: TetMesh) -> Callable[..., Body]:
-    """``make_two(material of the core, evaluator)``, the rest being neo-Hookean."""
+    """``make_two(material of the core, evaluator)``, the rest being neo-Hookean.
+
+    Only the core's damping has slopes with a skew part.
+    """
 
     @cache
     def make(material: str | None = None, evaluator: str = "auto") -> Body:
-        core = Region("core", BELOW, material, density_kg_m3=80.0)
+        core = Region("core", BELOW, material, density_kg_m3=80.0, damping="kelvin-voigt")
         return Body(
             small_mesh,
             density_kg_m3=DENSITY_KG_M3,
+            damping="rayleigh",
             regions=[core],
             evaluator=evaluator,
         )
@@ -61,12 +66,19 @@ def states(body: Body, rng: np.random.Generator, count: int = 2) -> tuple[np.nda
     return x, v, w
 
 
-def times(body: Body, triangles: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Product of each state's matrix, given by its lower triangle, with its vector."""
+def times(
+    body: Body, triangles: np.ndarray, field: np.ndarray, skew: np.ndarray | None = None
+) -> np.ndarray:
+    """Product of each state's matrix, given by lower triangles of its parts, with its vector."""
     vectors = field.reshape(len(triangles), -1)
-    return np.stack(
-        [body.pattern.matrix(row) @ d for row, d in zip(triangles, vectors, strict=True)]
-    )
+    skews = np.zeros((len(triangles), 0)) if skew is None else skew
+    parts = zip(triangles, skews, vectors, strict=True)
+    return np.stack([whole(body.pattern, lower, other) @ d for lower, other, d in parts])
+
+
+def transposed_times(body: Body, at: Linearisation, field: np.ndarray) -> np.ndarray:
+    """Product with the transpose of ∂f/∂x."""
+    return times(body, at.by_position, field, -at.by_position_skew)
 
 
 # Parts and constants --------------------------------------------------------------------------
@@ -129,12 +141,12 @@ def test_regions_with_the_same_constants_are_one_body(evaluator, element, rng):
     np.testing.assert_allclose(two.node_mass, one.node_mass, rtol=1e-13)
     assert relative_error(two.force(x, v, both), one.force(x, v, theta)) < 1e-12
     found, expected = two.linearise(x, v, both), one.linearise(x, v, theta)
-    for name in ("force", "by_position", "by_velocity"):
+    for name in ("force", "by_position", "by_velocity", "by_position_skew"):
         assert relative_error(getattr(found, name), getattr(expected, name)) < 1e-12
     summed = found.by_theta[..., :4] + found.by_theta[..., 4:]
     assert relative_error(summed, expected.by_theta) < 1e-12
     found, expected = two.curvature(x, v, w, both), one.curvature(x, v, w, theta)
-    for name in ("position_position", "position_velocity"):
+    for name in ("position_position", "position_velocity", "position_velocity_skew"):
         assert relative_error(getattr(found, name), getattr(expected, name)) < 1e-12
     for name in ("position_theta", "velocity_theta", "theta"):
         summed = getattr(found, name)[..., :4] + getattr(found, name)[..., 4:]
@@ -167,7 +179,7 @@ def test_linearise_gives_the_slopes_of_the_force(make_two, material, evaluator, 
     assert relative_error(at.force, body.force(x, v, theta)) < 1e-13
     assert_derivative(
         lambda x: body.force(x, v, theta),
-        lambda dx: times(body, at.by_position, dx),
+        lambda dx: times(body, at.by_position, dx, at.by_position_skew),
         x,
         rng,
         scale=LENGTH_M,
@@ -193,7 +205,7 @@ def test_curvature_gives_the_slopes_of_the_weighted_slopes(make_two, material, e
 
     np.testing.assert_allclose(at.theta, by_theta(x, v, theta), rtol=1e-9)
     assert_derivative(
-        lambda x: times(body, body.linearise(x, v, theta).by_position, w),
+        lambda x: transposed_times(body, body.linearise(x, v, theta), w),
         lambda dx: times(body, at.position_position, dx),
         x,
         rng,
@@ -201,15 +213,15 @@ def test_curvature_gives_the_slopes_of_the_weighted_slopes(make_two, material, e
         scale=LENGTH_M,
     )
     assert_derivative(
-        lambda v: times(body, body.linearise(x, v, theta).by_position, w),
-        lambda dv: times(body, at.position_velocity, dv),
+        lambda v: transposed_times(body, body.linearise(x, v, theta), w),
+        lambda dv: times(body, at.position_velocity, dv, at.position_velocity_skew),
         v,
         rng,
         tolerance=1e-7,
     )
     for k, direction in enumerate(np.diag(theta)):
         for name, slope in (
-            ("position_theta", lambda c: times(body, body.linearise(x, v, c).by_position, w)),
+            ("position_theta", lambda c: transposed_times(body, body.linearise(x, v, c), w)),
             ("velocity_theta", lambda c: times(body, body.linearise(x, v, c).by_velocity, w)),
             ("theta_theta", lambda c: by_theta(x, v, c)),
         ):

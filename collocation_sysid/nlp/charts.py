@@ -192,9 +192,7 @@ class Chart:
             if again[m] == AGAIN:
                 points[m], axes[m] = points_m[m], self.axes[m]
                 cells[m], _ = self._shape.cell_of(points_m[m])
-        return replace(
-            found, points_m=points, axes=axes, cells=cells, crossed=crossed, again=again
-        )
+        return replace(found, points_m=points, axes=axes, cells=cells, crossed=crossed, again=again)
 
     def _has_left(self, point: Array, cell: int) -> bool:
         if not np.isfinite(point).all():

@@ -9,8 +9,8 @@ skew one does not outweigh it, rows need no exchange, and it costs half as much 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Literal, Protocol
 
@@ -33,7 +33,7 @@ Choice = Literal["auto", "band", "sparse"]
 BAND_SPEED = 10.0
 LITTLE_WORK = 1e8
 
-_pbtrs, _gbtrs = get_lapack_funcs(("pbtrs", "gbtrs"), dtype=np.float64)
+_pbtrs, _gbtrs, _tbtrs = get_lapack_funcs(("pbtrs", "gbtrs", "tbtrs"), dtype=np.float64)
 NONE = np.zeros(0)
 
 
@@ -66,6 +66,27 @@ class _BandFactor:
 
 @dataclass(frozen=True, eq=False)
 class _BandLU:
+    """L, with a diagonal of ones that are not read, and U, as bands of their own."""
+
+    lower: Array
+    upper: Array
+    order: Index
+    positive_definite: bool
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        solved = right[self.order].reshape(len(right), -1)
+        for triangle in "UL" if transposed else "LU":
+            band, ones = (self.upper, "N") if triangle == "U" else (self.lower, "U")
+            solved, _ = _tbtrs(band, solved, uplo=triangle, trans="NT"[transposed], diag=ones)
+        result = np.empty_like(right)
+        result[self.order] = solved.reshape(right.shape)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _ExchangedBandLU:
+    """The same where rows were exchanged, in one band that has room for what that fills."""
+
     band: Array
     exchanges: NDArray[np.int32]
     order: Index
@@ -87,6 +108,15 @@ class _SparseFactor:
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         return self.lu.solve(right, "T" if transposed else "N")
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Memory for a banded LU: fetching it anew costs as much as half a factorisation."""
+
+    work: Array
+    lower: Array
+    upper: Array
 
 
 class Factoriser:
@@ -148,7 +178,7 @@ class Factoriser:
     @property
     def unsymmetric_numbers(self) -> int:
         """Numbers that one factor of another matrix holds."""
-        return self._size * (3 * self.half_bandwidth + 1) if self.banded else self.numbers
+        return 2 * self.numbers if self.banded else self.numbers
 
     @property
     def _sparse_work(self) -> float:
@@ -162,8 +192,10 @@ class Factoriser:
         values[self._full_source[self._full_rows == self._full_columns]] = degree
         return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
-    def factorise(self, values: Array, skew: Array = NONE) -> Factor:
+    def factorise(self, values: Array, skew: Array = NONE, room: Room | None = None) -> Factor:
         """Factorise the matrix with (m,) lower-triangle values, and those of a skew part.
+
+        Of a factor in a room that was given, nothing is left when another is put there.
 
         Raises
         ------
@@ -175,27 +207,38 @@ class Factoriser:
         if not self.banded:
             return self._sparse(values, skew)
         if skew.any():
-            return self._band_lu(values, skew)
+            return self._band_lu(values, skew, room or self.room())
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
         band.T.reshape(-1)[self._band_places] = values[self._kept]
         if cholesky_in_place(band):
             return _BandFactor(band, self._order)
         return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
 
-    def _band_lu(self, values: Array, skew: Array) -> Factor:
-        band = np.zeros((3 * self.half_bandwidth + 1, self._size), order="F")
+    def room(self) -> Room:
+        """Room for a banded LU."""
+        width, size = self.half_bandwidth, self._size
+        work = np.empty((3 * width + 1, size), order="F")
+        lower, upper = (np.empty((width + 1, size), order="F") for _ in range(2))
+        return Room(work, lower, upper)
+
+    def _band_lu(self, values: Array, skew: Array, room: Room) -> Factor:
+        band = room.work
+        width = self.half_bandwidth
+        band.fill(0)
         entries = band.T.reshape(-1)
         lower, upper = self._lu_places
-        entries[upper] = values[self._kept] - skew[self._kept]
-        entries[lower] = values[self._kept] + skew[self._kept]
+        symmetric, other = values[self._kept], skew[self._kept]
+        entries[upper] = symmetric - other
+        entries[lower] = symmetric + other
         exchanges = lu_in_place(band)
         if exchanges is None:
             raise np.linalg.LinAlgError("the matrix is singular")
         if (exchanges == np.arange(1, self._size + 1)).all():
-            definite = bool((band[2 * self.half_bandwidth] > 0).all())
-        else:
-            definite = self.factorise(values).positive_definite
-        return _BandLU(band, exchanges - 1, self._order, definite)
+            definite = bool((band[2 * width] > 0).all())
+            room.upper[:], room.lower[:] = band[width : 2 * width + 1], band[2 * width :]
+            return _BandLU(room.lower, room.upper, self._order, definite)
+        definite = self.factorise(values).positive_definite
+        return _ExchangedBandLU(band.copy("F"), exchanges - 1, self._order, definite)
 
     @cached_property
     def _lu_places(self) -> tuple[Index, Index]:
@@ -204,7 +247,11 @@ class Factoriser:
         return j * (3 * width + 1) + 2 * width + i - j, i * (3 * width + 1) + 2 * width + j - i
 
     def factorise_each(
-        self, matrix: Callable[[int], tuple[Array, Array]], count: int, threads: int
+        self,
+        matrix: Callable[[int], tuple[Array, Array]],
+        count: int,
+        threads: int,
+        rooms: Sequence[Room] = (),
     ) -> list[Factor]:
         """Factorise `count` matrices, side by side on threads; matrix(k) gives both parts' values.
 
@@ -217,7 +264,9 @@ class Factoriser:
 
         def run(start: int, stop: int) -> None:
             for k in range(start, stop):
-                factors[k] = self.factorise(*matrix(k))
+                # Of those that one thread fills in turn, one work space stays in its cache.
+                room = replace(rooms[k], work=rooms[start].work) if rooms else None
+                factors[k] = self.factorise(*matrix(k), room)
 
         in_slices(run, count, threads)
         return [factors[k] for k in range(count)]

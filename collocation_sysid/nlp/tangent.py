@@ -16,7 +16,7 @@ Z = dx/dq, R is zero and F_R is ∂F/∂q. With memory F' has what it brings, se
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from .factorisation import NONE, Choice, Factor, Factoriser
+from .factorisation import NONE, Choice, Factor, Factoriser, Room
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
 from .row import Row, weighted
@@ -37,6 +37,8 @@ from .unsymmetric import signs_by_column, signs_by_row
 
 # Element results and factors of this size at most are kept at a time.
 CHUNK_BYTES = 128e6
+# So many banded LUs at most, each chunk's in the memory of the one before.
+ROOMS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,12 +284,17 @@ class BlockSolver:
     @property
     def chunk(self) -> int:
         """Timesteps that are evaluated and factorised at a time."""
-        return max(1, min(self.dynamics.rows, int(CHUNK_BYTES / self._step_bytes)))
+        most = ROOMS if self._needs_rooms else self.dynamics.rows
+        return max(1, min(self.dynamics.rows, most, int(CHUNK_BYTES / self._step_bytes)))
 
     @property
     def chunk_bytes(self) -> int:
         """Memory that takes."""
         return self.chunk * self._step_bytes
+
+    @property
+    def _needs_rooms(self) -> bool:
+        return self.body.unsymmetric and self.factoriser.banded
 
     @property
     def _step_bytes(self) -> int:
@@ -321,6 +328,7 @@ class BlockSolver:
         dynamics, body = self.dynamics, self.body
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
+        rooms = [self.factoriser.room() for _ in range(self.chunk if self._needs_rooms else 0)]
         for start in reversed(starts) if backward else starts:
             stop = min(start + self.chunk, dynamics.rows)
             here = slice(start - dynamics.first_row, stop - dynamics.first_row)
@@ -329,7 +337,7 @@ class BlockSolver:
                 carried = dynamics.carried(history, slice(start, stop))
                 at = body.linearise(xi[here], nu[here], theta, dof_mass=damped, carried=carried)
             with self.stopwatch.solving():
-                factors = self._factorise(at, slice(start, stop))
+                factors = self._factorise(at, slice(start, stop), rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
@@ -342,7 +350,9 @@ class BlockSolver:
                     at.by_position_skew[k],
                 )
 
-    def _factorise(self, at: Linearisation, rows: slice) -> list[Factor]:
+    def _factorise(
+        self, at: Linearisation, rows: slice, rooms: Sequence[Room] = ()
+    ) -> list[Factor]:
         pattern, taken = self.body.pattern, self.dynamics.taken[rows]
 
         def matrix(k: int) -> tuple[Array, Array]:
@@ -359,7 +369,8 @@ class BlockSolver:
             return values, skew
 
         try:
-            return self.factoriser.factorise_each(matrix, len(at.force), self.body.threads)
+            count, threads = len(at.force), self.body.threads
+            return self.factoriser.factorise_each(matrix, count, threads, rooms)
         except np.linalg.LinAlgError as error:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "

@@ -80,7 +80,10 @@ class ObjectSection(Section):
     material: Material = Field(
         "neo-hookean", description="A material's name, or a table of file and function."
     )
-    damping: DampingName = "rayleigh"
+    damping: DampingName = Field(
+        "kelvin-voigt",
+        description="Law of the damping γ_r; rayleigh, the paper's, brakes rotation.",
+    )
     element: ElementName = "tet4"
     region: list[RegionSection] = Field(
         default_factory=list, description="[[object.region]] tables: cells that differ."

@@ -19,6 +19,7 @@ mesh = "body.vtu"              # tetrahedra, any format meshio reads
 mass_kg = 0.1                  # weighed; or density_kg_m3
 material = "neo-hookean"       # or stable-neo-hookean, mooney-rivlin, yeoh, gent, ...
 element = "tet4"               # or tet10 if it bends or is slender; tet10-p0, poisson above 0.4
+# damping = "rayleigh"         # the paper's, which brakes rotation; "kelvin-voigt" by default
 
 # [[object.region]]            # cells that differ; its parameters are "core.young_pa" and so on
 # name = "core"

@@ -593,7 +593,7 @@ display(figure)
 
 # %%
 mesh = cs.TetMesh(corners, np.array([[0, 1, 2, 3]]))
-body = cs.Body(mesh, "neo-hookean", density_kg_m3=DENSITY)
+body = cs.Body(mesh, "neo-hookean", density_kg_m3=DENSITY, damping="rayleigh")
 moduli = {"lambda_pa": TRUTH[0], "mu_pa": TRUTH[1]}
 assert np.allclose(body.elastic_force(bent.T, **moduli), force_at(bent, still, *TRUTH).full().T)
 assert np.allclose(body.stiffness(bent.T, **moduli).toarray(), stiffness_at(bent, *TRUTH).full())
