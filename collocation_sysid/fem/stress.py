@@ -133,16 +133,13 @@ class Stresses:
                 self._run("stress_by_theta", number, [x], theta, out, add=False)
                 first = body.starts[number]
                 here = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
-                found[:, :, here] = np.einsum(
-                    "tkp,kq->tqp",
-                    out.reshape(len(x), count, places.size),
-                    theta_q[first : first + count],
-                    optimize=True,
-                )
+                by_constant = out.reshape(len(x), count, places.size)
+                for k, j in zip(*np.nonzero(theta_q[first : first + count]), strict=True):
+                    found[:, j, here] += theta_q[first + k, j] * by_constant[:, k]
         return found
 
     def along(self, x: Array, direction: Array, theta: Array, out: Array | None = None) -> Array:
-        """∂S/∂x along a direction, (T, width)."""
+        """∂S/∂x along a direction, (T, width), added to `out` where it is given."""
         return self._of_points("stress_along", [x, direction], theta, out)
 
     def pulled(self, x: Array, weights: Array, theta: Array) -> Array:
@@ -162,8 +159,6 @@ class Stresses:
     ) -> Array:
         if out is None:
             out = np.zeros((len(fields[0]), self.width))
-        else:
-            out.fill(0.0)
         for number, part in enumerate(self.body.parts):
             if part.prony:
                 self._run(name, number, fields, theta, out, add=True)

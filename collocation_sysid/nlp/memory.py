@@ -252,10 +252,12 @@ class Slopes:
 
     def force(self) -> Array:
         """What they add to dF at the next evaluation, (3n, columns)."""
-        total = self._total
-        total.fill(0.0)
-        for r, columns in zip(self.history.recursions, self.columns, strict=True):
-            total[:, r.branch.points] += columns
+        total = self.columns[0]
+        if len(self.columns) > 1:
+            total = self._total
+            total.fill(0.0)
+            for r, columns in zip(self.history.recursions, self.columns, strict=True):
+                total[:, r.branch.points] += columns
         self._state[:] = self.history.xi[self.next]
         return self.stresses.force(self._state, total, self.theta).T
 
@@ -263,14 +265,23 @@ class Slopes:
         """Go past the next evaluation, whose state changes by (3n, columns)."""
         k, history, stress = self.next, self.history, self._stress
         self._state[:], self._direction[:] = history.xi[k], of_state.T
+        # Of a single branch the stress itself is not needed.
+        alone = history.recursions[0] if len(history.recursions) == 1 else None
+        if alone is not None:
+            stress = self.columns[0]
+            stress *= alone.d[k]
+            self._direction *= alone.a[k]
+        else:
+            stress.fill(0.0)
         self.stresses.along(self._state, self._direction, self.theta, stress)
         if len(self._moduli):
             for column, slope in zip(self._moduli, self._by_moduli(k), strict=True):
-                stress[column] += slope
+                stress[column] += slope if alone is None else alone.a[k] * slope
         for r, m, columns in zip(history.recursions, history.brought, self.columns, strict=True):
             points, own = r.branch.points, self.theta_q[[r.branch.share, r.branch.tau]]
-            columns *= r.d[k]
-            columns += np.multiply(stress[:, points], r.a[k], out=self._scratch[:, points])
+            if alone is None:
+                columns *= r.d[k]
+                columns += np.multiply(stress[:, points], r.a[k], out=self._scratch[:, points])
             for j in np.flatnonzero(own.any(axis=0)):
                 columns[j] += (r.d_by[:, k] @ own[:, j]) * m[k]
                 columns[j] += (r.a_by[:, k] @ own[:, j]) * history.stress[k, points]

@@ -1,0 +1,184 @@
+"""Along trajectories: derivatives forward and backward, and what is found again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from checks import directional_derivative, relative_error
+from memories_small import ONE, TWO, guesses, recorded, remembering, truth
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.methods.continuation import Continuation
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
+from collocation_sysid.nlp.collocation import Collocation, Part
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.nlp.tangent import BlockSolver
+
+KINDS = {
+    "relaxed": ("hung-cube", {}),
+    "loaded": ("hung-cube", {"loaded_since_s": 0.04}),
+    "undeformed": ("released-cube", {}),
+    "let-go": ("bar-let-go", {}),
+    "off-in-its-grasp": ("bar-with-nuisance", {}),
+}
+
+
+@pytest.fixture(
+    params=[(kind, "midpoint") for kind in KINDS]
+    + [("loaded", "bdf2"), ("undeformed", "backward-euler")],
+    ids="-".join,
+)
+def collocation(request: pytest.FixtureRequest) -> Collocation:
+    kind, scheme = request.param
+    name, changes = KINDS[kind]
+    return Collocation([remembering(name, 5, 2, **changes)], guesses(TWO, 1.1), scheme)
+
+
+def some_parameters(collocation: Collocation) -> np.ndarray:
+    phi = 0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)
+    return np.concatenate([collocation.parameters.guess_q, phi])
+
+
+def marched(collocation: Collocation, p: np.ndarray) -> Part:
+    """The experiment simulated at p."""
+    (segment,) = collocation.segments
+    (part,) = collocation.parts_at(p, [np.zeros((0, segment.dofs))])
+    x = march(segment.corrected(part.phi), part.setting.dynamics, part.setting.theta)
+    return Part(segment, part.q, part.phi, x)
+
+
+def disturbed(part: Part, size_m: float = 1e-4) -> np.ndarray:
+    """Positions that do not satisfy the equations of motion."""
+    segment = part.segment
+    change = np.zeros_like(part.x)
+    free = (len(part.x), len(segment.free_dofs))
+    change[:, segment.free_dofs] = np.random.default_rng(0).standard_normal(free)
+    first = segment.dynamics.first_row
+    x = part.x.copy()
+    x[first:] += size_m * segment.dynamics.without_taken(change)[first:]
+    return x
+
+
+def test_marched_trajectories_satisfy_the_equations(collocation: Collocation):
+    part = marched(collocation, some_parameters(collocation))
+    assert np.abs(part.residual_n).max() < 1e-12 * part.segment.force_n
+
+
+def test_sensitivities_are_those_of_simulations(collocation: Collocation):
+    p = some_parameters(collocation)
+    part = marched(collocation, p)
+    found = BlockSolver(part.segment).forward(part.x, part.setting).by_p
+    for k, place in enumerate(part.segment.moving):
+        expected = directional_derivative(
+            lambda at: marched(collocation, at).x, p, np.eye(len(p))[place]
+        )
+        assert relative_error(found[:, :, k], expected) < 1e-6
+    rows = BlockSolver(part.segment).sensitivities(part.x, part.setting)
+    np.testing.assert_array_equal(np.stack(list(rows)), found)
+
+
+def test_a_sweep_may_be_continued(collocation: Collocation):
+    part = marched(collocation, some_parameters(collocation))
+    x, setting = disturbed(part), part.setting
+    known = BlockSolver(part.segment, 3).forward(x[:3], setting)
+    continued = BlockSolver(part.segment).forward(x, setting, known)
+    whole = BlockSolver(part.segment).forward(x, setting)
+    np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(continued.step, whole.step, rtol=1e-12, atol=1e-15)
+
+
+def test_the_feasibility_step_solves_the_linearised_equations(collocation: Collocation):
+    part = marched(collocation, some_parameters(collocation))
+    segment, setting, x = part.segment, part.setting, disturbed(part)
+    step = BlockSolver(segment).forward(x, setting).step
+    change = directional_derivative(lambda at: segment.residual_n(at, setting), x, step)
+    assert relative_error(change, -segment.residual_n(x, setting)) < 1e-9
+
+
+def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
+    part = marched(collocation, some_parameters(collocation))
+    segment, setting, x = part.segment, part.setting, disturbed(part)
+    gradient = rng.standard_normal(x.shape)
+    y = BlockSolver(segment).backward(x, setting.theta, gradient)
+    step = BlockSolver(segment).forward(x, setting).step
+    residual = setting.dynamics.residual(x, setting.theta)
+    residual[:, segment.held_dofs] = 0
+    residual = setting.dynamics.without_taken(residual)
+    expected = float(np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs]))
+    assert float(np.sum(y * residual)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation, rng):
+    part = marched(collocation, some_parameters(collocation))
+    p = some_parameters(collocation)
+    z = collocation.pack(p, [disturbed(part)])
+    multipliers, direction = (rng.standard_normal(n) for n in (collocation.constraints, len(z)))
+    expected = directional_derivative(
+        lambda at: multipliers @ collocation.constraint_values(at), z, 0.1 * direction
+    )
+    found = collocation.pulled_back(z, multipliers) @ (0.1 * direction)
+    assert found == pytest.approx(float(expected), rel=1e-8)
+
+
+def test_the_adjoint_gradient_is_that_of_simulations():
+    collocation = Collocation([recorded("cube-with-nuisance", 6, 2)], guesses(TWO, 1.2))
+    p = some_parameters(collocation)
+    found = adjoint_gradient(collocation, simulated(collocation, p))
+    for k in range(len(p)):
+        expected = directional_derivative(
+            lambda at: collocation.objective(simulated(collocation, at)), p, np.eye(len(p))[k]
+        )
+        assert found[k] == pytest.approx(float(expected), rel=1e-6, abs=1e-6 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("branches", [1, 2])
+def test_the_memory_that_made_a_recording_is_found(branches: int):
+    true = truth(branches)
+    collocation = Collocation([recorded("hung-cube", 40, branches)], guesses(true))
+    solution = ReducedSpace()(collocation)
+    assert solution.status.converged
+    for name, value in true.items():
+        assert solution.parameters[name] == pytest.approx(value, rel=1e-5), name
+    assert solution.kkt_residual < 1e-8
+
+
+@pytest.mark.parametrize(
+    "method", [Shooting(), Continuation(stage={"method": "reduced-space"})], ids=lambda m: m.name
+)
+def test_other_methods_find_the_same(method):
+    collocation = Collocation([recorded("hung-cube", 20)], guesses(ONE, 1.2))
+    solution = method(collocation)
+    for name, value in ONE.items():
+        assert solution.parameters[name] == pytest.approx(value, rel=1e-5), name
+
+
+def test_methods_that_need_the_whole_matrix_say_which_do_not():
+    collocation = Collocation([recorded("hung-cube", 5)], guesses(ONE))
+    with pytest.raises(InputError, match=r"interior-point.*memory.*reduced-space, shooting"):
+        InteriorPoint()(collocation)
+    with pytest.raises(InputError, match="'gauss-newton'"):
+        ReducedSpace(hessian="exact")(collocation)
+
+
+@pytest.mark.parametrize("kind", ["relaxed", "loaded", "undeformed"])
+def test_newmark_and_the_schemes_meet_as_the_step_shrinks(kind: str):
+    name, changes = KINDS[kind]
+    experiment = remembering(name, 6, 2, **changes)
+    fine = simulate(experiment, TWO, "midpoint", substeps=32).positions_m
+    moved = np.abs(fine - fine[0]).max()
+    for integrator, count in (("newmark", 16), ("bdf2", 32)):
+        step_s = experiment.timestep_s / count
+        found = simulate(experiment, TWO, integrator, timestep_s=step_s, substeps=count)
+        assert np.abs(found.positions_m - fine).max() < 2e-3 * moved
+
+
+def test_a_share_of_zero_is_no_memory():
+    experiment = remembering("hung-cube", 6, 2)
+    none = TWO | {"prony_1.share": 0.0, "prony_2.share": 0.0}
+    forgetful = remembering("hung-cube", 6, 0)
+    expected = simulate(forgetful, truth(0), "midpoint").positions_m
+    found = simulate(experiment, none, "midpoint").positions_m
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
