@@ -41,7 +41,7 @@ from collocation_sysid.statistics.causes import likely_causes
 SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3
 # An answer is right whose parameters are all within so many standard errors.
 RIGHT = 3.0
-DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
+DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
 
 
 @dataclass(frozen=True)
