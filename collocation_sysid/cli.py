@@ -22,6 +22,7 @@ from .errors import InputError, SimulationError
 from .folders import require_possible, run_name
 
 if TYPE_CHECKING:
+    from .problem import Problem
     from .study import Limits, PlannedRun
     from .study.table import Yardstick
 
@@ -191,13 +192,21 @@ def simulate(
     epilog=_examples(
         "compare problem.toml --methods reduced-space,shooting --starts 40",
         "compare problem.toml --methods penalty,shooting --truth truth.toml",
+        "compare problem.toml --materials neo-hookean,yeoh",
     )
 )
 def compare(
     problem: ProblemPath,
     methods: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Methods, each with its options of the file.")
-    ],
+        str | None,
+        typer.Option(metavar="A,B,…", help="Methods, each with its options of the file."),
+    ] = None,
+    materials: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Materials, instead of the object's.")
+    ] = None,
+    prony: Annotated[
+        str | None, typer.Option(metavar="0,1,…", help="Numbers of branches of memory.")
+    ] = None,
     starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
     spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
@@ -216,7 +225,10 @@ def compare(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run methods side by side from many starts.
+    """Run methods side by side from many starts, or fit several models and say which to use.
+
+    With --materials or --prony each model is fitted to all recordings, and to all but each of them,
+    which it then predicts; of one recording the last third is held out.
 
     Finished runs are kept in the output folder: the same command resumes.
     """
@@ -225,14 +237,53 @@ def compare(
     from .study.arguments import parse_methods, read_truth
     from .study.table import Yardstick
 
-    names, limits = parse_methods(methods), Limits(workers, scheduler, time_limit)
+    names = parse_methods(methods) if methods is not None else ()
+    limits = Limits(workers, scheduler, time_limit)
     loaded = Problem.read(problem, set_ or (), allow_code)
+    if materials is not None or prony is not None:
+        planned = _planned_models(loaded, materials, prony, names, set_ or (), allow_code)
+        study = _Study("models", problem, planned, Yardstick(), out)
+        _study(study, limits, dry_run, as_json, quiet)
+        return
+    if not names:
+        raise InputError("nothing to compare; expected --methods, --materials or --prony")
     free = [item.name for item in loaded.parameters.free]
     yardstick = Yardstick(read_truth(truth or (), loaded.parameters.names, free), within)
     options = starts, spread, seed, yardstick.truth, allow_code
     planned = plan_comparison(loaded, names, set_ or (), *options)
     study = _Study("compare", problem, planned, yardstick, out)
     _study(study, limits, dry_run, as_json, quiet)
+
+
+def _planned_models(
+    problem: Problem,
+    materials: str | None,
+    prony: str | None,
+    methods: Sequence[str],
+    overrides: Sequence[str],
+    allow_code: bool,
+) -> list[PlannedRun]:
+    """The runs that compare models."""
+    from .problem import Problem
+    from .study import plan_models
+    from .study.variants import parse_branches, parse_materials, variants
+
+    if len(methods) > 1:
+        raise InputError(
+            f"found {', '.join(methods)}; expected one method to compare models by, or methods "
+            "without --materials and --prony",
+            None,
+            "--methods",
+        )
+    named = parse_materials(materials) if materials is not None else ()
+    counts = parse_branches(prony) if prony is not None else ()
+    fitted = [e for e in problem.experiments if not e.validation]
+    times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
+    assert problem.path is not None  # it was read
+    found = variants(problem.path, overrides, named, counts, times_s)
+    for variant in found:  # a model that cannot be would fail every run
+        Problem.read(problem.path, variant.overrides, allow_code)
+    return plan_models(problem, found, methods[0] if methods else None, allow_code)
 
 
 @app.command(

@@ -20,6 +20,8 @@ from ..errors import InputError
 from ..problem import Problem
 from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile
+from .prediction import recordings
+from .variants import Variant
 
 KEY_LENGTH = 20
 
@@ -39,6 +41,8 @@ class PlannedRun:
     guess : mapping of the estimated parameters to their guesses, None where there is none
     swept : mapping of swept keys to their values as text
     allow_code : bool, run the Python files that the problem names
+    held_out : str or None
+        Where models are compared: the recording that is predicted, "" if all are fitted.
     """
 
     key: str
@@ -49,10 +53,14 @@ class PlannedRun:
     guess: Mapping[str, float | None] = field(default_factory=dict)
     swept: Mapping[str, str] = field(default_factory=dict)
     allow_code: bool = False
+    held_out: str | None = None
 
     @property
     def label(self) -> str:
         """The run in a few words."""
+        if self.held_out is not None:
+            what = f" without '{self.held_out}'" if self.held_out else ""
+            return f"{self.swept['model']}{what}"
         if not self.swept:
             return f"{self.method}, start {self.start}"
         return ", ".join(f"{short}={self.swept[key]}" for key, short in short_keys(self.swept))
@@ -106,16 +114,12 @@ def plan_comparison(
         neither guess nor truth, and a problem without a file.
     """
     _refuse_options(starts, spread, seed)
-    if problem.path is None:
-        raise InputError(
-            "this problem has no file, which a study's processes read; write one, and take "
-            "Problem.read"
-        )
+    path = _path_of(problem)
     planned = []
     for start in range(starts):
         moved = list(overrides) + _start_overrides(problem, truth or {}, start, spread, seed)
-        file, _ = read_problem_file(problem.path, moved)
-        planned += [_planned(problem.path, file, method, moved, start) for method in methods]
+        file, _ = read_problem_file(path, moved)
+        planned += [_planned(path, file, method, moved, start) for method in methods]
     return [replace(run, allow_code=allow_code) for run in planned]
 
 
@@ -145,6 +149,39 @@ def plan_sweep(
             raise InputError(error.message, where, error.where) from error
         planned.append(_planned(path, file, method or file.solver.method, moved, swept=swept))
     return [replace(run, allow_code=allow_code) for run in planned]
+
+
+def plan_models(
+    problem: Problem,
+    variants: Sequence[Variant],
+    method: str | None = None,
+    allow_code: bool = False,
+) -> list[PlannedRun]:
+    """Every model fitted to all recordings, and to all but each; of one recording, its last third.
+
+    Raises
+    ------
+    InputError
+        For a model that the problem file cannot have, and a problem without a file.
+    """
+    path = _path_of(problem)
+    planned = []
+    for held_out in ("", *recordings(problem)):
+        for variant in variants:
+            file, _ = read_problem_file(path, variant.overrides)
+            solver, swept = method or file.solver.method, {"model": variant.label}
+            run = _planned(path, file, solver, variant.overrides, 0, swept, held_out)
+            planned.append(replace(run, allow_code=allow_code))
+    return planned
+
+
+def _path_of(problem: Problem) -> Path:
+    if problem.path is None:
+        raise InputError(
+            "this problem has no file, which a study's processes read; write one, and take "
+            "Problem.read"
+        )
+    return problem.path
 
 
 def _refuse_options(starts: int, spread: float, seed: int) -> None:
@@ -185,6 +222,7 @@ def _planned(
     overrides: Sequence[str],
     start: int = 0,
     swept: Mapping[str, str] | None = None,
+    held_out: str | None = None,
 ) -> PlannedRun:
     guess = {
         name: section.guess
@@ -197,11 +235,13 @@ def _planned(
     solver = content.get("solver", {})
     content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
     content["solver"]["method"] = method
-    decisive = [content, start, _hashes_of_files(content, path.parent), _version()]
+    of_study = start if held_out is None else f"without {held_out}"
+    decisive = [content, of_study, _hashes_of_files(content, path.parent), _version()]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
     whole = str(path.resolve())
-    return PlannedRun(key, whole, method, start, tuple(overrides), guess, dict(swept or {}))
+    changed, varied = tuple(overrides), dict(swept or {})
+    return PlannedRun(key, whole, method, start, changed, guess, varied, held_out=held_out)
 
 
 def _version() -> str:

@@ -6,11 +6,13 @@ import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import exp
 from pathlib import Path
 from typing import Any
 
 from ..fem.constants import symbol_of, unit_of
 from ..output.record import as_json
+from .choice import advice, model_notes, model_rows
 from .plan import PlannedRun, short_keys
 from .plots import comparison_plots, sweep_plots
 from .store import Record, RunStore, write_whole
@@ -39,7 +41,7 @@ class Report:
     Attributes
     ----------
     title : str
-    kind : {"compare", "sweep"}
+    kind : {"compare", "sweep", "models"}
     planned : tuple of PlannedRun
     records : mapping of key to record, those there are
     yardstick : Yardstick
@@ -53,7 +55,9 @@ class Report:
 
     @property
     def rows(self) -> list[Row]:
-        """One row for each planned run."""
+        """One row for each planned run, or for each model."""
+        if self.kind == "models":
+            return model_rows(self.planned, self.records)
         return [run_row(run, self.records.get(run.key), self.yardstick) for run in self.planned]
 
     @property
@@ -61,6 +65,8 @@ class Report:
         """The tables people look at, each within 80 columns."""
         if self.kind == "compare":
             return comparison_views(method_rows(self.rows))
+        if self.kind == "models":
+            return model_views(self.rows)
         return sweep_views(self.rows, list(self.planned[0].swept))
 
     @property
@@ -69,7 +75,8 @@ class Report:
         return [
             f"{run.label}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
-            if (record := self.records.get(run.key)) is not None and "result" not in record
+            if (record := self.records.get(run.key)) is not None
+            and not {"result", "model"} & record.keys()
         ]
 
     @property
@@ -77,6 +84,8 @@ class Report:
         """What to know when reading the tables."""
         missing = len(self.planned) - len(self.records)
         kept = [f"{missing} of {len(self.planned)} runs are still to be done."] if missing else []
+        if self.kind == "models":
+            return [*model_notes(self.rows), *kept]
         return [*((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == "compare" else ()), *kept]
 
 
@@ -105,7 +114,9 @@ def write_report(report: Report, folder: Path) -> None:
         write_whole(folder / "summary.csv", as_csv(method_rows(rows)))
     write_whole(folder / "summary.json", as_json(report_json(report)) + "\n")
     write_whole(folder / "summary.md", as_markdown(report))
-    if report.kind == "compare":
+    if report.kind == "models":
+        figures = {}
+    elif report.kind == "compare":
         figures = comparison_plots(rows, report.records, report.yardstick)
     else:
         figures = sweep_plots(rows, list(report.planned[0].swept))
@@ -130,6 +141,8 @@ def report_json(report: Report) -> dict[str, Any]:
             "within": report.yardstick.within,
             "methods": method_rows(rows),
         }
+    elif report.kind == "models":
+        content |= {"advice": advice(rows), "notes": model_notes(rows)}
     else:
         content["swept"] = list(first.swept)
     return content
@@ -221,6 +234,54 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:
         _view("Estimates ± standard error", places, estimates, rows),
         _view("Quality and cost", places, quality, rows),
     ]
+
+
+def model_views(rows: Sequence[Row]) -> list[View]:
+    """Fit and prediction of every model, and what its small-strain moduli are."""
+    numbers: dict[str, Cell] = {
+        "free": _number("free", 1, "d"),
+        "fit mm": _number("rms_m", 1e3, ".3g"),
+        "ΔAIC": _number("delta_aic", 1, ".1f"),
+        "held out mm": _number("held_out_rms_m", 1e3, ".3g"),
+        "times best": lambda row: _times(row),
+        "total s": _number("total_s"),
+    }
+    moduli: dict[str, Cell] = {}
+    names = dict.fromkeys(name for row in rows for name in row["parameters"])
+    for name in names:
+        text = f"{symbol_of(name)} {unit_of(name)}".strip()
+        moduli[text] = lambda row, name=name: _value(row["parameters"].get(name))
+    model = {"": lambda row: "→" if row["chosen"] else "", "model": _text("model")}
+    views = [_view("Models", model, numbers, rows)]
+    held = {
+        f"'{n}' mm": _held_out(n) for n in dict.fromkeys(n for r in rows for n in r["predictions"])
+    }
+    if len(held) > 1:
+        views.append(_view("Recordings held out", {"model": _text("model")}, held, rows))
+    return [*views, _turned("Parameters", {"model": _text("model")}, moduli, rows)]
+
+
+def _turned(
+    title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
+) -> View:
+    """A view with a line for each cell and a column for each row."""
+    (name,) = names.values()
+    lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
+    return View(title, ("", *(name(row) for row in rows)), lines)
+
+
+def _held_out(name: str) -> Cell:
+    return lambda row: _value(row["predictions"].get(name), 1e3, ".3g")
+
+
+def _times(row: Row) -> str:
+    if row["log_ratio"] is None:
+        return "–"
+    return f"{exp(row['log_ratio']):.2f} ± {exp(row['log_ratio']) * row['log_ratio_error']:.2f}"
+
+
+def _value(value: float | None, factor: float = 1.0, form: str = ".4g") -> str:
+    return "–" if value is None else format(factor * value, form)
 
 
 def _view(

@@ -22,6 +22,7 @@ from ..output.record import as_json, result
 from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run, run
+from .prediction import model_record
 from .store import ERROR, FINISHED, write_whole
 
 
@@ -36,6 +37,10 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
     """Do a planned run; what goes wrong becomes part of its record."""
     try:
         problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
+        held_out = planned.get("held_out")
+        if held_out is not None:
+            found = model_record(problem, planned["method"], held_out)
+            return {"outcome": FINISHED, "message": found["status"], "model": found}
         finished = run(problem, planned["method"])
         return {
             "outcome": FINISHED,

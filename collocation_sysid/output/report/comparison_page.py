@@ -8,6 +8,16 @@ from typing import Any
 from ...errors import InputError
 from .page import number, picture, read_json, rendered
 
+MODEL_COLUMNS = {
+    "model": "model",
+    "chosen": "to use",
+    "free": "parameters",
+    "status": "status",
+    "rms_m": "markers RMS m",
+    "delta_aic": "ΔAIC",
+    "held_out_rms_m": "held out RMS m",
+    "total_s": "time s",
+}
 # Columns that a person looks for first; the others are in runs.csv.
 METHOD_COLUMNS = {
     "method": "method",
@@ -43,7 +53,12 @@ def comparison_page(folder: str | Path) -> str:
             "comparison.html",
             summary=summary,
             methods=_table(methods, METHOD_COLUMNS),
-            runs=_table(runs, {name: name for name in _run_columns(runs, swept)}),
+            runs=_table(
+                runs,
+                MODEL_COLUMNS
+                if summary["kind"] == "models"
+                else {name: name for name in _run_columns(runs, swept)},
+            ),
             pictures=[
                 {"source": picture(file), "caption": file.stem.replace("_", " ")}
                 for file in sorted(folder.glob("*.png"))

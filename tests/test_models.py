@@ -1,0 +1,349 @@
+"""Which model? Variants of a problem, their evidence, what they predict, and the advice."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fits_small import autoregressive, problem
+from problem_files import EXPERIMENT, PROBLEM, replace_text, run_command, write_problem
+from problems_small import smooth_poses, times
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import write_poses_csv
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.problem import Problem
+from collocation_sysid.statistics.evidence import evidence_of
+from collocation_sysid.study import PlannedRun, plan_models
+from collocation_sysid.study.choice import advice, model_rows
+from collocation_sysid.study.prediction import model_record, without
+from collocation_sysid.study.variants import (
+    parse_branches,
+    parse_materials,
+    toml,
+    variants,
+)
+from collocation_sysid.synthesis import write_data
+
+BOTH = ("neo-hookean", "yeoh")
+DAMPING = "gamma_r_s = 0.009, gamma_m_1_s = 1.0, lambda_pa = 120.0"
+TRUTHS = {
+    "neo-hookean": (f"parameters={{mu_pa = 80.0, {DAMPING}}}",),
+    "yeoh": (
+        "object.material=yeoh",
+        f"parameters={{c10_pa = 40.0, c20_pa = 60.0, c30_pa = 0.0, {DAMPING}}}",
+    ),
+}
+TIMES_S = (0.01, 1.0)
+
+
+def soft_bar(folder: Path, material: str, steps: dict[str, int]) -> Path:
+    """Recordings of a bar so soft that it strains by a half, with 0.5 mm of noise."""
+    folder.mkdir(exist_ok=True)
+    box_mesh((0.06, 0.06, 0.12), (2, 2, 4)).write(folder / "body.vtu")
+    text = PROBLEM.replace("interior-point", "reduced-space")
+    for k, (name, count) in enumerate(steps.items()):
+        sway_m = np.roll((0.02, 0.02, 0.03), k).tolist()
+        poses = smooth_poses(times(count), sway_m, (0.2, -0.1, 0.1), 12 + 3 * k)
+        write_poses_csv(folder / f"{name}_motion.csv", poses)
+        text += EXPERIMENT.replace("swing", name).replace("0.089", "0.119")
+    file = folder / "problem.toml"
+    file.write_text(text)
+    truth = Problem.read(file, TRUTHS[material], simulation=True)
+    write_data(truth, folder, "midpoint", noise_m=5e-4, seed=1)
+    return file
+
+
+def compared(file: Path) -> list[dict]:
+    """The rows of a comparison, its runs done here."""
+    planned = plan_models(Problem.read(file), variants(file, (), BOTH, (), TIMES_S))
+    records = {
+        run.key: {"model": model_record(read(run), run.method, run.held_out or "")}
+        for run in planned
+    }
+    return model_rows(planned, json.loads(json.dumps(records)))
+
+
+def read(run: PlannedRun) -> Problem:
+    return Problem.read(run.problem, run.overrides)
+
+
+# Twins ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [{"a": 40}, {"a": 25, "b": 25}], ids=["one", "two"])
+def test_yeohs_material_is_recognised_at_large_strain(steps, tmp_path: Path):
+    neo_hookean, yeoh = rows = compared(soft_bar(tmp_path / "bar", "yeoh", steps))
+    assert yeoh["chosen"]
+    assert (yeoh["delta_aic"], yeoh["free"], neo_hookean["free"]) == (0, 6, 4)
+    assert neo_hookean["delta_aic"] > 100
+    assert neo_hookean["log_ratio"] > 2 * neo_hookean["log_ratio_error"] > 0
+    assert neo_hookean["log_ratio"] > np.log(1.2)
+    assert set(yeoh["predictions"]) == set(steps)
+    said = advice(rows)
+    assert said.startswith("Use yeoh: it misses what is held out by")
+    assert "2 parameters more" in said
+    assert said.endswith("That is sure, as far as these recordings go.")
+
+
+def test_yeohs_is_not_preferred_on_data_of_a_neo_hookean(tmp_path: Path):
+    neo_hookean, yeoh = rows = compared(soft_bar(tmp_path / "bar", "neo-hookean", {"a": 40}))
+    assert neo_hookean["chosen"]
+    assert yeoh["delta_aic"] > 0
+    # 0.5 mm in three directions
+    assert neo_hookean["held_out_rms_m"] == pytest.approx(5e-4 * np.sqrt(3), rel=0.15)
+    assert advice(rows).startswith("Use neo-hookean: it misses what is held out by")
+
+
+# Held out ---------------------------------------------------------------------------------------
+
+
+def test_of_two_recordings_one_is_held_out(tmp_path: Path):
+    several = Problem.read(write_problem(tmp_path, {"a": 6, "b": 7}))
+    left, start_s = without(several, "b")
+    assert [(e.name, e.validation) for e in left.experiments] == [("a", False), ("b", True)]
+    assert start_s == -np.inf
+
+
+def test_of_one_recording_the_last_third_is_held_out(tiny: Path):
+    alone = Problem.read(tiny / "problem.toml")
+    left, start_s = without(alone, "swing")
+    (kept,), (whole,) = left.experiments, alone.experiments
+    later = kept.t_s > start_s
+    assert later.sum() == 3  # of 9
+    assert not kept.markers.present[later].any()
+    earlier = kept.markers.positions_m[~later]
+    np.testing.assert_array_equal(earlier, whole.markers.positions_m[~later])
+
+
+# Variants ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bar(tiny: Path) -> Path:
+    return tiny / "problem.toml"
+
+
+def changed(file: Path, label: str, materials=(), branches=(), overrides=()) -> Problem:
+    """The problem as one of its variants has it."""
+    found = {v.label: v for v in variants(file, overrides, materials, branches, TIMES_S)}
+    return Problem.read(file, found[label].overrides)
+
+
+@pytest.mark.parametrize(
+    ("material", "expected"),
+    [
+        ("neo-hookean", "lambda_pa mu_pa gamma_r_s gamma_m_1_s"),
+        ("yeoh", "lambda_pa gamma_r_s gamma_m_1_s c10_pa c20_pa c30_pa"),
+        ("mooney-rivlin", "lambda_pa gamma_r_s gamma_m_1_s c10_pa c01_pa"),
+        ("gent", "lambda_pa mu_pa gamma_r_s gamma_m_1_s gent_limit"),
+    ],
+)
+def test_a_material_brings_its_constants_and_the_rest_stays_as_stated(bar, material, expected):
+    overrides = ("parameters.gamma_m_1_s=0.7",)
+    problem = changed(bar, material, {material: 0, "linear": 0}, overrides=overrides)
+    assert problem.bodies[0].parts[0].material.name == material
+    assert set(problem.parameters.names) == set(expected.split())
+    fixed = [i.name for i in problem.parameters.items if i.fixed]
+    assert fixed == ["gamma_m_1_s"]
+    given = {i.name: (i.guess, i.lower, i.upper) for i in problem.parameters.items}
+    assert given["lambda_pa"] == (400.0, 10.0, 1e5)
+
+
+def test_the_fixed_poisson_ratio_stays_whatever_the_material(bar):
+    stated = "parameters={young_pa = {}, poisson = 0.45, gamma_r_s = {}, gamma_m_1_s = {}}"
+    problem = changed(bar, "yeoh", BOTH, overrides=(stated,))
+    assert set(problem.parameters.names) == {
+        *("poisson", "gamma_r_s", "gamma_m_1_s", "c10_pa", "c20_pa", "c30_pa")
+    }
+    assert next(i.guess for i in problem.parameters.items if i.fixed) == 0.45
+    back = changed(bar, "neo-hookean", BOTH, overrides=(*_as_yeoh(), "object.density_kg_m3=40"))
+    assert set(back.parameters.names) == {"kappa_pa", "mu_pa", "gamma_r_s", "gamma_m_1_s"}
+
+
+def _as_yeoh() -> tuple[str, ...]:
+    own = "c10_pa = {}, c20_pa = {}, c30_pa = {}, kappa_pa = {guess = 300.0}"
+    stated = f"parameters={{{own}, gamma_r_s = {{}}, gamma_m_1_s = {{}}}}"
+    return "object.material=yeoh", stated
+
+
+def test_branches_are_tables_with_a_share_and_a_time_constant_each(bar):
+    none, one, two = variants(bar, (), (), (0, 1, 2), TIMES_S)
+    assert [v.label for v in (none, one, two)] == ["no memory", "1 branch", "2 branches"]
+    assert not any("prony" in setting for setting in none.overrides)
+    assert 'object.prony=[{"name" = "prony_1"}]' in one.overrides
+    assert 'object.prony=[{"name" = "prony_1"}, {"name" = "prony_2"}]' in two.overrides
+    assert (
+        '"prony_1.share" = {"guess" = 0.1}, "prony_1.tau_s" = {"guess" = 0.1}' in one.overrides[-1]
+    )
+    assert '"prony_1.tau_s" = {"guess" = 0.0464}' in two.overrides[-1]
+    assert '"prony_2.tau_s" = {"guess" = 0.215}' in two.overrides[-1]
+
+
+def test_materials_and_branches_are_combined(bar):
+    found = variants(bar, (), BOTH, (0, 1), TIMES_S)
+    assert [v.label for v in found] == [
+        "neo-hookean, no memory",
+        "neo-hookean, 1 branch",
+        "yeoh, no memory",
+        "yeoh, 1 branch",
+    ]
+
+
+def test_a_value_is_written_as_toml_reads_it():
+    value = {"a.b": {"guess": 1e-5, "bounds": [1, -2.5]}, "text": 'a "quoted" ß', "flag": True}
+    assert tomllib.loads(f"value = {toml(value)}")["value"] == value
+
+
+def test_bad_models_are_refused_in_one_line(bar, tiny):
+    with pytest.raises(InputError, match=r"'yeho'.*did you mean 'yeoh'"):
+        parse_materials("yeho,gent")
+    with pytest.raises(InputError, match="whole numbers such as 0,1,2"):
+        parse_branches("1,x")
+    with pytest.raises(InputError, match="yeoh alone; expected two or more"):
+        variants(bar, (), ("yeoh",), (), TIMES_S)
+    region = '[[object.region]]\nname = "core"\ncells = { indices = [0] }\n\n[parameters]'
+    replace_text("[parameters]", region)(tiny)
+    with pytest.raises(InputError, match=r"object\.region: found regions"):
+        variants(bar, (), BOTH, (), TIMES_S)
+
+
+# Evidence ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.6, 0.9])
+def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_tells(phi: float):
+    of = problem((400,), markers=4, offsets=False)
+    found = []
+    for seed in range(6):
+        errors = [autoregressive(np.random.default_rng(seed), 400, 4, phi)]
+        evidence = evidence_of(of.fit(errors, np.zeros(len(of.names)))[0])
+        found.append(evidence.independent / evidence.measurements)
+    # Of a first-order process 1 + 2 Σ φᵏ = (1 + φ) / (1 − φ).
+    assert np.mean(found) == pytest.approx((1 - phi) / (1 + phi), rel=0.3)
+
+
+def test_errors_that_all_markers_share_count_once():
+    of = problem((400,), markers=4, offsets=False)
+    errors = [autoregressive(np.random.default_rng(0), 400, 4, 0.0, shared=0.98)]
+    evidence = evidence_of(of.fit(errors, np.zeros(len(of.names)))[0])
+    assert evidence.independent == pytest.approx(400, rel=0.2)  # of 4800
+
+
+def test_a_needless_parameter_costs_two_and_gains_one_on_average():
+    of, rng, changes = problem((60,), markers=2, offsets=False), np.random.default_rng(0), []
+    # The errors are all there is to fit: any parameter is needless.
+    fewer = replace(
+        of,
+        slopes=tuple(slope[..., 1:] for slope in of.slopes),
+        names=of.names[1:],
+        prior_slope=of.prior_slope[1:],
+    )
+    for _ in range(80):
+        errors = [autoregressive(rng, 60, 2, 0.0)]
+        small, large = (
+            evidence_of(each.fit(errors, np.zeros(len(each.names)))[0]) for each in (fewer, of)
+        )
+        assert large.fitted - small.fitted == pytest.approx(1, abs=1e-6)
+        changes.append(large.criterion(360) - small.criterion(360))
+    assert np.mean(changes) == pytest.approx(2 - 1, abs=0.5)
+
+
+# The advice -------------------------------------------------------------------------------------
+
+
+def row_of(model: str, free: int, blocks: dict, misfit: float, failure: str = "") -> dict:
+    """Records of a model: fitted, and each recording predicted with these Σ of squares by block."""
+    evidence = {"misfit": misfit, "prior": 0.0, "fitted": float(free)}
+    evidence |= {"measurements": 900, "independent": 300.0}
+    whole = {"converged": True, "status": "converged", "free": ["p"] * free, "rms_m": 1e-3}
+    found = {"": whole | {"evidence": evidence, "parameters": {}}}
+    for name, each in blocks.items():
+        rms_m = float(np.sqrt(np.sum(each) / 100))
+        found[name] = whole | {"prediction": {"rms_m": rms_m, "samples": 100, "blocks_m2": each}}
+        if failure:
+            found[name] = whole | {"prediction": None, "failure": failure}
+    return {"model": model, "found": found}
+
+
+def rows_of(*models: dict) -> list[dict]:
+    planned, records = [], {}
+    for each in models:
+        for held_out, found in each["found"].items():
+            key = f"{each['model']}/{held_out}"
+            swept = {"model": each["model"]}
+            planned.append(PlannedRun(key, "problem.toml", "m", swept=swept, held_out=held_out))
+            records[key] = {"model": found}
+    return model_rows(planned, records)
+
+
+STEADY = np.full(8, 1e-5)
+WAVY = STEADY * (1 + 0.3 * np.cos(np.arange(8)))
+
+
+def test_of_models_that_predict_alike_the_one_with_fewer_parameters_is_taken():
+    small = row_of("small", 4, {"a": (1.01 * WAVY).tolist()}, 900)
+    large = row_of("large", 6, {"a": (WAVY + 1e-6 * np.sin(np.arange(8))).tolist()}, 899)
+    rows = rows_of(small, large)
+    assert rows[0]["chosen"]
+    assert "hardly tell them apart" in advice(rows)
+
+
+def test_a_model_that_fits_better_but_predicts_worse_is_not_taken():
+    small = row_of("small", 4, {"a": STEADY.tolist()}, 900)
+    large = row_of("large", 6, {"a": (1.4 * WAVY).tolist()}, 700)
+    rows = rows_of(small, large)
+    assert rows[0]["chosen"]
+    assert rows[0]["delta_aic"] == pytest.approx(300 * np.log(900 / 700) - 4)
+    assert "large fits better, but does not predict better" in advice(rows)
+
+
+def test_recordings_that_disagree_leave_it_open():
+    small = row_of("small", 4, {"a": (2 * STEADY).tolist(), "b": STEADY.tolist()}, 900)
+    large = row_of("large", 6, {"a": STEADY.tolist(), "b": (1.5 * STEADY).tolist()}, 850)
+    rows = rows_of(small, large)
+    assert rows[0]["log_ratio_error"] > rows[0]["log_ratio"] > 0
+    assert rows[0]["chosen"]
+
+
+def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
+    small = row_of("small", 4, {"a": STEADY.tolist(), "b": STEADY.tolist()}, 900)
+    large = row_of("large", 6, {"a": [], "b": []}, 700, failure="the step at row 7 failed")
+    said = advice(rows_of(small, large))
+    assert said.startswith("Use small: no other predicts what is held out. large does not predict")
+    assert "but fits all better (AIC is 71.4 for it)" in said
+
+
+# The command line -------------------------------------------------------------------------------
+
+
+def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
+    monkeypatch.chdir(tiny)
+    monkeypatch.setenv("COLUMNS", "80")
+    words = ("compare", "problem.toml", "--materials", "neo-hookean,st-venant-kirchhoff")
+    words = (*words, "--methods", "reduced-space", "--workers", "2", "--out", "models")
+    done = run_command(*words, "--quiet")
+    assert done.code == 0, done.err
+    assert "Use " in done.out
+    assert "the last third of the recording" in done.out
+    summary = json.loads((tiny / "models" / "summary.json").read_text())
+    assert summary["kind"] == "models"
+    assert summary["advice"] in done.out
+    assert [row["model"] for row in summary["runs"]] == ["neo-hookean", "st-venant-kirchhoff"]
+    assert sum(row["chosen"] for row in summary["runs"]) == 1
+    listed = run_command(*words, "--dry-run")
+    assert listed.out.count("finished") == 4
+    page = run_command("report", "models")
+    assert summary["advice"].split(":")[0] in (tiny / "models" / "report.html").read_text()
+    assert page.code == 0
+
+
+def test_there_must_be_something_to_compare(tiny: Path):
+    nothing = run_command("compare", "problem.toml")
+    assert (nothing.code, "--methods, --materials or --prony" in nothing.err) == (2, True)
+    several = ("compare", "problem.toml", "--materials", "gent,yeoh", "--methods")
+    assert "expected one method" in run_command(*several, "reduced-space,shooting").err
