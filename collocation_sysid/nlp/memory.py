@@ -249,6 +249,11 @@ class Slopes:
         self._direction = np.zeros_like(self._state)
         self._moduli = np.flatnonzero(theta_q[history.body.elastic_places].any(axis=0))
         self._slopes, self._first = np.zeros((0, 0, 0)), 0
+        # (columns, N) derivatives of d and a of each branch, and where they are not zero.
+        self._own = []
+        for r in history.recursions:
+            own = theta_q[[r.branch.share, r.branch.tau]].T
+            self._own.append((np.flatnonzero(own.any(axis=1)), own @ r.d_by, own @ r.a_by))
 
     def force(self) -> Array:
         """What they add to dF at the next evaluation, (3n, columns)."""
@@ -277,14 +282,16 @@ class Slopes:
         if len(self._moduli):
             for column, slope in zip(self._moduli, self._by_moduli(k), strict=True):
                 stress[column] += slope if alone is None else alone.a[k] * slope
-        for r, m, columns in zip(history.recursions, history.brought, self.columns, strict=True):
-            points, own = r.branch.points, self.theta_q[[r.branch.share, r.branch.tau]]
+        for r, m, columns, (moved, d_own, a_own) in zip(
+            history.recursions, history.brought, self.columns, self._own, strict=True
+        ):
+            points = r.branch.points
             if alone is None:
                 columns *= r.d[k]
                 columns += np.multiply(stress[:, points], r.a[k], out=self._scratch[:, points])
-            for j in np.flatnonzero(own.any(axis=0)):
-                columns[j] += (r.d_by[:, k] @ own[:, j]) * m[k]
-                columns[j] += (r.a_by[:, k] @ own[:, j]) * history.stress[k, points]
+            for j in moved:
+                columns[j] += d_own[j, k] * m[k]
+                columns[j] += a_own[j, k] * history.stress[k, points]
         self.next += 1
 
     def _by_moduli(self, k: int) -> Array:

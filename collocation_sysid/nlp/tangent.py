@@ -536,7 +536,8 @@ class _Forward:
             given.place_taken(t, solution)
         if self.slopes is not None:
             of_state = np.zeros((solver.body.pattern.size, self.shape[1]))
-            of_state[solver.free] = row.p[0] * solution + weighted(row.p, self.past, self.shape)
+            of_past = weighted(row.p, self.past, self.shape) if row.p[1:].any() else 0.0
+            of_state[solver.free] = row.p[0] * solution + of_past
             if given is not None:
                 of_state[given.held_dofs] = given.of_evaluations[0][t, given.places < 0]
             self.slopes.advance(of_state)

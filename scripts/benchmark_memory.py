@@ -1,0 +1,78 @@
+"""What branches of memory cost a sweep of the paper's size: 171 nodes, 100 timesteps.
+
+Sweeps with none, one and two branches take turns in one run, on one thread, by processor time, so
+that other work on the machine moves the ratio little. A branch has two parameters, and with them
+two more columns to solve for; the second table has them fixed.
+
+    python scripts/benchmark_memory.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from collocation_sysid import Body, Collocation, Experiment, Parameters, Problem, Unknown
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.tangent import BlockSolver
+
+FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+MEMORY = {
+    "prony_1.share": 0.3,
+    "prony_1.tau_s": 0.1,
+    "prony_2.share": 0.2,
+    "prony_2.tau_s": 0.4,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="What branches of memory cost a sweep.")
+    parser.add_argument("--repeats", type=int, default=15)
+    repeats = parser.parse_args().repeats
+    (experiment,) = Problem.read(FILE).experiments
+    for estimated in (True, False):
+        print(f"memory's parameters {'estimated' if estimated else 'fixed'}")
+        sweeps = [sweep(experiment, branches, estimated) for branches in range(3)]
+        seconds = np.array([[timed(run) for run, _ in sweeps] for _ in range(repeats)])
+        best, relative = seconds.min(axis=0), np.median(seconds / seconds[:, :1], axis=0)
+        for branches, (_, columns) in enumerate(sweeps):
+            print(
+                f"  {branches} branches, {columns} columns: {1e3 * best[branches]:6.1f} ms at best,"
+                f" {best[branches] / best[0]:.2f} times as long; median ratio "
+                f"{relative[branches]:.2f}"
+            )
+
+
+def sweep(
+    experiment: Experiment, branches: int, estimated: bool
+) -> tuple[Callable[[], object], int]:
+    """A sweep of the experiment with so many branches, and how many columns it has."""
+    plain, names = experiment.body, [f"prony_{k + 1}" for k in range(branches)]
+    body = Body(plain.mesh, density_kg_m3=plain.parts[0].density_kg_m3, prony=names, threads=1)
+    memory = {n: v for n, v in MEMORY.items() if n.partition(".")[0] in names}
+    given: dict[str, Unknown | float] = {name: Unknown(guess=v) for name, v in TRUTH.items()}
+    given |= {name: Unknown(guess=v) if estimated else v for name, v in memory.items()}
+    collocation = Collocation([replace(experiment, body=body)], Parameters.of(given))
+    (segment,) = collocation.segments
+    setting = segment.setting(collocation.guess_p, np.zeros(segment.nuisance.size))
+    x = march(experiment=segment.experiment, dynamics=setting.dynamics, theta=setting.theta)
+    solver = BlockSolver(segment)
+    solver.forward(x, setting)
+    return lambda: solver.forward(x, setting), 1 + len(segment.moving)
+
+
+def timed(run: Callable[[], object]) -> float:
+    """Processor time of a run [s]."""
+    began = time.process_time()
+    run()
+    return time.process_time() - began
+
+
+if __name__ == "__main__":
+    main()

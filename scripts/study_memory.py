@@ -1,0 +1,121 @@
+"""How often the 95 % intervals of materials with memory hold the truth: noisy twins.
+
+A block sticks out of a hand that swings it and then holds it still; its tracks come from the scheme
+that also fits them, with white noise. Counted is how often an interval holds the truth: of each
+parameter, and of the instantaneous modulus. Without noise the truth is found to rounding, which is
+said first.
+
+    python scripts/study_memory.py --twins 200 --branches 1 2
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.stats import binom
+
+from collocation_sysid import (
+    Body,
+    Collocation,
+    Experiment,
+    Grasp,
+    Markers,
+    Nuisance,
+    Parameters,
+    PoseSequence,
+    ReducedSpace,
+    Unknown,
+    simulate,
+    with_markers,
+)
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_of
+
+SIZE_M, DIVISIONS = (0.1, 0.03, 0.03), (4, 1, 1)
+NOISE_M, STEPS, STEP_S, MOVED_S = 2e-4, 120, 0.01, 0.4
+TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.003, "gamma_m_1_s": 0.5}
+BRANCHES = (
+    {"prony_1.share": 0.4, "prony_1.tau_s": 0.3},
+    {"prony_2.share": 0.3, "prony_2.tau_s": 0.03},
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Coverage of intervals with memory.")
+    parser.add_argument("--twins", type=int, default=200)
+    parser.add_argument("--branches", type=int, nargs="+", choices=(1, 2), default=[1, 2])
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    for branches in arguments.branches:
+        report(branches, arguments.twins, arguments.seed)
+
+
+def report(branches: int, twins: int, seed: int) -> None:
+    """Find the truth without noise, then count."""
+    exact, parameters = recording(branches), unknowns(branches)
+    solution = ReducedSpace()(Collocation([exact], parameters))
+    true = truth(branches)
+    worst = max(abs(solution.parameters[name] / value - 1) for name, value in true.items())
+    print(f"{branches} branches; without noise all parameters are right to {worst:.1e}")
+    rng = np.random.default_rng(seed)
+    at_once = true["young_pa"] * (1 + sum(v for n, v in true.items() if n.endswith("share")))
+    true |= {"instantaneous_young_pa": at_once}
+    held = {name: 0 for name in true}
+    wide = dict.fromkeys(true, 0)
+    for _ in range(twins):
+        tracks = exact.markers.positions_m
+        noisy = with_markers(exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape))
+        collocation = Collocation([noisy], parameters)
+        found = ReducedSpace()(collocation)
+        fit = linearised_fit(collocation, found.z)
+        uncertainty = uncertainty_of(fit, parameters, found.q)
+        for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
+            if name in true and estimate.ci95 is not None:
+                held[name] += estimate.ci95[0] <= true[name] <= estimate.ci95[1]
+                wide[name] += 1
+    low, high = binom.interval(0.95, twins, 0.95)
+    print(f"  {twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %")
+    for name, count in held.items():
+        share = 100 * count / max(1, wide[name])
+        print(f"  {name:24}{share:6.1f} % of {wide[name]} intervals", flush=True)
+
+
+def truth(branches: int) -> dict[str, float]:
+    """All parameters with so many branches."""
+    return TRUTH | {name: v for branch in BRANCHES[:branches] for name, v in branch.items()}
+
+
+def unknowns(branches: int) -> Parameters:
+    """All to be estimated, from guesses near the truth."""
+    return Parameters.of({n: Unknown(guess=1.1 * v) for n, v in truth(branches).items()})
+
+
+@cache
+def recording(branches: int) -> Experiment:
+    """The block with the tracks that the truth gives it."""
+    names = [f"prony_{k + 1}" for k in range(branches)]
+    body = Body(box_mesh(SIZE_M, DIVISIONS), density_kg_m3=200.0, prony=names)
+    t_s = STEP_S * np.arange(STEPS + 1)
+    moving = np.minimum(t_s, MOVED_S)
+    share = 1 - np.cos(4 * np.pi * moving / MOVED_S)
+    turn = np.sin(np.pi * moving / (2 * MOVED_S)) ** 2
+    half = np.outer(turn, [0.0, 0.6, 0.3])
+    quaternions = np.column_stack([half, np.sqrt(1 - np.sum(half**2, axis=1))])
+    poses = PoseSequence(t_s, np.outer(share, [0.0, 0.01, 0.015]), quaternions)
+    held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
+    seen = np.flatnonzero(body.nodes_m[:, 0] > 0.049)
+    nowhere = np.zeros((len(t_s), len(seen), 3))
+    markers = Markers(t_s, nowhere, NOISE_M, None, body.nodes_m[seen])
+    experiment = Experiment(
+        body, t_s, [Grasp(held, poses)], markers, name="block", nuisance=Nuisance.none()
+    )
+    tracks = simulate(experiment, truth(branches), "midpoint").markers_m
+    return replace(experiment, markers=with_markers(experiment, tracks).markers)
+
+
+if __name__ == "__main__":
+    main()
