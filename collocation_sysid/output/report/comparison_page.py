@@ -56,7 +56,7 @@ def comparison_page(folder: str | Path) -> str:
             runs=_table(
                 runs,
                 MODEL_COLUMNS
-                if summary["kind"] == "models"
+                if summary.get("kind") == "models"
                 else {name: name for name in _run_columns(runs, swept)},
             ),
             pictures=[
