@@ -110,9 +110,7 @@ def test_forces_balance_and_exert_no_torque(element, rng):
 @pytest.mark.parametrize("material", [*MATERIALS, of_a_user])
 def test_undeformed_it_is_rayleighs(material, element, rng):
     """So that damping ratios of small oscillations are the same."""
-    bodies = [
-        small_body(material, element, "casadi", law) for law in ("kelvin-voigt", "rayleigh")
-    ]
+    bodies = [small_body(material, element, "casadi", law) for law in ("kelvin-voigt", "rayleigh")]
     _, v = state(bodies[0], rng)
     found, expected = (damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies)
     assert relative_error(found, expected) < 1e-12
@@ -152,9 +150,7 @@ def test_linearise_gives_the_slopes_of_the_force(material, element, evaluator, r
         (x, by_x, LENGTH_M, lambda x: body.force(x, v, theta)),
         (v, by_v, 1.0, lambda v: body.force(x, v, theta)),
     ):
-        assert_derivative(
-            moved, lambda d, m=slopes: times(body, *m, d), point, rng, scale=scale
-        )
+        assert_derivative(moved, lambda d, m=slopes: times(body, *m, d), point, rng, scale=scale)
     assert_derivative(
         lambda c: body.force(x, v, c), lambda d: at.by_theta @ d, theta, rng, scale=theta
     )

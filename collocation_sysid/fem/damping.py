@@ -46,9 +46,7 @@ class Damping:
     stress: Stress | None = field(default=None, repr=False)
 
 
-def kelvin_voigt(
-    psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
-) -> tuple[ca.SX, ca.SX]:
+def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
     """P_v = γ_r F dS/dt = γ_r (dP/dt − Ḟ S), and γ_r (∂(dP/dt)/∂F − Ḟ ∂S/∂F).
 
     With S = F⁻¹ P, ∂S/∂F:A = F⁻¹ (∂P/∂F:A − A S).
