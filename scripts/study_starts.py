@@ -216,9 +216,8 @@ CASES: dict[str, Callable[[], Case]] = {
 
 def hanging_cylinder(layers: int, steps: int, scheme: str, rings: int = 1) -> Experiment:
     """A cylinder held at one end, hanging and swung, with tracks of its own scheme."""
-    body = Body(
-        cylinder_mesh(RADIUS_M, HEIGHT_M, rings, layers), density_kg_m3=20.0, damping="rayleigh"
-    )
+    shape = cylinder_mesh(RADIUS_M, HEIGHT_M, rings, layers)
+    body = Body(shape, density_kg_m3=20.0, damping="rayleigh")
     t_s = STEP_S * np.arange(steps, dtype=np.float64)
     poses = swing(
         t_s,
@@ -350,9 +349,9 @@ def counted_factorisations() -> Iterator[list[int]]:
     """Count the matrices factorised meanwhile."""
     count, original = [0], Factoriser.factorise
 
-    def counting(self: Factoriser, values: NDArray[np.float64]):
+    def counting(self: Factoriser, *matrix):
         count[0] += 1
-        return original(self, values)
+        return original(self, *matrix)
 
     Factoriser.factorise = counting
     try:

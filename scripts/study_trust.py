@@ -147,12 +147,10 @@ def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
 @cache
 def bodies() -> tuple[tuple[Body, float], ...]:
     """Each with its Young's modulus [Pa] where it is soft."""
+    cylinder, box = cylinder_mesh(0.04, 0.16, 1, 5), box_mesh((0.04, 0.05, 0.15), (2, 2, 5))
     return (
-        (Body(cylinder_mesh(0.04, 0.16, 1, 5), density_kg_m3=20.0, damping="rayleigh"), 700.0),
-        (
-            Body(box_mesh((0.04, 0.05, 0.15), (2, 2, 5)), density_kg_m3=100.0, damping="rayleigh"),
-            5e3,
-        ),
+        (Body(cylinder, density_kg_m3=20.0, damping="rayleigh"), 700.0),
+        (Body(box, density_kg_m3=100.0, damping="rayleigh"), 5e3),
     )
 
 

@@ -56,6 +56,13 @@ def box(
     return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=element)
 
 
+def with_papers_damping(experiment: Experiment) -> Experiment:
+    """The experiment with Rayleigh's law."""
+    body = experiment.body
+    rayleigh = Body(body.mesh, density_kg_m3=30.0, element=body.element.name, damping="rayleigh")
+    return replace(experiment, body=rayleigh)
+
+
 def nodes_where(body: Body, axis: int, value_m: float) -> np.ndarray:
     """Nodes on a plane across an axis."""
     return np.flatnonzero(np.abs(body.nodes_m[:, axis] - value_m) < 1e-9)

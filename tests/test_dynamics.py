@@ -15,6 +15,7 @@ from problems_small import (
     nodes_where,
     times,
     vertex_markers,
+    with_papers_damping,
 )
 
 from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
@@ -33,7 +34,8 @@ ELASTIC = {"lambda_pa": TRUTH["lambda_pa"], "mu_pa": TRUTH["mu_pa"]}
 @pytest.fixture(scope="module")
 def backward_euler() -> tuple[Collocation, np.ndarray]:
     """Collocation of a cube of eight nodes, and positions (N, 3n) that satisfy nothing."""
-    experiment = hung_cube(steps=5, divisions=(1, 1, 1), start="undeformed")
+    cube = hung_cube(steps=5, divisions=(1, 1, 1), start="undeformed")
+    experiment = with_papers_damping(cube)
     collocation = Collocation([experiment], GUESS, "backward-euler")
     rng = np.random.default_rng(2)
     x = experiment.rigid_positions(experiment.t_s).reshape(len(experiment.t_s), -1)

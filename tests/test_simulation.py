@@ -18,6 +18,7 @@ from problems_small import (
     smooth_poses,
     times,
     vertex_markers,
+    with_papers_damping,
 )
 from scipy.spatial.transform import Rotation
 
@@ -256,7 +257,7 @@ def test_newmark_halves_steps_that_are_too_large():
 
 
 def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
-    cube = jerked_cube(0.45, timestep_s=0.02)
+    cube = with_papers_damping(jerked_cube(0.45, timestep_s=0.02))
     dynamics = Dynamics.of(cube, "midpoint")
     x = march(cube, dynamics, THETA)
     residual = dynamics.residual(x, THETA)[:, Solver(cube).free]

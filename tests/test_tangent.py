@@ -12,10 +12,10 @@ from problems_small import (
     hung_cube,
     measured,
     released_cube,
+    with_papers_damping,
 )
 
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.fem.body import Body
 from collocation_sysid.methods.multipliers import constraint_multipliers
 from collocation_sysid.nlp import tangent
 from collocation_sysid.nlp.collocation import Collocation
@@ -181,9 +181,7 @@ def test_rows_one_by_one_are_the_same_sensitivities():
 
 def test_indefinite_blocks_are_counted():
     """Rayleigh's damping makes them so where elements are squashed; the objective law does not."""
-    cube = hung_cube(6)
-    body = Body(cube.body.mesh, density_kg_m3=30.0, damping="rayleigh")
-    collocation = Collocation([replace(cube, body=body)], GUESS)
+    collocation = Collocation([with_papers_damping(hung_cube(6))], GUESS)
     (segment,) = collocation.segments
     x = np.tile(segment.body.nodes_m.ravel(), (segment.grid_rows, 1))
     x.reshape(len(x), -1, 3)[3:, :, 2] *= 0.05

@@ -158,9 +158,9 @@ def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypa
         factorised = []
         factorise_each = solver.factoriser.factorise_each
 
-        def counted(matrix, count, threads, kept=factorised, do=factorise_each):
+        def counted(matrix, count, *rest, kept=factorised, do=factorise_each):
             kept.append(count)
-            return do(matrix, count, threads)
+            return do(matrix, count, *rest)
 
         object.__setattr__(solver.factoriser, "factorise_each", counted)
         (part,) = collocation.parts(z)

@@ -62,7 +62,7 @@ class Law:
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """That of the damping law, from the energy as an expression in F; none, where it has none."""
+        """That of the damping law, from the energy as an expression in F; 0 where it has none."""
         potential = self.damping.potential
         return potential(psi, F, rate, **self._of_damping(theta)) if potential else ca.SX(0)
 

@@ -19,7 +19,7 @@ fixed s, and with Γ = Σ_q ∂g/∂m
 So two phases go before the last, for s and for Γ. The node vectors coupled are ∂s/∂x and
 Σ_q ∂²g/∂x∂m; those of s by v are among them, since what of s is a rate along v changes with v as
 that which it is the rate of changes with x. Of a g that is an energy, or its derivative along v,
-those by v are too; of a dissipation function Σ_q ∂²g/∂v∂m is another one.
+those by v are too; of a power that is dissipated Σ_q ∂²g/∂v∂m is another one.
 
 Of an element only the mean dilatation and the 4 · 5 distortions at its points are resisted: alone,
 it does not resist the three conformal motions that leave its volume as it is. Four elements whose
@@ -86,7 +86,7 @@ class _Shape:
 
     @property
     def stretches(self) -> ca.SX:
-        """m."""
+        """Their symbols m."""
         return ca.vertcat(*self.point.stretches)
 
     @property
@@ -236,8 +236,8 @@ def _coupling(
     for terms in outputs.values():
         total = ca.SX(0, 0)
         if terms[0].contraction != "none":
-            own = terms[0].by.count("theta") and constants or 1
-            total = ca.SX(size, size if terms[0].contraction == "pairs" else own)
+            width = constants if "theta" in terms[0].by else 1
+            total = ca.SX(size, size if terms[0].contraction == "pairs" else width)
         for term in terms:
             chain = chains[id(term.scalar)]
             by_s, bent = _slopes(shape.volumes, shape.volume, chain.slopes)

@@ -47,10 +47,10 @@ class Term:
             return piece
         if self.part == "whole":
             return mirrored(piece)
+        if self.part == "symmetric":
+            return mirrored((piece + piece.T) / 2)
         # Contracted in pairs, a piece gives the lower triangle of its transpose.
-        return (
-            mirrored((piece + piece.T) / 2) if self.part == "symmetric" else (piece.T - piece) / 2
-        )
+        return (piece.T - piece) / 2
 
 
 # The terms of each output.

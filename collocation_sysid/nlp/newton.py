@@ -102,8 +102,8 @@ class Solver:
         Parameters
         ----------
         residual : x -> (3n,)
-        linearise : x -> residual (3n,), and lower triangles (m,) of the symmetric and, (m,) or (0,),
-            the skew part of −∂r/∂x
+        linearise : x -> residual (3n,), and lower triangles of the symmetric part (m,) and the
+            skew part, (m,) or (0,), of −∂r/∂x
         """
         x = x.copy()
         self._require_upright(x)

@@ -81,8 +81,7 @@ class ObjectSection(Section):
         "neo-hookean", description="A material's name, or a table of file and function."
     )
     damping: DampingName = Field(
-        "kelvin-voigt",
-        description="Law of the damping γ_r; rayleigh, the paper's, brakes rotation.",
+        "kelvin-voigt", description="Law of γ_r; rayleigh, the paper's, brakes rotation."
     )
     element: ElementName = "tet4"
     region: list[RegionSection] = Field(
