@@ -80,7 +80,8 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
         said = [oddity.sentence for oddity in oddities(body)]
         if not said and (odd := odd_material(body, body.theta(solution.parameters))) is not None:
             said = [odd]
-        yield from ((sentence, "doubtful") for sentence in said)
+        for sentence in said:
+            yield sentence, "doubtful"
 
 
 def _of_rollout(

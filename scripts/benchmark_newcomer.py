@@ -1,8 +1,9 @@
 """What it costs to know nothing: a run at the paper's size without guess and places of markers.
 
 The same recording is identified with both (a guess a factor of two off, places known to 1 mm) and
-without either, in turn, with the default nuisance parameters, and the ratio of the medians is printed. A run is the whole of it: start,
-solve, roll-out, error bars and verdict. Compiling the element's code comes before.
+without either, in turn and with the default nuisance parameters; the ratio of the medians is
+printed. A run is the whole of it: start, solve, roll-out, error bars and verdict. Compiling the
+element's code comes before.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from problem_files import run_command, settings, write_problem
 from collocation_sysid import Run, run
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.output.record import result
+from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.cause import Cause
 from collocation_sysid.statistics.trust import (
     Trust,
@@ -35,6 +36,9 @@ from twins import BODIES, NOISE_M, SOFT, twin
 from wrong_twins import FAULTS
 
 RNG = np.random.default_rng
+FOAM_CYLINDER = Path(__file__).parents[1] / "problems" / "foam_cylinder" / "problem.toml"
+# Of λ = 800 Pa and μ = 600 Pa, with which its tracks were made.
+FOAM_YOUNG_PA = 600 * (3 * 800 + 2 * 600) / (800 + 600)
 OF = problem((80,), markers=3)
 
 
@@ -165,6 +169,16 @@ def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     assert found.uncertainty.noise == "estimated"
     said = [diagnosis.sentence for diagnosis in found.diagnoses]
     assert not any("as noise should be" in sentence for sentence in said)
+
+
+@pytest.mark.parametrize(("substeps", "good"), [(1, False), (2, True)])
+def test_a_step_too_coarse_for_the_error_bars_is_not_good(substeps, good):
+    problem = replace(Problem.read(FOAM_CYLINDER), substeps=substeps)
+    found = run(problem, "reduced-space")
+    bar = found.estimates["young_pa"]
+    assert bar.std_error is not None
+    off = abs(bar.value - FOAM_YOUNG_PA) / bar.std_error
+    assert (off < 3, found.trust.verdict == "good") == (good, good)
 
 
 def test_the_verdict_is_shown_stored_and_fed():

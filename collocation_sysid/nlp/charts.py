@@ -21,8 +21,8 @@ from ..fem.body import Body
 # A place leaves its element when another holds it better by this, in barycentric coordinates: so
 # it cannot swing between two. The clock leaves its sample when it is off by more than this.
 BETTER, SAMPLES_OFF = 0.01, 1.0
-# A place that leaves the surface across an edge where it did before, so many times more, keeps to the
-# plane it is in. What is nearer than this, over an edge of the mesh, is the same.
+# A place that leaves the surface across an edge where it did before, so many times more, keeps to
+# the plane it is in. What is nearer than this, over an edge of the mesh, is the same.
 AGAIN, SAME = 2, 1e-6
 
 
