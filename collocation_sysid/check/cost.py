@@ -58,12 +58,13 @@ def costs(
     factorisation : {"auto", "band", "sparse"}
     """
     width = max(len(segment.free_dofs) for segment in collocation.segments)
+    reduced = Cost(
+        "reduced-space", memory_mb(collocation), _sweeps_s(collocation, z, factorisation)
+    )
+    if collocation.remembers:  # other methods refuse it
+        return (reduced,)
     return (
-        Cost(
-            "reduced-space",
-            memory_mb(collocation),
-            _sweeps_s(collocation, z, factorisation),
-        ),
+        reduced,
         Cost(
             "interior-point",
             BYTES * nonzeros / 1e6,

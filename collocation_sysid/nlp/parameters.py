@@ -104,7 +104,7 @@ class Parameter:
         if self.fixed:
             self._check_fixed()
             return
-        least = max(0.0 if self.scale == "log" else -np.inf, constant_named(self.name).least)
+        least = 0.0 if self.scale == "log" else constant_named(self.name).at_least
         if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
             raise InputError(
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "

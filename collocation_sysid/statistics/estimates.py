@@ -140,7 +140,7 @@ def _of_parameter(item: Parameter, value: float, deviation: float, quantile: flo
     if not deviation <= UNDETERMINED:
         return Estimate(value, reason="the data do not determine it")
     spread = deviation * item.unit
-    least = constant_named(item.name).least
+    least = constant_named(item.name).at_least
     return Estimate(
         value, spread, (max(least, value - quantile * spread), value + quantile * spread)
     )
