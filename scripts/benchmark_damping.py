@@ -2,7 +2,7 @@
 
 A sweep is what an iteration of reduced space costs: all timesteps evaluated, their blocks
 factorised, the feasibility step and the sensitivities solved for. Kelvin and Voigt's blocks are not
-symmetric. Rounds of both laws alternate; the ratio of their medians is what counts.
+symmetric. Rounds of both laws alternate; the best times are compared.
 
     python scripts/benchmark_damping.py
 """
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -48,7 +47,7 @@ def main() -> None:
 
 
 def measure(mesh: str, steps: int, element: str, threads: int, rounds: int) -> dict:
-    """Medians in milliseconds, and the ratio of the sweeps."""
+    """Best times in milliseconds, which a busy machine disturbs least, and the sweeps' ratio."""
     sweeps = {law: sweep_of(mesh, steps, element, threads, law) for law in LAWS}
     taken: dict[str, list[tuple[float, ...]]] = {law: [] for law in LAWS}
     for _ in range(rounds):
@@ -57,7 +56,7 @@ def measure(mesh: str, steps: int, element: str, threads: int, rounds: int) -> d
     names = ("sweep", "evaluation", "linear algebra")
     found: dict = {
         law: {
-            name: 1e3 * statistics.median(times)
+            name: 1e3 * min(times)
             for name, times in zip(names, zip(*taken[law], strict=True), strict=True)
         }
         for law in LAWS

@@ -54,7 +54,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 
 def new_body(mesh, material: str | Callable = "neo-hookean", evaluator: str = "auto") -> Body:
-    return Body(mesh, material, density_kg_m3=30.0, evaluator=evaluator)
+    return Body(mesh, material, 30.0, damping="rayleigh", evaluator=evaluator)
 
 
 def squeezed(mesh) -> np.ndarray:

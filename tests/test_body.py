@@ -233,7 +233,7 @@ def test_linearise_writes_into_the_given_rows(make_body, rng):
     rows = np.full((len(x), body.linearisation_width), np.nan)
     at = body.linearise(x, v, theta, out=rows)
     for name, expected in vars(body.linearise(x, v, theta)).items():
-        assert np.shares_memory(getattr(at, name), rows)
+        assert np.shares_memory(getattr(at, name), rows) or not expected.size
         np.testing.assert_array_equal(getattr(at, name), expected)
     with pytest.raises(InputError, match="expected contiguous float64"):
         body.linearise(x, v, theta, out=rows[:, 1:])

@@ -7,6 +7,7 @@ from problems_small import TRUTH, box
 
 from collocation_sysid.fem.pattern import SymmetricPattern
 from collocation_sysid.nlp.factorisation import Factoriser
+from collocation_sysid.nlp.unsymmetric import whole
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
 BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
@@ -56,6 +57,30 @@ def test_factors_solve_for_vectors_and_columns(
     assert solved.shape == right.shape
     np.testing.assert_array_equal(right, before)
     np.testing.assert_allclose(kept(pattern, values, free) @ solved, right, atol=1e-10)
+
+
+@pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
+@pytest.mark.parametrize("columns", [None, 5])
+@pytest.mark.parametrize("shift", [100.0, 0.5, -100.0])
+@pytest.mark.parametrize(("choice", "pattern"), CHOICES, ids=IDS)
+def test_a_skew_part_is_solved_for_exactly_also_transposed(
+    choice, pattern: SymmetricPattern, shift: float, columns: int | None, transposed: bool
+):
+    """With a shift of 0.5 rows are exchanged."""
+    free = without_first_nodes(pattern)
+    values, skew = random_values(pattern, shift), random_values(pattern, 0.0, seed=3)
+    skew[pattern.diagonal] = 0
+    symmetric = kept(pattern, values, free)
+    matrix = whole(pattern, values, skew).toarray()[np.ix_(free, free)]
+    assert not np.allclose(matrix, matrix.T)
+    right = np.random.default_rng(1).normal(size=(len(free), columns or 1))
+    right = right if columns else right[:, 0]
+    factor = Factoriser(pattern, free, choice).factorise(values, skew)
+    solved = factor.solve(right, transposed)
+    assert solved.shape == right.shape
+    np.testing.assert_allclose((matrix.T if transposed else matrix) @ solved, right, atol=1e-9)
+    if shift == 100.0:
+        assert factor.positive_definite == (np.linalg.eigvalsh(symmetric)[0] > 0)
 
 
 @pytest.mark.parametrize("shift", [100.0, 1.0, 0.0, -100.0])

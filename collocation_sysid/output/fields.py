@@ -25,7 +25,7 @@ from ..fem.elements import Element
 from ..fem.expressions import kernel_of
 from ..fem.kernel import PointKernel
 from ..fem.materials import Material
-from ..fem.point import Point
+from ..fem.point import Point, Term
 
 NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
@@ -80,7 +80,7 @@ def field_kernel(element: Element, material: Material) -> PointKernel:
     point = Point.of(element, len(material.constants), "x")
     fields = ca.vertcat(*_point_fields(material, point.theta))
     felt = ca.substitute(fields, _F, ca.vec(point.felt))
-    return kernel_of("fields", point, point.volume * felt, {"fields": ()})
+    return kernel_of("fields", point, {"fields": (Term(point.volume * felt, ()),)})
 
 
 _F = ca.SX.sym("F", 9)
