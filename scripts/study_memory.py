@@ -99,7 +99,7 @@ def recording(branches: int) -> Experiment:
     """The block with the tracks that the truth gives it."""
     names = [f"prony_{k + 1}" for k in range(branches)]
     body = Body(box_mesh(SIZE_M, DIVISIONS), density_kg_m3=200.0, prony=names)
-    t_s = STEP_S * np.arange(STEPS + 1)
+    t_s = np.asarray(STEP_S * np.arange(STEPS + 1), dtype=np.float64)
     moving = np.minimum(t_s, MOVED_S)
     share = 1 - np.cos(4 * np.pi * moving / MOVED_S)
     turn = np.sin(np.pi * moving / (2 * MOVED_S)) ** 2

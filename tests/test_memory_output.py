@@ -7,12 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from memories_small import ONE, guesses, recorded, remembering
+from problem_files import replace_text, run_command, settings
 from problems_small import measured_with, with_markers
 
+from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.memory_notes import memory_notes
@@ -66,3 +69,50 @@ def test_a_branch_slower_than_the_recordings_is_told():
 def test_constants_of_a_branch_have_symbols():
     assert symbol_of("prony_1.share") == "g prony_1"
     assert symbol_of("core.prony_1.tau_s") == "τ core.prony_1"
+
+
+# Problem files ----------------------------------------------------------------------------------
+
+MEMORY = replace_text(
+    "[parameters]",
+    '[[object.prony]]\nname = "prony_1"\n\n[parameters]\nprony_1.share = 0.2\nprony_1.tau_s = {}',
+)
+
+
+def test_a_problem_file_describes_a_memory(tiny):
+    MEMORY(tiny)
+    replace_text('nuisance = "none"', 'nuisance = "none"\nloaded_since_s = 2.5')(tiny)
+    problem = Problem.read(tiny / "problem.toml")
+    (experiment,) = problem.experiments
+    assert "prony_1.tau_s" in experiment.body.constants
+    assert experiment.loaded_since_s == 2.5
+    given = {item.name: item for item in problem.parameters.items}
+    assert given["prony_1.share"].fixed
+    assert given["prony_1.tau_s"].guess is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('name = "prony_1"', 'name = "prony_1"\nregion = "core"', "is of region 'core'"),
+        ("prony_1.share = 0.2", "prony_1.share = -0.2", "expected a number >= 0"),
+        ("prony_1.share = 0.2", "prony_1.share = { lower = -1.0 }", "expected 0 <= lower < upper"),
+        ("prony_1.share = 0.2", "", "prony_1.share is missing"),
+    ],
+    ids=["region", "negative", "bound", "missing"],
+)
+def test_a_slip_in_the_memory_is_one_message(tiny, old: str, new: str, expected: str):
+    MEMORY(tiny)
+    replace_text(old, new)(tiny)
+    with pytest.raises(InputError, match=expected):
+        Problem.read(tiny / "problem.toml")
+
+
+def test_the_command_line_says_which_methods_take_a_memory(tiny):
+    MEMORY(tiny)
+    refused = run_command("solve", tiny / "problem.toml", "--out", tiny / "run")
+    assert refused.code == 2
+    assert "method 'interior-point' cannot solve for materials with memory" in refused.err
+    checked = run_command("check", tiny / "problem.toml", *settings("solver.method=reduced-space"))
+    assert "interior-point" not in checked.out
+    assert "τ prony_1" in checked.out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from checks import assert_derivative, observed_order, relative_error
@@ -25,7 +27,7 @@ ONE = CONSTANTS | {"prony_1.share": SHARE, "prony_1.tau_s": TAU_S}
 
 def body_of(element: str = "tet10", evaluator: str = "auto", **changes) -> Body:
     mesh = box_mesh((0.1, 0.1, 0.1), (1, 1, 1))
-    given = {"prony": ["prony_1"]} | changes
+    given: dict[str, Any] = {"prony": ["prony_1"]} | changes
     return Body(mesh, density_kg_m3=30.0, element=element, evaluator=evaluator, **given)
 
 

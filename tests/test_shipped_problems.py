@@ -111,6 +111,17 @@ def test_one_material_fits_the_measured_beam_under_three_loads():
         assert rms_m < limits_m[segment.experiment.name]
 
 
+@pytest.mark.slow
+def test_memory_explains_the_creep_of_the_measured_beam():
+    solution = solve(measured_beam("memory.toml"))
+    assert solution.status.converged
+    assert 2.5e5 < solution.parameters["young_pa"] < 2.75e5
+    assert 0.08 < solution.parameters["prony_1.share"] < 0.15
+    limits_m = {"gravity": 0.00016, "load52": 0.00036, "load101": 0.00071}
+    for name, rms_m in solution.rms_by_experiment_m.items():
+        assert rms_m < limits_m[name]
+
+
 # What motion capture does to markers ----------------------------------------------------------
 
 
