@@ -138,7 +138,7 @@ def test_roll_outs_that_are_no_finer_tell_nothing():
 def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     assert any(reason.startswith("the step moves") for reason in answer.trust.reasons)
     estimates = {"mu_pa": Estimate(100.0, 1.0, (98, 102))}
-    assert numerical_concerns(estimates, {"mu_pa": 0.9}) == []
+    assert numerical_concerns(estimates, {"mu_pa": 1.9}) == []
     assert numerical_concerns(estimates, None) == []
     ((said, strength),) = numerical_concerns(estimates, {"mu_pa": -3.0})
     assert strength == "check"
