@@ -18,9 +18,6 @@ from .run import Run, solve
 from .statistics.estimates import Estimate
 from .statistics.numerical import Refinement, numerical_error
 
-# Errors of smooth solutions fall with the square of linear elements' edges, and faster for
-# quadratic ones; where the body leaves its grasp they do not.
-MESH_ORDER = 2.0
 MOST_LEVELS = 3
 # Last step of the logarithms: far below any error bar.
 TOLERANCE = 1e-6
@@ -91,14 +88,14 @@ def refinement_of(
             start = Earlier.of(solution)
             found[kind].append(_level(kind, level, solution))
     linear = {item.name for item in problem.parameters.items if item.scale == "linear"}
-    orders = as_scheme(problem.scheme).order, MESH_ORDER
+    order = as_scheme(problem.scheme).order
     errors = {}
     for name, estimate in estimates.items():
         by_step, by_mesh = ([each["values"][name] for each in found[kind]] for kind in FINER)
         # What is fixed, or at its bound, stays.
         if any(value != estimate.value for value in (*by_step, *by_mesh)):
             is_linear = name in linear
-            errors[name] = numerical_error(name, estimate, by_step, by_mesh, orders, is_linear)
+            errors[name] = numerical_error(name, estimate, by_step, by_mesh, order, is_linear)
     return Refinement(errors, tuple(each for kind in FINER for each in found[kind]))
 
 

@@ -22,6 +22,7 @@ from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
 from ..statistics.cause import Cause
+from ..statistics.stillness import stillness_notes
 from .cost import Cost, cost_notes, cost_warnings, costs
 from .derivatives import SAMPLES, derivative_errors, first_samples, shortened
 from .description import description_causes
@@ -138,7 +139,8 @@ def check_problem(problem: Problem) -> Findings:
         for s in collocation.segments
     )
     causes, holds = description_causes(problem), _holds(problem, bodies)
-    warnings = [cause.sentence for cause in causes] + _body_warnings(bodies)
+    still = stillness_notes(problem.experiments, problem.parameters)
+    warnings = [cause.sentence for cause in causes] + still + _body_warnings(bodies)
     for hold in holds:
         warnings += hold_warnings(hold)
     for motion in motions:
@@ -149,7 +151,7 @@ def check_problem(problem: Problem) -> Findings:
         body = next(each for each in bodies if recording.experiment in each.experiments)
         warnings += recording_warnings(recording, body.edges_m[1], body.diagonal_m)
     warnings += cost_warnings(chosen, found_costs) if chosen else []
-    said = {cause.sentence for cause in causes}
+    said = {*still, *(cause.sentence for cause in causes)}
     known = [note for note in problem.notes if note not in said]
     notes = [*known, *([scan.sentence] if scan else []), *start_notes]
     for motion in motions:

@@ -142,6 +142,11 @@ def is_modulus(name: str) -> bool:
     return unit_of(name) == "Pa"
 
 
+def is_damping(name: str) -> bool:
+    """Whether a constant is one of the dampings, of which bodies at rest tell nothing."""
+    return bare(name) in (GAMMA_R.name, GAMMA_M.name)
+
+
 def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:
     """A sensible value of a constant in a material of given stiffness; None where none is known.
 

@@ -19,6 +19,7 @@ from ..methods.options import Options
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
+from ..statistics.stillness import stillness_notes
 from ..statistics.uncertainty import ErrorsOption, NoiseOption
 
 
@@ -161,7 +162,8 @@ class Problem:
         )
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
         odd = (oddity.sentence for body in self.bodies for oddity in oddities(body))
-        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *cleaned, *notes)))
+        still = stillness_notes(self.experiments, self.parameters)
+        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *notes)))
         self._check()
 
     def __repr__(self) -> str:

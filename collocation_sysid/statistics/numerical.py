@@ -6,15 +6,16 @@ half the edge lengths. An error of order p leaves
 
     Δ = δ 2^p / (2^p − 1)
 
-in x (Richardson), of which δ / (2^p − 1) in the finer answer. Three times that is taken for how
-wrong Δ may be, as Roache's grid convergence index does for two levels (1994): with p = 2 the
-interval then holds what any order from 0.8 upwards leaves. With three levels p is observed, from
-the ratio of both changes, and 1.25 times what is left of the finest is enough, unless the changes
-do not shrink as they should: then the largest of them is taken. The interval of 95 % is
+in x (Richardson). With two levels p is assumed, 2 as a rule, and what Δ may be wrong by is what
+lower orders would leave: half of p for the step, whose order is known; ½ for the mesh, since
+elements that are too stiff, and the edge of a grasp, converge slowly at first. On the other side
+twice δ / (2^p − 1) is enough. With three levels p is observed, from the ratio of both changes, and
+1.25 times what is left of the finest is enough (Roache 1994), unless the changes do not shrink as
+they should: then the largest of them is taken. The ends of the interval of 95 % are
 
     x + Δ_step + Δ_mesh ± √(n² + (u_step + u_mesh)²),
 
-n being the half width for the noise and u what the Δ may be wrong by.
+n being the half width for the noise and u what each Δ may be wrong by on that side.
 
 Cheaper is a Gauss–Newton step towards a finer simulation with the answer's parameters, d being what
 that changes of the residuals: −A⁻¹ Sᵀ d, see `information`, to first order.
@@ -33,9 +34,11 @@ from ..fem.constants import bare
 from .estimates import Estimate
 from .linearised import FitBlock, LinearisedFit
 
-# Roache's factors of safety, for an assumed and for an observed order.
-ASSUMED, OBSERVED = 3.0, 1.25
-LEAST_ORDER = 0.5
+# Roache's factor of safety for an observed order.
+OBSERVED = 1.25
+# Errors of smooth solutions fall with the square of linear elements' edges, and faster for
+# quadratic ones; where elements are too stiff or the body leaves its grasp they do not.
+MESH_ORDER, LEAST_ORDER = 2.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -87,14 +90,15 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Limit:
-    """Way from the first of several values to their limit, and how wrong that may be."""
+    """Way from the first of several values to their limit, and what it may lack on both sides."""
 
     way: float = 0.0
-    doubt: float = 0.0
+    below: float = 0.0
+    above: float = 0.0
     order: float | None = None
 
     @classmethod
-    def of(cls, x: Sequence[float], order: float) -> _Limit:
+    def of(cls, x: Sequence[float], order: float, least: float) -> _Limit:
         """Of values at steps or edge lengths halved again and again, or one value alone."""
         changes = np.diff(x)
         if not len(changes):
@@ -102,14 +106,18 @@ class _Limit:
         last = float(changes[-1])
         if len(changes) == 1:
             left = last / (2**order - 1)
-            return cls(last + left, ASSUMED * abs(left))
+            further = last / (2**least - 1) - left
+            sides = sorted((-2 * left, further))
+            return cls(last + left, -sides[0], sides[1])
         ratio = float(changes[-2] / last) if last else np.inf
         if not ratio > 2**LEAST_ORDER:
-            return cls(float(changes.sum()), float(np.abs(changes).max()))
+            largest = float(np.abs(changes).max())
+            return cls(float(changes.sum()), largest, largest)
         # No faster than in theory: a change that vanishes by chance promises nothing.
         found = float(np.log2(ratio))
         left = last / (2 ** min(found, order) - 1)
-        return cls(float(changes.sum()) + left, OBSERVED * abs(left), found)
+        doubt = OBSERVED * abs(left)
+        return cls(float(changes.sum()) + left, doubt, doubt, found)
 
 
 def numerical_error(
@@ -117,7 +125,7 @@ def numerical_error(
     estimate: Estimate,
     by_step: Sequence[float],
     by_mesh: Sequence[float],
-    orders: tuple[float, float] = (2.0, 2.0),
+    step_order: float = 2.0,
     linear: bool = False,
 ) -> NumericalError:
     """Numerical error from the values that finer steps and meshes give.
@@ -130,21 +138,21 @@ def numerical_error(
         The answer, whose interval is that of the noise.
     by_step, by_mesh : sequences of float
         The values with the step, or the edge lengths, halved once, twice and so on; may be empty.
-    orders : (step, mesh) assumed
+    step_order : float
+        Of the scheme.
     linear : bool
         Whether the parameter is its own coordinate.
     """
     at = _Coordinate(name, linear)
     x = at.of(estimate.value)
-    step, mesh = (
-        _Limit.of([x, *map(at.of, values)], order)
-        for values, order in zip((by_step, by_mesh), orders, strict=True)
-    )
+    step = _Limit.of([x, *map(at.of, by_step)], step_order, step_order / 2)
+    mesh = _Limit.of([x, *map(at.of, by_mesh)], MESH_ORDER, LEAST_ORDER)
     limit, interval = x + step.way + mesh.way, None
     if estimate.ci95 is not None:
         low, high = map(at.of, estimate.ci95)
-        half = float(np.hypot((high - low) / 2, step.doubt + mesh.doubt))
-        interval = at.value(limit - half), at.value(limit + half)
+        down = float(np.hypot((high - low) / 2, step.below + mesh.below))
+        up = float(np.hypot((high - low) / 2, step.above + mesh.above))
+        interval = at.value(limit - down), at.value(limit + up)
     return NumericalError(
         by_step[0] - estimate.value if by_step else None,
         by_mesh[0] - estimate.value if by_mesh else None,

@@ -48,6 +48,8 @@ WILD, HARDLY_TAME = MOST_WILD, 0.2
 # What a scheme adds to the damping ratio, over it; and by how much it may lengthen a period.
 DAMPING_SHARE, GROSS_DAMPING_SHARE, LITTLE_DAMPING = 0.2, 1.0, 0.005
 PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
+# Standard errors that step and mesh may move a parameter: the half width of its interval.
+MOVED = 2.0
 # How what is said of the numerical error begins: estimated, and measured.
 STEP_MOVES = "the step moves", "step and mesh move"
 
@@ -187,7 +189,7 @@ def numerical_concerns(
         if (error := estimates[name].std_error) is not None and error > 0
     }
     worst = max(deviations, key=deviations.__getitem__, default=None)
-    if worst is None or deviations[worst] <= 1:
+    if worst is None or deviations[worst] <= MOVED:
         return []
     value, many = estimates[worst].value, deviations[worst]
     said = f"{what} {worst} by {100 * ways[worst] / value:+.2g} %, {many:.2g} standard errors"

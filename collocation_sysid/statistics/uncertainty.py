@@ -25,6 +25,7 @@ from scipy.stats import t
 
 from ..arrays import Array
 from ..errors import InputError
+from ..fem.constants import constant_named, is_damping
 from ..nlp.collocation import Collocation
 from ..nlp.lapack import one_blas_thread
 from ..nlp.parameters import Parameters
@@ -61,6 +62,8 @@ NoiseOption = Literal["auto", "given", "estimated"]
 Errors = Literal["independent", "autocorrelated"]
 ErrorsOption = Literal["auto", "independent", "autocorrelated"]
 
+# A damping that ended at its bound is not told at all if it may be this many times the usual.
+UNINFORMED = 100.0
 # Residuals this many times sigma, or one over it, are worth a word.
 NOTEWORTHY = 1.1
 # With σ given, correlation that widens no error bar by this factor is of no consequence.
@@ -211,9 +214,12 @@ def uncertainty_of(
         if errors == "autocorrelated" or kind != "given" or _widens(fit, persistent, of_all):
             (of_all, quantiles), used = persistent, "autocorrelated"
     shared = fit.shared
-    of_all[fit.at_bound] = of_all[:, fit.at_bound] = np.nan
-    of_q, bounded = of_all[:shared, :shared], fit.at_bound[:shared]
-    lost = np.flatnonzero(np.diag(of_q) > UNDETERMINED**2)
+    silent = _no_information(parameters, q, np.diag(of_all)[:shared])
+    at_bound = fit.at_bound.copy()
+    at_bound[:shared] &= ~silent
+    of_all[at_bound] = of_all[:, at_bound] = np.nan
+    of_q, bounded = of_all[:shared, :shared], at_bound[:shared]
+    lost = np.flatnonzero((np.diag(of_q) > UNDETERMINED**2) | (silent & fit.at_bound[:shared]))
     of_q[lost] = of_q[:, lost] = np.nan
     of_q[lost, lost] = np.inf
     scatter = _scatter(fit, parameters, q, noise, errors, extra)
@@ -276,6 +282,16 @@ def _scatter(
         steps.append(step)
         variances.append(np.diag(found.covariance) / sizes**2)
     return scatter_of(names, steps, variances) if len(names) > 1 else None
+
+
+def _no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
+    """(nq,) dampings of which even a hundred times the usual would not show."""
+    found = []
+    for item, at, variance in zip(parameters.free, q, variances, strict=True):
+        usual = constant_named(item.name).usual or 0.0
+        deviation = np.sqrt(variance) * item.per_value(item.value(float(at)))
+        found.append(is_damping(item.name) and not deviation <= UNINFORMED * usual)
+    return np.array(found, dtype=bool)
 
 
 def _check(noise: str, errors: str) -> None:
@@ -384,6 +400,11 @@ def _parameter_notes(
                 f"{item.name} ended at its {side} bound {getattr(item, side):g}: it has no error "
                 "bar, and the others' allow for other values of it; widen the bound, or fix it "
                 "if it is known"
+            )
+        elif estimate.ci95 is None and is_damping(item.name):
+            notes.append(
+                f"{item.name}: no information on damping in these data; fix it, give it a prior, "
+                "or move the body"
             )
         elif estimate.ci95 is None:
             notes.append(
