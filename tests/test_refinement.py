@@ -60,6 +60,13 @@ def test_a_refined_body_has_the_same_mass_and_energy(element):
     assert energies[1] == pytest.approx(energies[0])
 
 
+def test_a_refined_body_keeps_its_terms():
+    core = Region("core", np.arange(3), "yeoh", prony=["slow"], damping="rayleigh")
+    body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=30.0, regions=[core])
+    assert [*refined(body).constants] == [*body.constants]
+    assert [part.damping for part in refined(body).parts] == [part.damping for part in body.parts]
+
+
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_a_grasp_holds_the_same_faces_on_the_finer_mesh(element):
     hung = hung_cube(4)

@@ -56,7 +56,9 @@ def refined(body: Body) -> Body:
     """The body on a mesh twice as fine, its regions of the same cells."""
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
-        Region(part.name, inside.ravel(), part.material, part.density_kg_m3, part.damping)
+        Region(
+            part.name, inside.ravel(), part.material, part.density_kg_m3, part.damping, part.prony
+        )
         for part, inside in zip(body.parts, cells, strict=True)
         if part.name
     ]
@@ -68,6 +70,7 @@ def refined(body: Body) -> Body:
         body.element.name,
         damping=rest.damping,
         regions=regions,
+        prony=rest.prony,
         evaluator=body.evaluator,
         threads=body.threads,
     )
