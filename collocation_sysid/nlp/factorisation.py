@@ -74,6 +74,8 @@ class _BandLU:
     positive_definite: bool
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
+        if not right.size:
+            return right.copy()  # SciPy's tbtrs writes beyond an array without columns
         solved = right[self.order].reshape(len(right), -1)
         for triangle in "UL" if transposed else "LU":
             band, ones = (self.upper, "N") if triangle == "U" else (self.lower, "U")
