@@ -43,7 +43,7 @@ def main() -> None:
 
 def swung(speed_rad_s: float, seed: int) -> Experiment:
     """The bar, held at one end, turned to and fro about two axes at this speed at most."""
-    t_s = STEP_S * np.arange(round(TIME_S / STEP_S) + 1)
+    t_s = STEP_S * np.arange(round(TIME_S / STEP_S) + 1, dtype=np.float64)
     angle = speed_rad_s / (2 * np.pi * TURN_HZ) * (1 - np.cos(2 * np.pi * TURN_HZ * t_s))
     tilt = 0.5 * np.sin(2 * np.pi * 1.1 * t_s) ** 2
     turns = Rotation.from_rotvec(np.outer(angle, [1, 0, 0]) + np.outer(tilt, [0, 1, 0]))

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
-from collocation_sysid.nlp.factorisation import Factoriser
+from collocation_sysid.nlp.factorisation import Factor, Factoriser
 from collocation_sysid.nlp.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.problem import Problem
@@ -349,9 +350,9 @@ def counted_factorisations() -> Iterator[list[int]]:
     """Count the matrices factorised meanwhile."""
     count, original = [0], Factoriser.factorise
 
-    def counting(self: Factoriser, *matrix):
+    def counting(self: Factoriser, *matrix: Any, **room: Any) -> Factor:
         count[0] += 1
-        return original(self, *matrix)
+        return original(self, *matrix, **room)
 
     Factoriser.factorise = counting
     try:

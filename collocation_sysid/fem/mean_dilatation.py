@@ -242,8 +242,9 @@ def _coupling(
             chain = chains[id(term.scalar)]
             by_s, bent = _slopes(shape.volumes, shape.volume, chain.slopes)
             if term.contraction == "nodes":
-                slopes = by_thetas[id(term.scalar)] if len(term.by) > 1 else chain.slopes
-                total[:count, :] += (by_s @ shape.as_by_x(term.by[0])).T @ slopes
+                along = shape.as_by_x(term.by[0])
+                slopes = by_thetas[id(term.scalar)] if "theta" in term.by else chain.slopes
+                total[:count, :] += (by_s @ along).T @ slopes
             elif term.contraction == "pairs":
                 second = by_s.T @ seconds[id(term.scalar)] @ by_s + bent
                 total += _of_pair(shape, chain, blocks, size, term, by_s, second)

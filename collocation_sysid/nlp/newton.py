@@ -153,7 +153,7 @@ class Solver:
     def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
         try:
             with self.stopwatch.solving():
-                factor = self.factoriser.factorise(*matrix)
+                factor = self.factoriser.factorise(matrix[0], matrix[1])
         except np.linalg.LinAlgError as error:
             raise NewtonFailure(x, f"the equations are singular: {error}") from error
         if keep_definite and not factor.positive_definite:
