@@ -18,7 +18,8 @@ QUICK = sorted(set(SMALL_EXPERIMENTS) - {"quadratic-bar", "cube-with-nuisance", 
 
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_the_true_parameters_are_recovered(name: str):
-    solution = AugmentedLagrangian()(collocation_of(name))
+    # A cube that is let go tells little of γ_m: the last digits of the loss tell it.
+    solution = AugmentedLagrangian(tolerance=1e-7)(collocation_of(name))
     assert solution.status is Status.CONVERGED
     found = [solution.parameters[key] for key in TRUTH]
     np.testing.assert_allclose(found, list(TRUTH.values()), rtol=2e-3)

@@ -83,7 +83,7 @@ def test_midpoint_at_ten_milliseconds_is_not_warned_of(tiny: Path):
 
 def test_damping_at_the_guess_is_rayleighs(tiny: Path):
     gammas = ("parameters.gamma_r_s.guess=0.02", "parameters.gamma_m_1_s.guess=0.5")
-    modes = checked(tiny, *gammas).motions[0].modes
+    modes = checked(tiny, *gammas, 'object.damping="rayleigh"').motions[0].modes
     assert modes
     for mode in modes:
         omega = 2 * np.pi * mode.frequency_hz

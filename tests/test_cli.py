@@ -418,7 +418,7 @@ def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
 
 def test_the_same_from_python(tiny):
     problem = cs.Problem.read("problem.toml")
-    solution = cs.solve(problem, method="interior-point")
+    solution = cs.solve(problem, cs.InteriorPoint(tolerance=1e-10))
     assert solution.status.converged
     assert solution.parameters == pytest.approx(TRUTH, rel=1e-5)
     trajectory = cs.simulate(problem.experiments[0], solution.parameters, "midpoint")
@@ -439,7 +439,7 @@ def test_a_method_is_given_with_its_options(tiny):
 def test_reduced_space_is_the_method_unless_another_is_named(tiny):
     text = Path("problem.toml").read_text()
     Path("problem.toml").write_text(text.replace('method = "interior-point"', ""))
-    named = cs.solve(cs.Problem.read("problem.toml"), "interior-point")
+    named = cs.solve(cs.Problem.read("problem.toml"), cs.InteriorPoint(tolerance=1e-10))
     default = cs.solve(cs.Problem.read("problem.toml"))
     assert default.method == "reduced-space"
     np.testing.assert_allclose(default.theta, named.theta, rtol=1e-5)

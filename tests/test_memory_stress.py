@@ -19,6 +19,7 @@ from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.memory import History, Remembered
 from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.nlp.unsymmetric import whole
 
 SHARE, TAU_S = 0.5, 0.2
 CONSTANTS = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
@@ -210,10 +211,11 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
     np.testing.assert_allclose(
         at.force, body.force(x, v, theta, carried=carried), rtol=1e-11, atol=1e-12
     )
+    slopes = at.by_position, at.by_position_skew
     assert_derivative(
         lambda state: body.force(state, v, theta, carried=carried),
         lambda d: np.stack(
-            [body.pattern.matrix(k) @ row for k, row in zip(at.by_position, d, strict=True)]
+            [whole(body.pattern, *both) @ row for *both, row in zip(*slopes, d, strict=True)]
         ),
         x, rng, 1e-7, scale=1e-2,
     )  # fmt: skip

@@ -403,8 +403,8 @@ def _parameter_notes(
             )
         elif estimate.ci95 is None and is_damping(item.name):
             notes.append(
-                f"{item.name}: no information on damping in these data; fix it, give it a prior, "
-                "or move the body"
+                f"{item.name} is not determined: no information on damping in these data; fix it, "
+                "give it a prior, or move the body"
             )
         elif estimate.ci95 is None:
             notes.append(

@@ -1160,6 +1160,7 @@ title = "My object"
 mesh = "mesh.vtu"
 mass_kg = 0.012
 material = "neo-hookean"
+damping = "rayleigh"
 
 [parameters]
 young_pa    = { guess = 1000.0, lower = 10.0, upper = 1e6 }
