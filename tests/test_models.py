@@ -42,7 +42,7 @@ TIMES_S = (0.01, 1.0)
 
 
 def soft_bar(folder: Path, material: str, steps: dict[str, int]) -> Path:
-    """Recordings of a bar so soft that it strains by a half, with 0.5 mm of noise."""
+    """Recordings of a bar so soft that it strains much, with 0.5 mm of noise."""
     folder.mkdir(exist_ok=True)
     box_mesh((0.06, 0.06, 0.12), (2, 2, 4)).write(folder / "body.vtu")
     text = PROBLEM.replace("interior-point", "reduced-space")
