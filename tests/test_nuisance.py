@@ -330,6 +330,14 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
     assert np.isclose(distance_m, [1e-4, 0.007, 0.0247], atol=1e-9).any()
 
 
+def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
+    cube = replace(hung_cube(4), nuisance=ONE_OF_EACH["place"])
+    charted = Collocation([cube], GUESS, charts={cube.name: Chart.of(cube)})
+    exact = replace(charted, experiments=[replace(cube, nuisance=IDEAL)])
+    assert len(exact.guess_p) == exact.nq
+    assert replace(charted, substeps=2).segments[0].chart is charted.charts[cube.name]
+
+
 def test_nuisance_parameters_widen_the_error_bars_of_the_material():
     plain = measured(hung_cube(20))
     known = ReducedSpace()(alone(plain))

@@ -94,6 +94,14 @@ class Chart:
         )
         return chart.about(points)
 
+    def suits(self, experiment: Experiment) -> bool:
+        """Whether it is of this body, and of places known as well as the experiment's."""
+        return (
+            self.body is experiment.body
+            and self.on_surface == experiment.markers.on_surface
+            and np.array_equal(self.sigma_m, experiment.place_sigma_m)
+        )
+
     @cached_property
     def estimated(self) -> Index:
         """Markers whose places are not exact."""

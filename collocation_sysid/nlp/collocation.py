@@ -110,7 +110,8 @@ class Collocation:
     huber : float, optional
         Huber's loss beyond this many standard deviations, see `Observation`.
     charts : mapping of experiment name to Chart
-        Where recordings are read, see `charts`; by default where their markers start.
+        Where recordings are read, see `charts`; where their markers start by default, and where
+        one is not of the experiment's body and places.
 
     Raises
     ------
@@ -144,7 +145,9 @@ class Collocation:
         found, first = [], First(self.nq, self.nq, 0)
         for experiment in self.experiments:
             if not experiment.validation:
-                chart = self.charts.get(experiment.name) or Chart.of(experiment)
+                chart = self.charts.get(experiment.name)
+                if chart is None or not chart.suits(experiment):
+                    chart = Chart.of(experiment)
                 found.append(Segment(experiment, *options, first, chart))
                 first = found[-1].after
         return tuple(found)
