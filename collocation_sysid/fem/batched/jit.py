@@ -1,8 +1,7 @@
 """Compile LLVM IR to native code for this CPU, with the object code kept on disk.
 
-The cache lives in the user's cache folder (or ``COLLOCATION_SYSID_CACHE``) and is keyed by the
-code's own key, the sources that generate it, the LLVM version, the CPU and its features. A file
-is the code after its SHA-256 checksum.
+It is keyed by the code's own key, the sources that generate it, the LLVM version, the CPU and its
+features, see `object_cache`.
 """
 
 from __future__ import annotations
@@ -10,29 +9,21 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from llvmlite import __version__ as llvmlite_version
 from llvmlite import binding as llvm
 from llvmlite import ir
-from platformdirs import user_cache_path
+
+from . import object_cache
 
 # Scalar functions that compiled code calls, or that vector intrinsics fall back to; resolved from
 # the C library by name.
 LIBM = ("exp", "exp2", "expm1", "log", "log1p", "pow", "ldexp", "hypot", "fmod", "remainder", "erf")
 LIBM += ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
 LIBM += ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
-CHECKSUM_BYTES = hashlib.sha256().digest_size
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept between runs."""
-    override = os.environ.get("COLLOCATION_SYSID_CACHE")
-    return Path(override) if override else user_cache_path("collocation_sysid")
 
 
 @cache
@@ -101,13 +92,11 @@ class CompiledFunction:
 def _cached_object(build: Callable[[], ir.Module], key: str, machine: llvm.TargetMachine) -> bytes:
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
-    digest = hashlib.sha256(f"{host}\n{_generation()}\n{key}".encode()).hexdigest()
-    path = cache_folder() / f"{digest[:32]}.o"
-    code = _read_checked(path)
+    whole_key = f"{host}\n{_generation()}\n{key}"
+    code = object_cache.load(whole_key)
     if code is None:
         code = _compile(build(), machine)
-        with suppress(OSError):  # a read-only cache costs time, not correctness
-            _write_checked(path, code)
+        object_cache.store(whole_key, code)
     return code
 
 
@@ -118,24 +107,6 @@ def _generation() -> str:
     for file in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(file.read_bytes())
     return digest.hexdigest()
-
-
-def _read_checked(path: Path) -> bytes | None:
-    """Object code as `_write_checked` left it; LLVM would end the process over a damaged one."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    checksum, code = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
-    return code if checksum == hashlib.sha256(code).digest() else None
-
-
-def _write_checked(path: Path, code: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        unfinished = Path(folder) / path.name
-        unfinished.write_bytes(hashlib.sha256(code).digest() + code)
-        unfinished.replace(path)
 
 
 def _compile(module: ir.Module, machine: llvm.TargetMachine) -> bytes:
