@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -12,6 +14,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.forces import Forces
 from collocation_sysid.nlp.modes import Modes, natural_modes
 
 ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
@@ -97,10 +100,11 @@ def test_a_point_mass_slows_a_bar_down():
     body = bar("tet10")
     free = all_but(body, nodes_where(body, 0, 0.0))
     tip = nodes_where(body, 0, LENGTH_M)
-    mass = body.dof_mass.copy()
-    tip_kg = 10 * body.mass_kg
-    mass[dofs_of(tip)] += tip_kg / len(tip)
-    modes = natural_modes(body, body.nodes_m, free, THIN, dof_mass=mass)
+    alone, tip_kg = Forces.on(body), 10 * body.mass_kg
+    mass_kg = alone.mass_kg.copy()
+    mass_kg[0, dofs_of(tip)] += tip_kg / len(tip)
+    forces = replace(alone, mass_kg=mass_kg)
+    modes = natural_modes(body, body.nodes_m, free, THIN, forces=forces)
     # A massless cantilever's stiffness 3 E I / L³, with 33/140 of its own mass at the tip.
     spring = 3 * YOUNG_PA * SIDE_M**4 / 12 / LENGTH_M**3
     expected = np.sqrt(spring / (tip_kg + 33 / 140 * body.mass_kg)) / (2 * np.pi)

@@ -11,6 +11,7 @@ from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from ..fem.pattern import dofs_of
+from ..nlp.forces import Forces
 from ..nlp.modes import Modes, natural_modes
 from ..nlp.newton import Solver
 from ..nlp.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
@@ -98,8 +99,8 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
     time_s = float(experiment.t_s[least])
     x, about = _state(experiment, held[least], time_s, theta)
     free = dofs_of(np.flatnonzero(~held[least]))
-    mass = np.repeat(experiment.node_mass_kg(time_s)[0], 3)
-    modes = natural_modes(experiment.body, x, free, theta, COUNT, mass)
+    forces = Forces.of(experiment, time_s)
+    modes = natural_modes(experiment.body, x, free, theta, COUNT, forces)
     found = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
     if found:

@@ -21,6 +21,7 @@ from .nuisance import Nuisance
 
 if TYPE_CHECKING:
     from ..fem.body import Body
+    from ..fem.pattern import SymmetricPattern
 
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
@@ -205,6 +206,11 @@ class Experiment:
         for force in self.forces:
             total = total + force.at_nodes(times, n)
         return total
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity of the slopes of the forces on its body."""
+        return self.body.pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.

@@ -17,6 +17,7 @@ import scipy.linalg
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp
+from .forces import Forces
 from .modes import natural_modes
 
 MODES = 20
@@ -119,10 +120,10 @@ class Sway:
         """Of an experiment; of the constants only ratios count."""
         body, markers = experiment.body, experiment.markers
         free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
-        mass = experiment.node_mass_kg(experiment.t_s[:1])[0]
+        forces = Forces.of(experiment, experiment.t_s[:1])
         theta = body.theta(constants)
-        modes = natural_modes(body, body.nodes_m, free, theta, MODES, np.repeat(mass, 3))
-        weighed = modes.shapes * mass[:, None]
+        modes = natural_modes(body, body.nodes_m, free, theta, MODES, forces)
+        weighed = modes.shapes * forces.mass_kg[0, ::3, None]
         omega = modes.angular_frequencies_rad_s
         return cls(
             markers.observe(body.nodes_m),

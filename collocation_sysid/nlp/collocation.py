@@ -469,8 +469,9 @@ class Collocation:
         largest = 0.0
         for part in self.parts(z):
             dynamics = part.setting.dynamics
-            internal = dynamics.internal_force(part.x, part.setting.theta)
-            for force in (internal, dynamics.external_force_n):
+            total = dynamics.force(part.x, part.setting.theta)
+            external = dynamics.evaluated.external_n
+            for force in (total - external, external):
                 largest = max(largest, float(np.abs(force[:, part.segment.free_dofs]).max()))
         return largest
 

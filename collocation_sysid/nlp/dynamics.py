@@ -12,6 +12,8 @@ from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
 from ..fem.memory import Carried
+from ..fem.pattern import SymmetricPattern
+from .forces import Forces, per_dof
 from .memory import History
 from .schemes import Scheme, as_scheme
 
@@ -52,8 +54,7 @@ class Dynamics:
     t_s : (N,) grid times
     first_row : int
     mass_kg : (N, 3n) of every dof in each row, point masses included
-    weighed_kg : (N, 3n) the same at each row's evaluation, where gravity and γ_m act
-    external_force_n : (N, 3n) gravity and other forces at each row's evaluation
+    forces : Forces at each row's evaluation
     taken : (N, 3n) bool
         Held dofs that are free at other times: while one is held, the grasp takes what force
         there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
@@ -68,8 +69,7 @@ class Dynamics:
     t_s: Array
     first_row: int
     mass_kg: Array
-    weighed_kg: Array
-    external_force_n: Array
+    forces: Forces
     taken: NDArray[np.bool_]
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
@@ -84,18 +84,13 @@ class Dynamics:
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
         lag_s = tables.p @ np.arange(tables.p.shape[1]) * (t_s[1] - t_s[0])
-        evaluated_s = t_s - lag_s
-        weighed = _per_dof(experiment.node_mass_kg(evaluated_s))
-        forces = experiment.node_forces_n(evaluated_s).reshape(rows, dofs)
-        weight = weighed * np.tile(experiment.gravity_m_s2, dofs // 3)
         return cls(
             body=experiment.body,
             tables=tables,
             t_s=t_s,
             first_row=first_row,
-            mass_kg=_per_dof(experiment.node_mass_kg(t_s)),
-            weighed_kg=weighed,
-            external_force_n=_compact(weight + forces),
+            mass_kg=per_dof(experiment.node_mass_kg(t_s)),
+            forces=Forces.of(experiment, t_s - lag_s),
             taken=_taken(experiment, t_s),
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
@@ -103,8 +98,7 @@ class Dynamics:
 
     def under_gravity(self, change_m_s2: Array) -> Dynamics:
         """The same with a constant (3,) added to gravity."""
-        pull = self.weighed_kg * np.tile(change_m_s2, self.body.pattern.size // 3)
-        return replace(self, external_force_n=_compact(self.external_force_n + pull))
+        return replace(self, forces=self.forces.under_gravity(change_m_s2))
 
     def first_rows(self, rows: int) -> Dynamics:
         """The same on the first grid times only."""
@@ -114,10 +108,14 @@ class Dynamics:
             tables=Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
             t_s=self.t_s[:rows],
             mass_kg=self.mass_kg[:rows],
-            weighed_kg=self.weighed_kg[:rows],
-            external_force_n=self.external_force_n[:rows],
+            forces=self.forces.rows(slice(rows)),
             taken=self.taken[:rows],
         )
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity of the blocks."""
+        return self.forces.pattern
 
     @property
     def rows(self) -> int:
@@ -182,18 +180,22 @@ class Dynamics:
 
     def residual(self, x: Array, theta: Array) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
-        return self.assemble_residual(x, self.internal_force(x, theta))
+        return self.assemble_residual(x, self.force(x, theta))
 
-    def internal_force(self, x: Array, theta: Array) -> Array:
-        """Internal forces (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
-        damped = self.weighed_kg[self.first_row :]
+    @property
+    def evaluated(self) -> Forces:
+        """The forces of rows `first_row`…."""
+        return self.forces.rows(slice(self.first_row, self.rows))
+
+    def force(self, x: Array, theta: Array) -> Array:
+        """Forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
         carried = self.carried(self.history(x, theta))
-        return self.body.force(*self.evaluation_states(x), theta, damped, carried)
+        return self.evaluated.total(*self.evaluation_states(x), theta, carried)
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
-        """The same from the internal forces (N − first_row, 3n) at the evaluation states."""
+        """The same from the forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
-        total[self.first_row :] = force + self.external_force_n[self.first_row :]
+        total[self.first_row :] = force
         return self.combine(self.tables.w, self.without_taken(total)) - self.inertia(x)
 
     def without_taken(self, rows: Array) -> Array:
@@ -209,9 +211,8 @@ class Dynamics:
 
     def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
         """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
-        damped = self.weighed_kg[self.first_row :]
         carried = self.carried(self.history(x, theta))
-        return self.body.linearise(*self.evaluation_states(x), theta, out, damped, carried)
+        return self.evaluated.linearise(*self.evaluation_states(x), theta, out, carried)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
         """The force part of ∂c_t/∂x_{t−lag} as Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.
@@ -234,22 +235,6 @@ class Dynamics:
     def inertia_coefficient(self, lag: int) -> Array:
         """(N,) factor of the mass in ∂c_t/∂x_{t−lag}: −s_lag / Δt²."""
         return -self.tables.s[:, lag] / self.step_s**2
-
-
-def _per_dof(of_nodes: Array) -> Array:
-    """(T, n) values of nodes as (T, 3n) values of their dofs."""
-    return _compact(np.repeat(of_nodes, 3, axis=1))
-
-
-def _compact(rows: Array) -> Array:
-    """The same rows; where all are equal they take the memory of one."""
-    return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
-
-
-def external_force(experiment: Experiment, time_s: float) -> Array:
-    """Gravity and other forces of an experiment at a time, (3n,) [N]."""
-    weight = experiment.node_mass_kg(time_s)[0, :, None] * experiment.gravity_m_s2
-    return (weight + experiment.node_forces_n(time_s)[0]).ravel()
 
 
 def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:

@@ -81,10 +81,9 @@ def march_on(
     first, seen = dynamics.first_row, done - dynamics.first_row
     history = dynamics.history(x[:done], theta)
     if seen > 0:
-        damped = dynamics.weighed_kg[first:done]
-        carried = dynamics.carried(history, slice(first, done))
-        internal = dynamics.body.force(xi[:seen], nu[:seen], theta, damped, carried)
-        forces[first:done] = internal + dynamics.external_force_n[first:done]
+        here = slice(first, done)
+        carried = dynamics.carried(history, here)
+        forces[here] = dynamics.forces.rows(here).total(xi[:seen], nu[:seen], theta, carried)
     dynamics.without_taken(forces)
     memory, intervals = history.last if history else None, dynamics.until_next_s
     for t in range(done, dynamics.rows):
@@ -126,10 +125,9 @@ class _Step:
         t: int,
         carried: Carried | None = None,
     ) -> None:
-        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t)
-        row, damped = self.row, dynamics.weighed_kg[t]
-        self.carried = carried
-        self.damped, self.load = damped, dynamics.external_force_n[t]
+        self.theta, self.row = theta, Row.of(dynamics, t)
+        self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
+        row = self.row
         first, shape = max(0, t - dynamics.reach), x.shape[1:]
         past, past_forces = x[first:t][::-1], forces[first:t][::-1]
         self.xi = weighted(row.p, past, shape)
@@ -140,8 +138,7 @@ class _Step:
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        states, body = self.states(x), self.dynamics.body
-        return body.force(*states, self.theta, self.damped, self.carried)[0] + self.load
+        return self.forces.total(*self.states(x), self.theta, self.carried)[0]
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """ξ_t and ν_t, (1, 3n) each."""
@@ -157,11 +154,10 @@ class _Step:
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
-        body = self.dynamics.body
-        at = body.linearise(*self.states(x), self.theta, dof_mass=self.damped, carried=self.carried)
-        matrix = self.row.block(at.by_position[0], at.by_velocity[0], body.pattern)
+        at = self.forces.linearise(*self.states(x), self.theta, carried=self.carried)
+        matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
         skew = self.row.skew_block(at.by_position_skew[0])
-        return self._balanced(at.force[0] + self.load, x), matrix, skew
+        return self._balanced(at.force[0], x), matrix, skew
 
 
 def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: Array) -> Array:

@@ -19,6 +19,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from ..arrays import Array, Index
 from ..fem.body import Body
 from .factorisation import Factor, Factoriser
+from .forces import Forces
 
 # ω² below this share of the largest K_ii / M_ii is zero up to rounding.
 RIGID = 1e-12
@@ -60,7 +61,7 @@ def natural_modes(
     free_dofs: Index,
     theta: Array,
     count: int = 6,
-    dof_mass: Array | None = None,
+    forces: Forces | None = None,
 ) -> Modes:
     """The lowest modes of a body about a state.
 
@@ -73,31 +74,32 @@ def natural_modes(
     theta : (k,) constants of the body
     count : int
         Modes wanted; there may be fewer.
-    dof_mass : (3n,) array, optional
-        Mass of every dof [kg]; the body's own by default.
+    forces : Forces, optional
+        On the body at one time; nothing acts on it by default.
 
     Returns
     -------
     Modes
     """
-    mass = (body.dof_mass if dof_mass is None else dof_mass)[free_dofs]
-    state = np.asarray(x, dtype=float).reshape(-1, 3)
-    at = body.linearise(state, np.zeros_like(state), theta, dof_mass=dof_mass)
+    forces = forces or Forces.on(body)
+    mass, pattern = forces.mass_kg[0, free_dofs], forces.pattern
+    state = np.asarray(x, dtype=float).reshape(1, -1)
+    at = forces.linearise(state, np.zeros_like(state), theta)
     lower, damping = -at.by_position[0], -at.by_velocity[0]
-    stiffness = sp.csc_array(body.pattern.matrix(lower)[:, free_dofs][free_dofs])
+    stiffness = sp.csc_array(pattern.matrix(lower)[:, free_dofs][free_dofs])
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
     wanted = count + RIGID_MOTIONS
     if len(free_dofs) <= max(DENSE, 3 * wanted):
         squares, vectors = _dense(stiffness, mass, wanted)
     else:
-        lower[body.pattern.diagonal[free_dofs]] += SHIFT * largest * mass
-        factor = Factoriser.of(body.pattern, free_dofs).factorise(lower)
+        lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
+        factor = Factoriser.of(pattern, free_dofs).factorise(lower)
         squares, vectors = _lanczos(stiffness, mass, factor, -SHIFT * largest, wanted)
     oscillating = squares > RIGID * largest
-    shapes = np.zeros((int(oscillating.sum()), body.pattern.size))
+    shapes = np.zeros((int(oscillating.sum()), pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T
     omega, shapes = np.sqrt(squares[oscillating])[:count], shapes[:count]
-    drag = np.einsum("ki,ki->k", shapes, (body.pattern.matrix(damping) @ shapes.T).T)
+    drag = np.einsum("ki,ki->k", shapes, (pattern.matrix(damping) @ shapes.T).T)
     return Modes(
         omega / (2 * np.pi),
         drag / (2 * omega),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
-from .dynamics import external_force
+from .forces import Forces
 from .lapack import one_blas_thread
 from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
@@ -110,18 +110,17 @@ class _Stepper:
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""
-        mass = self._mass(load_s)
-        now = state.memory.now if state.memory else None
-        force = self.body.force(state.x, state.v, self.theta, mass, now)[0]
-        force += external_force(self.experiment, load_s)
+        forces, now = Forces.of(self.experiment, load_s), state.memory.now if state.memory else None
+        force = forces.total(state.x, state.v, self.theta, now)[0]
         acceleration = state.a.copy()
-        acceleration[dofs] = (force / mass)[dofs]
+        acceleration[dofs] = (force / forces.mass_kg[0])[dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
-        body, theta, h = self.body, self.theta, end_s - state.t_s
-        load, mass = external_force(self.experiment, load_s), self._mass(load_s)
+        theta, h = self.theta, end_s - state.t_s
+        forces = Forces.of(self.experiment, load_s)
+        mass = forces.mass_kg[0]
         carried = state.memory.ahead(h) if state.memory else None
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
@@ -136,14 +135,14 @@ class _Stepper:
 
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            return body.force(x, v, theta, mass, carried)[0] + load - mass * a
+            return forces.total(x, v, theta, carried)[0] - mass * a
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
-            at = body.linearise(x, v, theta, dof_mass=mass, carried=carried)
+            at = forces.linearise(x, v, theta, carried=carried)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
-            matrix[body.pattern.diagonal] += slope**2 * mass
-            return at.force[0] + load - mass * a, matrix, -at.by_position_skew[0]
+            matrix[forces.pattern.diagonal] += slope**2 * mass
+            return at.force[0] - mass * a, matrix, -at.by_position_skew[0]
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         guess[solver.held] = x_held

@@ -83,7 +83,7 @@ class Solver:
         holding = at_start if held is None else held
         self.free = dofs_of(np.flatnonzero(~holding))
         self.held = dofs_of(np.flatnonzero(holding))
-        self.factoriser = Factoriser.of(self.body.pattern, self.free)
+        self.factoriser = Factoriser.of(experiment.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 
     def newton(

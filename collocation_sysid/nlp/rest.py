@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
-from .dynamics import external_force
 from .factorisation import NONE
+from .forces import Forces
 from .lapack import one_blas_thread
 from .memory import start_carried
 from .newton import NewtonFailure, Solver, simulation_error
@@ -36,19 +36,21 @@ def rest_state(
     solver = solver or Solver(experiment)
     at_s = float(experiment.t_s[0] if time_s is None else time_s)
     body = experiment.body
-    load = external_force(experiment, at_s)
+    forces = Forces.of(experiment, at_s)
     still = np.zeros((1, body.pattern.size))
     shape = experiment.rigid_positions([at_s])[0]
     carried = start_carried(body, theta, experiment.loaded_since_s)
 
     def solve(x: Array, share: float) -> Array:
+        loaded = forces.scaled(share)
+
         def residual(state: Array) -> Array:
-            return body.force(state, still, theta, carried=carried)[0] + share * load
+            return loaded.total(state, still, theta, carried)[0]
 
         def linearise(state: Array) -> tuple[Array, Array, Array]:
             # Nothing moves: there is no skew part.
-            forces = body.linearise(state, still, theta, carried=carried)
-            return forces.force[0] + share * load, -forces.by_position[0], NONE
+            at = loaded.linearise(state, still, theta, carried=carried)
+            return at.force[0], -at.by_position[0], NONE
 
         moved = x.copy()
         moved[solver.held] = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]

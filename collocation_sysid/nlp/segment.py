@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..fem.body import Body
-from ..fem.pattern import dofs_of
+from ..fem.pattern import SymmetricPattern, dofs_of
 from .block_band import Block, BlockBand, Term
 from .charts import Chart
 from .dynamics import Dynamics
@@ -78,6 +78,11 @@ class Segment:
     def body(self) -> Body:
         """What moves."""
         return self.experiment.body
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity of the blocks."""
+        return self.experiment.pattern
 
     @cached_property
     def constants(self) -> ThetaMap:
@@ -163,7 +168,7 @@ class Segment:
     @property
     def dofs(self) -> int:
         """3n."""
-        return self.body.pattern.size
+        return self.pattern.size
 
     @cached_property
     def free_dofs(self) -> Index:
@@ -252,10 +257,11 @@ class Segment:
     @cached_property
     def force_n(self) -> float:
         """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
-        dynamics, at_rest = self.dynamics, self.body.nodes_m
-        theta = self.constants.theta(self.parameters.guess_q)
-        forces = self.body.linearise(at_rest[None], np.zeros_like(at_rest)[None], theta)
-        last, pattern = Row.of(dynamics, dynamics.rows - 1), self.body.pattern
+        dynamics, at_rest = self.dynamics, self.body.nodes_m.reshape(1, -1)
+        theta, last = self.constants.theta(self.parameters.guess_q), dynamics.rows - 1
+        at_last = dynamics.forces.rows(slice(last, None))
+        forces = at_last.linearise(at_rest, np.zeros_like(at_rest), theta)
+        last, pattern = Row.of(dynamics, last), self.pattern
         block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
@@ -358,7 +364,7 @@ class Segment:
         return adding_skew(self.dofs, self._row_starts(), self._jacobian_blocks())
 
     def _jacobian_blocks(self) -> list[Block]:
-        rows, columns, source = self.body.pattern.full
+        rows, columns, source = self.pattern.full
         row_place = np.full(self.dofs, -1)
         row_place[self.row_dofs] = np.arange(self.rows_per_time)
         free = np.zeros(self.dofs, dtype=bool)
@@ -410,7 +416,7 @@ class Segment:
             self.dynamics,
             self.jacobian,
             self._row_starts(),
-            self.body.pattern,
+            self.pattern,
             self.row_dofs,
             self.length_m / self.force_n,
         )
@@ -435,13 +441,13 @@ class Segment:
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
         positions, inertia, grasps = self._jacobian_constants
         values[positions] += inertia
-        skew = skew_values(self.body.pattern, forces.by_position_skew)
+        skew = skew_values(self.pattern, forces.by_position_skew)
         if skew.size:
             self._skew_jacobian.fill(values, skew, skew, self.body.threads)
         self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
         values[grasps] = 1.0
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
-        weighed = dynamics.weighed_kg[dynamics.first_row :]
+        weighed = dynamics.evaluated.mass_kg
         by_p[dynamics.first_row :] = setting.force_slopes(forces.by_theta, weighed)
         by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p)) / self.force_n
         dynamics.without_taken(by_p)
@@ -478,7 +484,7 @@ class Segment:
     def linearisation_rows(self) -> Array:
         """Work space of `constraints_and_jacobian`."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
-        return np.zeros((self.constraint_times, self.body.linearisation_width))
+        return np.zeros((self.constraint_times, self.dynamics.forces.linearisation_width))
 
     # Second derivatives -----------------------------------------------------------------------
 
@@ -501,7 +507,7 @@ class Segment:
         return self.nq + np.arange(self.grid_rows) * self.dofs
 
     def _hessian_blocks(self, skew: bool = False) -> list[Block]:
-        rows, columns, source = self.body.pattern.full
+        rows, columns, source = self.pattern.full
         blocks = []
         for distance in range(self.dynamics.reach + 1):
             terms = list(self._curvature_terms(distance))
@@ -560,19 +566,14 @@ class Segment:
         first = dynamics.first_row
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
         weights = self._force_weights(multipliers)[first:]
-        curvature = self.body.curvature(
-            *dynamics.evaluation_states(x),
-            weights,
-            setting.theta,
-            self._curvature_rows,
-            dynamics.weighed_kg[first:],
-        )
+        forces, states = dynamics.evaluated, dynamics.evaluation_states(x)
+        curvature = forces.curvature(*states, weights, setting.theta, self._curvature_rows)
         layout = self.hessian_layout
         of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)
         band.fill(
             of_band, curvature.position_position, curvature.position_velocity, self.body.threads
         )
-        skew = skew_values(self.body.pattern, curvature.position_velocity_skew)
+        skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
         mixed = np.zeros((2, self.grid_rows, self.dofs, self.nq))
@@ -586,7 +587,7 @@ class Segment:
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
-        pull = (weights * dynamics.weighed_kg[first:]).sum(axis=0).reshape(-1, 3).sum(axis=0)
+        pull = (weights * forces.mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
         by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
@@ -607,7 +608,7 @@ class Segment:
 
     @cached_property
     def _curvature_rows(self) -> Array:
-        return np.zeros((self.constraint_times, self.body.curvature_width))
+        return np.zeros((self.constraint_times, self.dynamics.forces.curvature_width))
 
     @cached_property
     def hessian_layout(self) -> HessianLayout:

@@ -46,7 +46,7 @@ class Setting:
         Parameters
         ----------
         by_theta : (…, 3n, k) of the internal forces
-        weighed_kg : (…, 3n) mass that gravity pulls at
+        weighed_kg : (…, 3n) what gravity pulls at
         """
         of_q = by_theta @ self.theta_q
         if not self.gravity_phi.shape[1]:

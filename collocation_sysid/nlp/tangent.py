@@ -118,17 +118,17 @@ class BlockSolver:
         self.stopwatch = stopwatch or Stopwatch()
         self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
         self.segment = segment
-        self.body = segment.body
+        self.body, self.pattern = segment.body, segment.pattern
         self.free = segment.free_dofs
-        self.factoriser = Factoriser.of(self.body.pattern, self.free, factorisation)
-        full_rows, full_columns, source = self.body.pattern.full
-        place = np.full(self.body.pattern.size, -1)
+        self.factoriser = Factoriser.of(self.pattern, self.free, factorisation)
+        full_rows, full_columns, source = self.pattern.full
+        place = np.full(self.pattern.size, -1)
         place[self.free] = np.arange(len(self.free))
         kept = (place[full_rows] >= 0) & (place[full_columns] >= 0)
         self._source = source[kept]
-        self._signs = signs_by_row(self.body.pattern)[kept]
+        self._signs = signs_by_row(self.pattern)[kept]
         # Sorted by column; the matrices are symmetric, so that serves for rows as well.
-        held = np.full(self.body.pattern.size, -1)
+        held = np.full(self.pattern.size, -1)
         held[segment.grasping.dofs] = np.arange(len(segment.grasping.dofs))
         beside = (place[full_rows] >= 0) & (held[full_columns] >= 0)
         shape = (len(self.free), len(segment.grasping.dofs))
@@ -137,7 +137,7 @@ class BlockSolver:
         # Its data are their own numbers, in the order that compressing them gave.
         order = np.asarray(self._held.data, dtype=np.int64) - 1
         self._held_source = source[beside][order]
-        self._held_signs = signs_by_column(self.body.pattern)[beside][order]
+        self._held_signs = signs_by_column(self.pattern)[beside][order]
         self._held = self._held.astype(float)
         counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
         indptr = np.concatenate([[0], np.cumsum(counts)])
@@ -172,7 +172,7 @@ class BlockSolver:
         memory = known.memory if known else None
         march = _Forward(self, setting, (len(self.free), count), memory)
         march.remember(history, theta_q, done)
-        for step in self._steps(x, setting.theta, first=done, history=history):
+        for step in self._steps(x, setting, first=done, history=history):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
             residual = march.residual(step, inertia[step.t])
@@ -198,7 +198,7 @@ class BlockSolver:
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
         march.remember(history, setting.columns(shape[1], first=0))
         yield from np.zeros((self.dynamics.first_row, *shape))
-        for step in self._steps(x, setting.theta, history=history):
+        for step in self._steps(x, setting, history=history):
             row, right = np.zeros(shape), np.zeros(march.shape)
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
@@ -219,14 +219,14 @@ class BlockSolver:
         history = self.dynamics.history(x, setting.theta)
         march.remember(history, np.zeros((len(setting.theta), count)))
         yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
-        for step in self._steps(x, setting.theta, history=history):
+        for step in self._steps(x, setting, history=history):
             row, nothing = np.zeros((x.shape[1], count)), np.zeros((2, *march.shape))
             row[self.free] = march.advance(step, nothing[0], nothing[1], given)
             row[given.held_dofs] = given.of_held[step.t]
             yield row
 
     @one_blas_thread()
-    def backward(self, x: Array, theta: Array, gradient: Array) -> Array:
+    def backward(self, x: Array, setting: Setting, gradient: Array) -> Array:
         """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].
 
         Dofs that a passing grasp holds have zeros.
@@ -235,9 +235,9 @@ class BlockSolver:
         rows = [Row.of(dynamics, t) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
-        history = dynamics.history(x, theta)
+        history = dynamics.history(x, setting.theta)
         weights = Weights(history) if history else None
-        for step in self._steps(x, theta, backward=True, history=history):
+        for step in self._steps(x, setting, backward=True, history=history):
             t = step.t
             through_stress = weights.pulled()[self.free] if weights else 0.0
             lags = range(min(reach, t) + 1)
@@ -319,13 +319,13 @@ class BlockSolver:
     def _steps(
         self,
         x: Array,
-        theta: Array,
+        setting: Setting,
         backward: bool = False,
         first: int = 0,
         history: History | None = None,
     ) -> Iterator[_Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
-        dynamics, body = self.dynamics, self.body
+        dynamics, theta = self.dynamics, setting.theta
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room() for _ in range(self.chunk if self._needs_rooms else 0)]
@@ -333,9 +333,9 @@ class BlockSolver:
             stop = min(start + self.chunk, dynamics.rows)
             here = slice(start - dynamics.first_row, stop - dynamics.first_row)
             with self.stopwatch.evaluating():
-                damped = dynamics.weighed_kg[start:stop]
+                forces = setting.dynamics.forces.rows(slice(start, stop))
                 carried = dynamics.carried(history, slice(start, stop))
-                at = body.linearise(xi[here], nu[here], theta, dof_mass=damped, carried=carried)
+                at = forces.linearise(xi[here], nu[here], theta, carried=carried)
             with self.stopwatch.solving():
                 factors = self._factorise(at, slice(start, stop), rooms)
             order = range(stop - start)
@@ -353,7 +353,7 @@ class BlockSolver:
     def _factorise(
         self, at: Linearisation, rows: slice, rooms: Sequence[Room] = ()
     ) -> list[Factor]:
-        pattern, taken = self.body.pattern, self.dynamics.taken[rows]
+        pattern, taken = self.pattern, self.dynamics.taken[rows]
 
         def matrix(k: int) -> tuple[Array, Array]:
             row = Row.of(self.dynamics, rows.start + k)
@@ -495,12 +495,12 @@ class _Forward:
         self.slopes = Slopes(history, theta_q, done, self._overstress)
         if not done and self.solver.dynamics.first_row:
             # The start is given.
-            self.slopes.advance(np.zeros((self.solver.body.pattern.size, theta_q.shape[1])))
+            self.slopes.advance(np.zeros((self.solver.pattern.size, theta_q.shape[1])))
 
     def residual(self, step: _Step, inertia: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
         solver, row = self.solver, Row.of(self.solver.dynamics, step.t)
-        force = (step.force + self.setting.dynamics.external_force_n[step.t])[solver.free]
+        force = step.force[solver.free]
         solver.without_taken(step.t, force)
         total = row.w[0] * force - inertia[solver.free]
         if self.weighs_past:
@@ -510,7 +510,7 @@ class _Forward:
 
     def force_slopes(self, step: _Step) -> Array:
         """∂F/∂p on the free dofs."""
-        weighed = self.setting.dynamics.weighed_kg[step.t]
+        weighed = self.setting.dynamics.forces.mass_kg[step.t]
         return self.setting.force_slopes(step.by_theta, weighed)[self.solver.free]
 
     def advance(
@@ -535,7 +535,7 @@ class _Forward:
         if given is not None:
             given.place_taken(t, solution)
         if self.slopes is not None:
-            of_state = np.zeros((solver.body.pattern.size, self.shape[1]))
+            of_state = np.zeros((solver.pattern.size, self.shape[1]))
             of_past = weighted(row.p, self.past, self.shape) if row.p[1:].any() else 0.0
             of_state[solver.free] = row.p[0] * solution + of_past
             if given is not None:
