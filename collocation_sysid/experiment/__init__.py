@@ -4,7 +4,7 @@ from .alignment import Aligned, align
 from .clock import sample_interval_s
 from .experiment import Experiment
 from .force_files import read_forces
-from .grasp import Grasp, held_nodes
+from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance
@@ -30,6 +30,7 @@ __all__ = [
     "align",
     "align_to_template",
     "fit_poses",
+    "held_dofs",
     "held_nodes",
     "place_markers",
     "read_forces",

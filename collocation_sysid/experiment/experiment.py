@@ -14,7 +14,8 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from .arrays import read_only_floats
 from .clock import STEP_TOLERANCE, sample_interval_s
-from .grasp import Grasp, held_nodes
+from .freedom import free_motions
+from .grasp import Grasp, held_dofs
 from .loads import Force, PointMass
 from .markers import Markers
 from .nuisance import Nuisance
@@ -28,9 +29,6 @@ StartRule = Literal["standard", "paper"]
 EARTH_M_S2 = (0.0, 0.0, -9.81)
 AS_IN_A_LABORATORY = Nuisance()
 
-# Held nodes count as collinear when they deviate from a line by less than this part of its length.
-_COLLINEAR = 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
@@ -43,8 +41,8 @@ class Experiment:
     t_s : (T,) array
         At least three evenly spaced times.
     grasps : sequence of Grasp
-        No node in two of them at a time. Selected nodes are looked up on the body, and poses given
-        as matrices are those at `t_s`.
+        No node in two of them at a time along the same axis. Selected nodes are looked up on the
+        body, and poses given as matrices are those at `t_s`.
     markers : Markers
         Tracks at the times `t_s`, at least one sample present. Those given by their places are put
         on the body, see `place_markers`.
@@ -157,38 +155,39 @@ class Experiment:
         return float(self.t_s[-1] - self.t_s[0])
 
     @cached_property
-    def held_nodes(self) -> Index:
-        """Nodes that are grasped throughout, sorted."""
+    def held_dofs(self) -> Index:
+        """Dofs, 3 node + axis, that are grasped throughout, sorted."""
         held, _ = self.grasped(self.t_s)
         return np.flatnonzero(held.all(axis=0))
 
     @cached_property
-    def free_nodes(self) -> Index:
-        """All other nodes, sorted; grasps with a time window may hold some for a while."""
-        return np.setdiff1d(np.arange(len(self.body.nodes_m)), self.held_nodes)
+    def free_dofs(self) -> Index:
+        """All other dofs, sorted; grasps with a time window may hold some for a while."""
+        return np.setdiff1d(np.arange(self.body.nodes_m.size), self.held_dofs)
 
     def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
-        """Return which nodes are held at the times `t_s` (T,), and where.
+        """Return which coordinates of the nodes are held at the times `t_s` (T,), and where.
 
         Returns
         -------
-        held : (T, n) bool
+        held : (T, n, 3) bool
         positions_m : (T, n, 3)
             NaN where a node is not held.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        n = len(self.body.nodes_m)
-        held = np.zeros((len(times), n), dtype=bool)
-        positions = np.full((len(times), n, 3), np.nan)
+        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        positions = np.full(held.shape, np.nan)
         for grasp in self.grasps:
             here = np.flatnonzero(grasp.holds(times))
-            held[np.ix_(here, grasp.nodes)] = True
-            positions[np.ix_(here, grasp.nodes)] = grasp.carry(self.body.nodes_m, times[here])
+            place = np.ix_(here, grasp.nodes, grasp.columns)
+            carried = grasp.carry(self.body.nodes_m, times[here])
+            held[place], positions[place] = True, carried[..., grasp.columns]
         return held, positions
 
     def held_positions(self, t_s: ArrayLike) -> Array:
-        """Return where `held_nodes` are carried at `t_s` (T,), as (T, held, 3) metres."""
-        return self.grasped(t_s)[1][:, self.held_nodes]
+        """Return where `held_dofs` are carried at `t_s` (T,), as (T, held) metres."""
+        positions = self.grasped(t_s)[1]
+        return positions.reshape(len(positions), -1)[:, self.held_dofs]
 
     def node_mass_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
@@ -209,8 +208,8 @@ class Experiment:
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
 
-        That is the first grasp that holds throughout, else the first. Without a grasp the body
-        stays where it is undeformed.
+        That is the first grasp that holds throughout along all axes; without one the first that
+        does along some, else the first. Without a grasp the body stays where it is undeformed.
         """
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
@@ -221,6 +220,7 @@ class Experiment:
         if not self.grasps:
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
         throughout = [grasp for grasp in self.grasps if grasp.holds(self.t_s).all()]
+        throughout.sort(key=lambda grasp: grasp.axes != "xyz")
         poses = (throughout or self.grasps)[0].poses
         if len(poses.t_s) > 1 and not throughout:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
@@ -264,9 +264,9 @@ class Experiment:
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)
-        grasped = held_nodes(self.grasps)
-        if grasped.size and grasped[-1] >= n:
-            raise InputError(f"a grasp holds node {grasped[-1]}, but the body has {n}")
+        grasped = held_dofs(self.grasps)
+        if grasped.size and grasped[-1] >= 3 * n:
+            raise InputError(f"a grasp holds node {grasped[-1] // 3}, but the body has {n}")
         for what, loads in (("point mass is tied to", self.masses), ("force is on", self.forces)):
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
@@ -300,22 +300,20 @@ class Experiment:
                 vars(self)["start_velocities_m_s"] = _state(np.zeros((n, 3)), n, "velocity")
         elif given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
-        held = np.flatnonzero(self.grasped(self.t_s[:1])[0][0])
-        if self.start == "equilibrium" and not _fixes_a_body(self.body.nodes_m[held]):
+        if self.start == "equilibrium":
+            self._refuse_free_motions()
+
+    def _refuse_free_motions(self) -> None:
+        held = self.grasped(self.t_s[:1])[0][0]
+        free = free_motions(self.body.nodes_m, held)
+        if free:
             raise InputError(
-                "start = 'equilibrium' needs at least 3 held nodes that do not lie on one line, "
-                "otherwise the body can turn freely and its rest state is not unique; "
-                f"{len(held)} nodes are held then. Grasp more nodes, or start 'undeformed'"
+                "start = 'equilibrium' needs grasps that leave the body no rigid motion, but it "
+                f"can {' and '.join(free)}, so that its rest state is not unique; "
+                f"{int(held.any(axis=1).sum())} nodes are held then. Grasp at least 3 nodes that "
+                "do not lie on one line, or more axes, or start 'undeformed'"
             )
 
 
 def _state(given: ArrayLike | None, nodes: int, name: str) -> Array | None:
     return None if given is None else read_only_floats(given, (nodes, 3), name)
-
-
-def _fixes_a_body(points_m: Array) -> bool:
-    """Whether holding these points leaves no rigid motion."""
-    if len(points_m) < 3:
-        return False
-    extents = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
-    return bool(extents[1] > _COLLINEAR * extents[0])

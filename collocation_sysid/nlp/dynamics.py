@@ -253,6 +253,6 @@ def external_force(experiment: Experiment, time_s: float) -> Array:
 
 
 def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
-    held, _ = experiment.grasped(t_s)
-    held[:, experiment.held_nodes] = False
-    return np.repeat(held, 3, axis=1)
+    held = experiment.grasped(t_s)[0].reshape(len(t_s), -1)
+    held[:, experiment.held_dofs] = False
+    return held

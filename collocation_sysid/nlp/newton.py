@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
-from ..fem.pattern import dofs_of
 from .factorisation import Factor, Factoriser
 from .stopwatch import Stopwatch
 
@@ -65,8 +64,8 @@ class Solver:
         Its body and grasps.
     options : NewtonOptions
     stopwatch : Stopwatch, optional
-    held : (n,) bool, optional
-        Which nodes are held; those at the experiment's first time by default.
+    held : (n, 3) bool, optional
+        Which coordinates are held; those at the experiment's first time by default.
     """
 
     def __init__(
@@ -81,8 +80,7 @@ class Solver:
         self.options = options or NewtonOptions()
         at_start = experiment.grasped(experiment.t_s[:1])[0][0]
         holding = at_start if held is None else held
-        self.free = dofs_of(np.flatnonzero(~holding))
-        self.held = dofs_of(np.flatnonzero(holding))
+        self.free, self.held = np.flatnonzero(~holding), np.flatnonzero(holding)
         self.factoriser = Factoriser.of(self.body.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 
@@ -178,7 +176,7 @@ class Solver:
 
 
 class Solvers:
-    """The solvers of an experiment, one for each set of nodes that is held at some time."""
+    """The solvers of an experiment, one for each set of dofs that is held at some time."""
 
     def __init__(
         self,
@@ -190,7 +188,7 @@ class Solvers:
         self._known: dict[bytes, Solver] = {}
 
     def holding(self, held: NDArray[np.bool_]) -> Solver:
-        """The solver with these nodes (n,) held."""
+        """The solver with these coordinates (n, 3) held."""
         key = held.tobytes()
         if key not in self._known:
             self._known[key] = Solver(*self._arguments, held)

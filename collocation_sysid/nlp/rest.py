@@ -81,14 +81,16 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
         if not grasp.holds(time_s):
             continue
         start, nodes = carried[grasp.nodes], grasp.nodes
+        place = np.ix_(nodes, grasp.columns)
         goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
         if share == 1:
-            positions[nodes] = goal
+            positions[place] = goal[:, grasp.columns]
             continue
         turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
         part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
         middle, way = start.mean(axis=0), (goal - start).mean(axis=0)
-        positions[nodes] = middle + share * way + part.apply(start - middle)
+        moved = middle + share * way + part.apply(start - middle)
+        positions[place] = moved[:, grasp.columns]
     return positions
 
 

@@ -23,7 +23,7 @@ from ..experiment import (
     PointMass,
     PoseSequence,
     align,
-    held_nodes,
+    held_dofs,
     read_forces,
     read_poses,
 )
@@ -148,7 +148,7 @@ class RecordingReader:
             )
 
         n = len(self.body.nodes_m)
-        if len(held_nodes(grasps)) == n:
+        if len(held_dofs(grasps)) == 3 * n:
             raise InputError(
                 f"the selected nodes are all {n} there are, so nothing can move; select fewer, and "
                 "check length_unit of the object",
@@ -214,7 +214,7 @@ class RecordingReader:
             nodes,
             poses,
             **grasp.model_dump(
-                include={"from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
+                include={"axes", "from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
             ),
             selection=selection(grasp.nodes),
         )

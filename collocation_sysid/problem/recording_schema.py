@@ -86,6 +86,10 @@ class GraspSection(Section):
         description="Selection: a table of box_m, ball_m or indices, or the name of a point array "
         "or physical group."
     )
+    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = Field(
+        "xyz",
+        description="Axes of the world along which it holds; the nodes slide along the others.",
+    )
     poses: Text | None = Field(
         None, description="Poses, CSV or .npz; held where they are without poses or markers."
     )
