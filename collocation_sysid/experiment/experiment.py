@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, Index
 from ..errors import InputError
 from .arrays import read_only_floats
-from .clock import STEP_TOLERANCE, sample_interval_s
+from .clock import STEP_TOLERANCE, first_time_fault, sample_interval_s
 from .freedom import free_motions
 from .grasp import Grasp, held_dofs
 from .loads import Force, PointMass
@@ -23,6 +23,7 @@ from .nuisance import Nuisance
 if TYPE_CHECKING:
     from ..fem.body import Body
 
+Kind = Literal["dynamic", "static"]
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
@@ -39,7 +40,7 @@ class Experiment:
     body : Body
         Provides `nodes_m`, `cells` and `element`.
     t_s : (T,) array
-        At least three evenly spaced times.
+        At least three evenly spaced times; of a static experiment one or more, ascending.
     grasps : sequence of Grasp
         No node in two of them at a time along the same axis. Selected nodes are looked up on the
         body, and poses given as matrices are those at `t_s`.
@@ -50,6 +51,9 @@ class Experiment:
         Acceleration of gravity.
     name : str
         For messages and reports; experiments of one problem have different names.
+    kind : {"dynamic", "static"}
+        A motion, or samples each of which is an equilibrium of its own; with memory, quasi-static
+        in time.
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
@@ -81,6 +85,7 @@ class Experiment:
     markers: Markers
     gravity_m_s2: Array
     name: str
+    kind: Kind
     start: Start
     start_rule: StartRule
     start_positions_m: Array | None
@@ -100,6 +105,7 @@ class Experiment:
         gravity_m_s2: ArrayLike = EARTH_M_S2,
         name: str = "experiment",
         *,
+        kind: Kind = "dynamic",
         start: Start = "equilibrium",
         start_rule: StartRule = "standard",
         start_positions_m: ArrayLike | None = None,
@@ -120,6 +126,7 @@ class Experiment:
                 markers=markers,
                 gravity_m_s2=read_only_floats(gravity_m_s2, (3,), "gravity_m_s2"),
                 name=name,
+                kind=kind,
                 start=start,
                 start_rule=start_rule,
                 start_positions_m=_state(start_positions_m, n, "start_positions_m"),
@@ -130,6 +137,7 @@ class Experiment:
                 forces=tuple(force.on(body) for force in forces),
                 nuisance=nuisance,
             )
+            self._check_kind()
             self._check_time()
             vars(self)["markers"] = markers.on(body, self._carried_back)
             self._check_nodes()
@@ -138,16 +146,22 @@ class Experiment:
             raise error.located(where=f"experiment '{name}'") from error
 
     def __repr__(self) -> str:
-        kind = ", validation" if self.validation else ""
+        static = "static, " if self.static else ""
+        validation = ", validation" if self.validation else ""
         return (
-            f"Experiment({self.name!r}: {len(self.t_s)} samples over {self.duration_s:.4g} s, "
-            f"grasps: {len(self.grasps)}, {self.markers!r}{kind})"
+            f"Experiment({self.name!r}: {static}{len(self.t_s)} samples over "
+            f"{self.duration_s:.4g} s, grasps: {len(self.grasps)}, {self.markers!r}{validation})"
         )
 
     @property
+    def static(self) -> bool:
+        """Whether every sample is an equilibrium of its own."""
+        return self.kind == "static"
+
+    @property
     def timestep_s(self) -> float:
-        """Time between samples."""
-        return self.duration_s / (len(self.t_s) - 1)
+        """Time between samples, on average; a second where there is one sample."""
+        return self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
 
     @property
     def duration_s(self) -> float:
@@ -243,13 +257,31 @@ class Experiment:
         body_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         return np.where(markers.located, given, body_m)
 
+    def _check_kind(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise InputError(f"kind is {self.kind!r}; expected one of {', '.join(get_args(Kind))}")
+        if not self.static:
+            return
+        for key, usual in (("start", "equilibrium"), ("start_rule", "standard")):
+            if getattr(self, key) != usual:
+                raise InputError(
+                    f"{key} is {getattr(self, key)!r}, but the experiment is static: each sample "
+                    f"is an equilibrium, and nothing moves; expected no {key}"
+                )
+
     def _check_time(self) -> None:
-        if len(self.t_s) < 3:
+        fewest = 1 if self.static else 3
+        if len(self.t_s) < fewest:
             raise InputError(
-                f"{len(self.t_s)} samples in time; at least 3 are needed: check window_s and the "
-                "marker file"
+                f"{len(self.t_s)} samples in time; at least {fewest} are needed: check window_s "
+                "and the marker file"
             )
-        step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
+        if not self.static:
+            step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
+        elif fault := first_time_fault(self.t_s):
+            raise InputError(f"t_s: {fault[1]}", where=f"row {fault[0] + 1}")
+        else:
+            step_s = float(np.diff(self.t_s).min(initial=self.timestep_s))
         measured = self.markers.t_s
         if len(measured) != len(self.t_s) or (
             np.abs(measured - self.t_s).max() > STEP_TOLERANCE * step_s

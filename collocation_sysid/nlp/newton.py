@@ -175,6 +175,37 @@ class Solver:
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
 
 
+def followed(
+    solve: Callable[[Array, float], Array], x: Array, halvings: int, guess: Array | None = None
+) -> Array:
+    """Follow x(s), what `solve(near, s)` finds, from x(0) to x(1) in steps that shrink on failure.
+
+    A guess of x(1) is tried first, and the way there is taken where that fails.
+
+    Raises
+    ------
+    NewtonFailure
+        Where a step that has been halved so often fails.
+    """
+    if guess is not None:
+        try:
+            return solve(guess, 1.0)
+        except NewtonFailure:
+            pass
+    rate, reached, increment = np.zeros_like(x), 0.0, 1.0
+    while reached < 1.0:
+        step = min(increment, 1.0 - reached)
+        try:
+            found = solve(x + step * rate, reached + step)
+        except NewtonFailure:
+            increment = step / 2
+            if increment < 0.5**halvings:
+                raise
+        else:
+            x, rate, reached = found, (found - x) / step, reached + step
+    return x
+
+
 class Solvers:
     """The solvers of an experiment, one for each set of dofs that is held at some time."""
 

@@ -11,7 +11,7 @@ from .dynamics import external_force
 from .factorisation import NONE
 from .lapack import one_blas_thread
 from .memory import start_carried
-from .newton import NewtonFailure, Solver, simulation_error
+from .newton import NewtonFailure, Solver, followed, simulation_error
 
 
 @one_blas_thread()
@@ -54,20 +54,10 @@ def rest_state(
         moved[solver.held] = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
         return solver.newton(moved, residual, linearise, keep_definite=True)
 
-    x = shape.ravel() if start is None else start
-    rate, reached, increment = np.zeros_like(x), 0.0, 1.0
-    while reached < 1.0:
-        step = min(increment, 1.0 - reached)
-        try:
-            found = solve(x + step * rate, reached + step)
-        except NewtonFailure as failure:
-            increment = step / 2
-            if increment < 0.5**solver.options.halvings:
-                raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
-            x = shape.ravel() if reached == 0 else x
-        else:
-            x, rate, reached = found, (found - x) / step, reached + step
-    return x
+    try:
+        return followed(solve, shape.ravel(), solver.options.halvings, start)
+    except NewtonFailure as failure:
+        raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
 
 
 def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
