@@ -8,7 +8,6 @@ import numpy as np
 from problems_small import EDGE_M, hung_cube, nodes_where, vertex_markers
 
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
-from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.nlp.modes import Modes, natural_modes
 from collocation_sysid.nlp.simulation import simulate
 
@@ -27,7 +26,7 @@ def released_in_a_mode(theta: np.ndarray, mode: int, timestep_s: float = 0.01, s
     cube = hung_cube()
     body, t_s = cube.body, timestep_s * np.arange(steps + 1)
     held = nodes_where(body, 2, EDGE_M)
-    modes = natural_modes(body, body.nodes_m, dofs_of(cube.free_nodes), theta)
+    modes = natural_modes(body, body.nodes_m, cube.free_dofs, theta)
     shape = modes.shapes[mode] / np.abs(modes.shapes[mode]).max()
     released = replace(
         cube,

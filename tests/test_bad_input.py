@@ -332,7 +332,7 @@ GRASPS = [
         edit=replace_text(f"grasp = {GRASP}", ""),
     ),
     bad(
-        "equilibrium-on-a-hinge", "at least 3 held nodes", "one line",
+        "equilibrium-on-a-hinge", "it can turn about x", "at least 3 nodes", "one line",
         edit=nodes("{ box_m = [[-1, -1, 0.089], [1, 0.001, 1]] }"),
     ),
 ]  # fmt: skip

@@ -308,7 +308,7 @@ def test_held_nodes_are_bound_to_the_grasp(make):
     collocation = Collocation([make()], GUESS, substeps=2)
     segment = collocation.segments[0]
     (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
-    held = segment.experiment.held_positions(segment.dynamics.t_s).reshape(len(lower), -1)
+    held = segment.experiment.held_positions(segment.dynamics.t_s)
     np.testing.assert_allclose(lower[:, segment.held_dofs], held, rtol=1e-14, atol=1e-17)
     np.testing.assert_array_equal(lower[:, segment.held_dofs], upper[:, segment.held_dofs])
     assert (lower[:, segment.free_dofs] == -np.inf).all()
@@ -460,7 +460,7 @@ def test_the_largest_violation_is_named():
     collocation = Collocation([swung(), replace(swung(steps=7), name="second")], GUESS)
     z = marched(collocation)
     q, positions = collocation.unpack(z)
-    node = int(collocation.segments[1].experiment.free_nodes[2])
+    node = int(collocation.segments[1].experiment.free_dofs[6]) // 3
     positions[1][-1, 3 * node + 1] += 1e-3
     worst = collocation.largest_violations(collocation.pack(q, positions), count=3)
     assert len(worst) == 3

@@ -196,7 +196,7 @@ def energies(scheme: str, theta: np.ndarray) -> np.ndarray:
     step, v0 = dynamics.step_s, dynamics.start_velocity_m_s
     if scheme == "midpoint":
         momenta = node_momenta(dynamics, x, theta).reshape(len(x) - 1, -1)
-        held = np.setdiff1d(np.arange(x.shape[1]), dofs_of(experiment.free_nodes))
+        held = np.setdiff1d(np.arange(x.shape[1]), experiment.free_dofs)
         momenta[:, held] = 0.0
         v = np.vstack([v0, momenta / dynamics.body.dof_mass])
     else:

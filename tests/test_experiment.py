@@ -62,13 +62,13 @@ def test_sizes_follow_from_times_and_grasps():
     swing = experiment()
     assert swing.timestep_s == pytest.approx(0.01)
     assert swing.duration_s == pytest.approx(0.05)
-    np.testing.assert_array_equal(swing.held_nodes, [0, 1, 2])
-    np.testing.assert_array_equal(swing.free_nodes, [3, 4])
+    np.testing.assert_array_equal(swing.held_dofs, np.arange(9))
+    np.testing.assert_array_equal(swing.free_dofs, np.arange(9, 15))
 
 
-def test_held_positions_follow_the_order_of_held_nodes():
+def test_held_positions_follow_the_order_of_held_dofs():
     swing = experiment(grasps=(lifted([4, 1, 2]), lifted([0, 3], speed_m_s=-2.0)))
-    held = swing.held_positions([0.0, 0.02])
+    held = swing.held_positions([0.0, 0.02]).reshape(2, 5, 3)
     np.testing.assert_allclose(held[0], NODES)
     np.testing.assert_allclose(held[1, :, 2] - NODES[:, 2], [-0.04, 0.02, 0.02, -0.04, 0.02])
     np.testing.assert_allclose(held[1, 1, :2], [0.1 * np.cos(0.02), 0.1 * np.sin(0.02)])
@@ -84,8 +84,8 @@ def test_rigid_positions_carry_the_whole_body_with_the_first_grasp():
 def test_without_a_grasp_the_body_stays_undeformed_and_all_nodes_are_free():
     free = experiment(grasps=(), start="undeformed")
     np.testing.assert_array_equal(free.rigid_positions([0.0, 0.1]), [NODES, NODES])
-    assert free.held_positions([0.0, 0.1]).shape == (2, 0, 3)
-    np.testing.assert_array_equal(free.free_nodes, np.arange(5))
+    assert free.held_positions([0.0, 0.1]).shape == (2, 0)
+    np.testing.assert_array_equal(free.free_dofs, np.arange(15))
 
 
 def test_a_given_start_is_at_rest_unless_velocities_are_given():

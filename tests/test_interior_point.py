@@ -112,7 +112,7 @@ def test_the_positions_satisfy_grasp_and_motion():
     segment = cube().segments[0]
     positions = solution.positions_m[0]
     np.testing.assert_allclose(
-        positions[:, segment.experiment.held_nodes],
+        positions.reshape(len(positions), -1)[:, segment.experiment.held_dofs],
         segment.experiment.held_positions(segment.dynamics.t_s),
         atol=1e-9,
     )
@@ -153,7 +153,7 @@ def test_the_start_shape_is_carried_with_the_grasp():
     segment = cube().segments[0]
     x = carried_rigidly(segment, as_theta(TRUTH)).reshape(segment.grid_rows, -1, 3)
     np.testing.assert_allclose(
-        x[:, segment.experiment.held_nodes],
+        x.reshape(len(x), -1)[:, segment.experiment.held_dofs],
         segment.experiment.held_positions(segment.dynamics.t_s),
         atol=1e-12,
     )

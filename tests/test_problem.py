@@ -29,6 +29,7 @@ from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.fem.materials import MATERIALS, neo_hookean
+from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.problem import Problem
@@ -202,7 +203,7 @@ def test_a_surface_is_filled_once_and_kept(tiny):
 )
 def test_every_kind_of_selection_finds_its_nodes(tiny, selection):
     replace_text(BOX, selection)(tiny)
-    np.testing.assert_array_equal(experiment_of(tiny).held_nodes, top_nodes())
+    np.testing.assert_array_equal(experiment_of(tiny).held_dofs, dofs_of(top_nodes()))
 
 
 def test_a_grasp_is_a_table_or_a_list_of_tables(tiny):
@@ -217,7 +218,7 @@ def test_a_second_hand_without_poses_stays_where_it_is(tiny):
     second = "{ nodes = { box_m = [[-1, -1, -1], [1, 1, 0.001]] } }"
     replace_text(GRASP, f"[{GRASP}, {second}]")(tiny)
     experiment = experiment_of(tiny)
-    assert len(experiment.held_nodes) == 18
+    assert len(experiment.held_dofs) == 54
     nodes = experiment.grasps[1].nodes
     still = experiment.grasps[1].poses.carry(experiment.body.nodes_m[nodes], experiment.t_s)
     np.testing.assert_allclose(still - experiment.body.nodes_m[nodes], 0.0, atol=1e-15)
@@ -488,8 +489,8 @@ def test_nuisance_is_read(loaded):
 def test_a_grasp_may_hold_for_a_while(tiny):
     experiment = experiment_of(tiny, "experiment.swing.grasp.until_s=0.02")
     held, _ = experiment.grasped([0.0, 0.02, 0.03])
-    np.testing.assert_array_equal(held.any(axis=1), [True, True, False])
-    assert len(experiment.held_nodes) == 0
+    np.testing.assert_array_equal(held.any(axis=(1, 2)), [True, True, False])
+    assert len(experiment.held_dofs) == 0
 
 
 def test_every_takes_only_some_samples(tiny):

@@ -27,7 +27,7 @@ from collocation_sysid.statistics.stillness import motionless
 def hanging(noise_m: float = 5e-4) -> Experiment:
     """The cube hung still from its top face."""
     moving = hung_cube(8, divisions=(1, 1, 2))
-    still = measured(replace(moving, grasps=(Grasp(moving.held_nodes, PoseSequence.fixed()),)))
+    still = measured(replace(moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),)))
     tracks = still.markers.positions_m
     noise = noise_m * np.random.default_rng(0).normal(size=tracks.shape)
     return with_markers(replace(still, name="hanging"), tracks + noise)

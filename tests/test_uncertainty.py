@@ -316,7 +316,7 @@ def test_fixed_parameters_have_no_error_bar():
 
 def test_damping_of_a_body_at_rest_is_reported_as_undetermined():
     moving = hung_cube(4)
-    still = replace(moving, grasps=(Grasp(moving.held_nodes, PoseSequence.fixed()),))
+    still = replace(moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),))
     uncertainty = covariance(*simulated([measured(still)]))
     assert np.isinf(np.diag(uncertainty.covariance)).tolist() == [False, False, True, True]
     assert uncertainty.estimates["gamma_r_s"].std_error is None

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Array, Index
+from ..arrays import Array
 from ..experiment.experiment import Experiment
+from ..experiment.grasp import Grasp
 
 # Of the mean edge: nodes this near the held ones' box belong to it or not by chance.
 NEAR = 0.1
@@ -32,6 +33,8 @@ class Hold:
     nearly_free : int
         Held nodes less than a tenth of an edge behind a face that the body goes on beyond, and
         not in it.
+    axes : str
+        Along which it holds.
     """
 
     experiment: str
@@ -41,15 +44,17 @@ class Hold:
     share: float
     nearly_held: int
     nearly_free: int
+    axes: str = "xyz"
 
 
 def holds_of(experiment: Experiment, mean_edge_m: float) -> tuple[Hold, ...]:
     """One for each grasp."""
     points_m = experiment.body.nodes_m
-    return tuple(_hold(experiment.name, points_m, g.nodes, mean_edge_m) for g in experiment.grasps)
+    return tuple(_hold(experiment.name, points_m, g, mean_edge_m) for g in experiment.grasps)
 
 
-def _hold(name: str, points_m: Array, nodes: Index, mean_edge_m: float) -> Hold:
+def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
+    nodes = grasp.nodes
     held, free = points_m[nodes], np.delete(points_m, nodes, axis=0)
     low, high = held.min(axis=0), held.max(axis=0)
     outside_m = np.concatenate([low - free, free - high], axis=1)
@@ -68,6 +73,7 @@ def _hold(name: str, points_m: Array, nodes: Index, mean_edge_m: float) -> Hold:
         len(nodes) / len(points_m),
         int(slightly_outside.any(axis=1).sum()),
         int(slightly_inside.any(axis=1).sum()),
+        grasp.axes,
     )
 
 
@@ -75,7 +81,8 @@ def hold_sentence(hold: Hold) -> str:
     """What a grasp holds."""
     size = " × ".join(f"{1e3 * (b - a):.4g}" for a, b in zip(hold.low_m, hold.high_m, strict=True))
     low = ", ".join(f"{1e3 * x:.4g}" for x in hold.low_m)
-    return f"{hold.nodes} nodes, {hold.share:.0%} of all, in {size} mm from ({low}) mm on"
+    along = "" if hold.axes == "xyz" else f", along {' and '.join(hold.axes)} only"
+    return f"{hold.nodes} nodes, {hold.share:.0%} of all, in {size} mm from ({low}) mm on{along}"
 
 
 def hold_warnings(hold: Hold) -> list[str]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
-from ..fem.pattern import dofs_of
 from ..nlp.forces import Forces
 from ..nlp.modes import Modes, natural_modes
 from ..nlp.newton import Solver
@@ -94,11 +93,11 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
     Of those times the last counts, when all point masses have joined.
     """
     held = experiment.grasped(experiment.t_s)[0]
-    count = held.sum(axis=1)
+    count = held.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
     x, about = _state(experiment, held[least], time_s, theta)
-    free = dofs_of(np.flatnonzero(~held[least]))
+    free = np.flatnonzero(~held[least])
     forces = Forces.of(experiment, time_s)
     modes = natural_modes(experiment.body, x, free, theta, COUNT, forces)
     found = _mode_findings(modes, experiment, scheme, step_s)

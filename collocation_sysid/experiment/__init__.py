@@ -4,11 +4,11 @@ from .alignment import Aligned, align
 from .clock import sample_interval_s
 from .experiment import Experiment
 from .force_files import read_forces
-from .grasp import Grasp, held_nodes
+from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance
-from .pose_files import read_poses
+from .pose_files import read_displacement, read_poses
 from .poses import PoseSequence
 from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
@@ -30,8 +30,10 @@ __all__ = [
     "align",
     "align_to_template",
     "fit_poses",
+    "held_dofs",
     "held_nodes",
     "place_markers",
+    "read_displacement",
     "read_forces",
     "read_markers",
     "read_poses",

@@ -48,6 +48,7 @@ def align(
     resample_hz: float | None = None,
     every: int = 1,
     held_s: Sequence[tuple[float, float]] | None = None,
+    static: bool = False,
 ) -> Aligned:
     """Put poses and markers on one evenly spaced time grid over the time that they share.
 
@@ -72,6 +73,8 @@ def align(
     held_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not go beyond. Throughout by
         default.
+    static : bool
+        The grid is the markers' own time, however it is spaced, and one sample is enough.
 
     Raises
     ------
@@ -80,10 +83,13 @@ def align(
         three samples.
     """
     table = table if window_s is None else _cut(table, window_s)
-    table, notes = _shared(table, poses, held_s or [(-np.inf, np.inf)] * len(poses))
+    held_s = held_s or [(-np.inf, np.inf)] * len(poses)
+    table, notes = _shared(table, poses, held_s, 1 if static else _FEWEST_SAMPLES)
     if every > 1:
         table = MarkerTable(table.t_s[::every], table.names, table.positions_m[::every])
-    if resample_hz is None:
+    if static:
+        t_s = grid = table.t_s
+    elif resample_hz is None:
         sample_interval_s(table.t_s, "markers")
         t_s, grid = table.t_s, even_times_s(table.t_s)
         table = MarkerTable(grid, table.names, table.positions_m)
@@ -103,7 +109,10 @@ def align(
 
 
 def _shared(
-    table: MarkerTable, poses: Sequence[PoseSequence], held_s: Sequence[tuple[float, float]]
+    table: MarkerTable,
+    poses: Sequence[PoseSequence],
+    held_s: Sequence[tuple[float, float]],
+    fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
     """The markers at times that have a pose in every grasp that holds then."""
     t_s = table.t_s
@@ -119,10 +128,10 @@ def _shared(
     if kept.all():
         return table, []
     spans = " and ".join(_span(sequence.t_s) for sequence, _ in moving)
-    if kept.sum() < _FEWEST_SAMPLES:
+    if kept.sum() < fewest:
         raise InputError(
             f"poses run {spans}, markers {_span(t_s)}: they share {kept.sum()} marker samples; "
-            f"expected at least {_FEWEST_SAMPLES}: check that both are of one recording and one "
+            f"expected at least {fewest}: check that both are of one recording and one "
             "clock, and window_s"
         )
     cut = t_s[kept]
@@ -215,10 +224,8 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
 def _interpolated(poses: PoseSequence, grid: Array) -> str:
     """What to say of poses that have no sample at each grid time."""
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
-    told = (
-        f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, "
-        f"{_rate_hz(grid):.6g} Hz {_span(grid)}"
-    )
+    at = f"{_rate_hz(grid):.6g} Hz {_span(grid)}" if len(grid) > 1 else _span(grid)
+    told = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
     steps = np.diff(poses.t_s)
     lost = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
     lost &= poses.t_s[:-1] < grid[-1]

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, Index
 from ..errors import InputError
 from .arrays import read_only_floats
-from .clock import STEP_TOLERANCE, sample_interval_s
-from .grasp import Grasp, held_nodes
+from .clock import STEP_TOLERANCE, first_time_fault, sample_interval_s
+from .freedom import free_motions
+from .grasp import Grasp, held_dofs
 from .loads import Force, PointMass
 from .markers import Markers
 from .nuisance import Nuisance
@@ -23,14 +24,12 @@ if TYPE_CHECKING:
     from ..fem.body import Body
     from ..fem.pattern import SymmetricPattern
 
+Kind = Literal["dynamic", "static"]
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
 EARTH_M_S2 = (0.0, 0.0, -9.81)
 AS_IN_A_LABORATORY = Nuisance()
-
-# Held nodes count as collinear when they deviate from a line by less than this part of its length.
-_COLLINEAR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +41,10 @@ class Experiment:
     body : Body
         Provides `nodes_m`, `cells` and `element`.
     t_s : (T,) array
-        At least three evenly spaced times.
+        At least three evenly spaced times; of a static experiment one or more, ascending.
     grasps : sequence of Grasp
-        No node in two of them at a time. Selected nodes are looked up on the body, and poses given
-        as matrices are those at `t_s`.
+        No node in two of them at a time along the same axis. Selected nodes are looked up on the
+        body, and poses given as matrices are those at `t_s`.
     markers : Markers
         Tracks at the times `t_s`, at least one sample present. Those given by their places are put
         on the body, see `place_markers`.
@@ -53,6 +52,9 @@ class Experiment:
         Acceleration of gravity.
     name : str
         For messages and reports; experiments of one problem have different names.
+    kind : {"dynamic", "static"}
+        A motion, or samples each of which is an equilibrium of its own; with memory, quasi-static
+        in time.
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
@@ -84,6 +86,7 @@ class Experiment:
     markers: Markers
     gravity_m_s2: Array
     name: str
+    kind: Kind
     start: Start
     start_rule: StartRule
     start_positions_m: Array | None
@@ -103,6 +106,7 @@ class Experiment:
         gravity_m_s2: ArrayLike = EARTH_M_S2,
         name: str = "experiment",
         *,
+        kind: Kind = "dynamic",
         start: Start = "equilibrium",
         start_rule: StartRule = "standard",
         start_positions_m: ArrayLike | None = None,
@@ -123,6 +127,7 @@ class Experiment:
                 markers=markers,
                 gravity_m_s2=read_only_floats(gravity_m_s2, (3,), "gravity_m_s2"),
                 name=name,
+                kind=kind,
                 start=start,
                 start_rule=start_rule,
                 start_positions_m=_state(start_positions_m, n, "start_positions_m"),
@@ -133,6 +138,7 @@ class Experiment:
                 forces=tuple(force.on(body) for force in forces),
                 nuisance=nuisance,
             )
+            self._check_kind()
             self._check_time()
             vars(self)["markers"] = markers.on(body, self._carried_back)
             self._check_nodes()
@@ -141,16 +147,22 @@ class Experiment:
             raise error.located(where=f"experiment '{name}'") from error
 
     def __repr__(self) -> str:
-        kind = ", validation" if self.validation else ""
+        static = "static, " if self.static else ""
+        validation = ", validation" if self.validation else ""
         return (
-            f"Experiment({self.name!r}: {len(self.t_s)} samples over {self.duration_s:.4g} s, "
-            f"grasps: {len(self.grasps)}, {self.markers!r}{kind})"
+            f"Experiment({self.name!r}: {static}{len(self.t_s)} samples over "
+            f"{self.duration_s:.4g} s, grasps: {len(self.grasps)}, {self.markers!r}{validation})"
         )
 
     @property
+    def static(self) -> bool:
+        """Whether every sample is an equilibrium of its own."""
+        return self.kind == "static"
+
+    @property
     def timestep_s(self) -> float:
-        """Time between samples."""
-        return self.duration_s / (len(self.t_s) - 1)
+        """Time between samples, on average; a second where there is one sample."""
+        return self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
 
     @property
     def duration_s(self) -> float:
@@ -158,38 +170,39 @@ class Experiment:
         return float(self.t_s[-1] - self.t_s[0])
 
     @cached_property
-    def held_nodes(self) -> Index:
-        """Nodes that are grasped throughout, sorted."""
+    def held_dofs(self) -> Index:
+        """Dofs, 3 node + axis, that are grasped throughout, sorted."""
         held, _ = self.grasped(self.t_s)
         return np.flatnonzero(held.all(axis=0))
 
     @cached_property
-    def free_nodes(self) -> Index:
-        """All other nodes, sorted; grasps with a time window may hold some for a while."""
-        return np.setdiff1d(np.arange(len(self.body.nodes_m)), self.held_nodes)
+    def free_dofs(self) -> Index:
+        """All other dofs, sorted; grasps with a time window may hold some for a while."""
+        return np.setdiff1d(np.arange(self.body.nodes_m.size), self.held_dofs)
 
     def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
-        """Return which nodes are held at the times `t_s` (T,), and where.
+        """Return which coordinates of the nodes are held at the times `t_s` (T,), and where.
 
         Returns
         -------
-        held : (T, n) bool
+        held : (T, n, 3) bool
         positions_m : (T, n, 3)
             NaN where a node is not held.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        n = len(self.body.nodes_m)
-        held = np.zeros((len(times), n), dtype=bool)
-        positions = np.full((len(times), n, 3), np.nan)
+        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        positions = np.full(held.shape, np.nan)
         for grasp in self.grasps:
             here = np.flatnonzero(grasp.holds(times))
-            held[np.ix_(here, grasp.nodes)] = True
-            positions[np.ix_(here, grasp.nodes)] = grasp.carry(self.body.nodes_m, times[here])
+            place = np.ix_(here, grasp.nodes, grasp.columns)
+            carried = grasp.carry(self.body.nodes_m, times[here])
+            held[place], positions[place] = True, carried[..., grasp.columns]
         return held, positions
 
     def held_positions(self, t_s: ArrayLike) -> Array:
-        """Return where `held_nodes` are carried at `t_s` (T,), as (T, held, 3) metres."""
-        return self.grasped(t_s)[1][:, self.held_nodes]
+        """Return where `held_dofs` are carried at `t_s` (T,), as (T, held) metres."""
+        positions = self.grasped(t_s)[1]
+        return positions.reshape(len(positions), -1)[:, self.held_dofs]
 
     def node_mass_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
@@ -215,8 +228,8 @@ class Experiment:
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
 
-        That is the first grasp that holds throughout, else the first. Without a grasp the body
-        stays where it is undeformed.
+        That is the first grasp that holds throughout along all axes; without one the first that
+        does along some, else the first. Without a grasp the body stays where it is undeformed.
         """
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
@@ -227,6 +240,7 @@ class Experiment:
         if not self.grasps:
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
         throughout = [grasp for grasp in self.grasps if grasp.holds(self.t_s).all()]
+        throughout.sort(key=lambda grasp: grasp.axes != "xyz")
         poses = (throughout or self.grasps)[0].poses
         if len(poses.t_s) > 1 and not throughout:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
@@ -249,13 +263,31 @@ class Experiment:
         body_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         return np.where(markers.located, given, body_m)
 
+    def _check_kind(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise InputError(f"kind is {self.kind!r}; expected one of {', '.join(get_args(Kind))}")
+        if not self.static:
+            return
+        for key, usual in (("start", "equilibrium"), ("start_rule", "standard")):
+            if getattr(self, key) != usual:
+                raise InputError(
+                    f"{key} is {getattr(self, key)!r}, but the experiment is static: each sample "
+                    f"is an equilibrium, and nothing moves; expected no {key}"
+                )
+
     def _check_time(self) -> None:
-        if len(self.t_s) < 3:
+        fewest = 1 if self.static else 3
+        if len(self.t_s) < fewest:
             raise InputError(
-                f"{len(self.t_s)} samples in time; at least 3 are needed: check window_s and the "
-                "marker file"
+                f"{len(self.t_s)} samples in time; at least {fewest} are needed: check window_s "
+                "and the marker file"
             )
-        step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
+        if not self.static:
+            step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
+        elif fault := first_time_fault(self.t_s):
+            raise InputError(f"t_s: {fault[1]}", where=f"row {fault[0] + 1}")
+        else:
+            step_s = float(np.diff(self.t_s).min(initial=self.timestep_s))
         measured = self.markers.t_s
         if len(measured) != len(self.t_s) or (
             np.abs(measured - self.t_s).max() > STEP_TOLERANCE * step_s
@@ -270,9 +302,9 @@ class Experiment:
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)
-        grasped = held_nodes(self.grasps)
-        if grasped.size and grasped[-1] >= n:
-            raise InputError(f"a grasp holds node {grasped[-1]}, but the body has {n}")
+        grasped = held_dofs(self.grasps)
+        if grasped.size and grasped[-1] >= 3 * n:
+            raise InputError(f"a grasp holds node {grasped[-1] // 3}, but the body has {n}")
         for what, loads in (("point mass is tied to", self.masses), ("force is on", self.forces)):
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
@@ -306,22 +338,20 @@ class Experiment:
                 vars(self)["start_velocities_m_s"] = _state(np.zeros((n, 3)), n, "velocity")
         elif given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
-        held = np.flatnonzero(self.grasped(self.t_s[:1])[0][0])
-        if self.start == "equilibrium" and not _fixes_a_body(self.body.nodes_m[held]):
+        if self.start == "equilibrium":
+            self._refuse_free_motions()
+
+    def _refuse_free_motions(self) -> None:
+        held = self.grasped(self.t_s[:1])[0][0]
+        free = free_motions(self.body.nodes_m, held)
+        if free:
             raise InputError(
-                "start = 'equilibrium' needs at least 3 held nodes that do not lie on one line, "
-                "otherwise the body can turn freely and its rest state is not unique; "
-                f"{len(held)} nodes are held then. Grasp more nodes, or start 'undeformed'"
+                "start = 'equilibrium' needs grasps that leave the body no rigid motion, but it "
+                f"can {' and '.join(free)}, so that its rest state is not unique; "
+                f"{int(held.any(axis=1).sum())} nodes are held then. Grasp at least 3 nodes that "
+                "do not lie on one line, or more axes, or start 'undeformed'"
             )
 
 
 def _state(given: ArrayLike | None, nodes: int, name: str) -> Array | None:
     return None if given is None else read_only_floats(given, (nodes, 3), name)
-
-
-def _fixes_a_body(points_m: Array) -> bool:
-    """Whether holding these points leaves no rigid motion."""
-    if len(points_m) < 3:
-        return False
-    extents = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
-    return bool(extents[1] > _COLLINEAR * extents[0])

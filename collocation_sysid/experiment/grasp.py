@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,9 @@ from .poses import PoseSequence
 
 if TYPE_CHECKING:
     from ..fem.body import Body
+
+
+AXES = ("x", "y", "z", "xy", "xz", "yz", "xyz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,9 @@ class Grasp:
         rough the poses are where they are not given.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
+    axes : str
+        Along which axes of the world they are held, such as "z" for a platen on which the body
+        slides; "xyz" by default.
     """
 
     nodes: Index
@@ -47,6 +54,7 @@ class Grasp:
     sigma_m: float | None
     sigma_rad: float | None
     selection: Selection | None
+    axes: str
 
     def __init__(
         self,
@@ -57,11 +65,14 @@ class Grasp:
         sigma_m: float | None = None,
         sigma_rad: float | None = None,
         selection: Selection | None = None,
+        axes: str = "xyz",
     ) -> None:
         if not from_s <= until_s:
             raise InputError(
                 f"a grasp holds from {from_s:g} s until {until_s:g} s; expected from_s <= until_s"
             )
+        if axes not in AXES:
+            raise InputError(f"axes of a grasp is {axes!r}; expected one of {', '.join(AXES)}")
         held = some_nodes(nodes, "the grasp")
         for name, value in (("sigma_m", sigma_m), ("sigma_rad", sigma_rad)):
             if value is not None and not value >= 0:
@@ -74,6 +85,7 @@ class Grasp:
             sigma_m=sigma_m,
             sigma_rad=sigma_rad,
             selection=held if isinstance(held, Selection) else selection,
+            axes=axes,
         )
 
     def on(self, body: Body, t_s: Array) -> Grasp:
@@ -83,6 +95,16 @@ class Grasp:
             poses = PoseSequence.from_matrices(t_s, poses)
         given = nodes is self.nodes and poses is self.poses
         return self if given else replace(self, nodes=nodes, poses=poses)
+
+    @cached_property
+    def columns(self) -> Index:
+        """(a,) its axes as numbers."""
+        return np.array(["xyz".index(axis) for axis in self.axes])
+
+    @cached_property
+    def dofs(self) -> Index:
+        """(h a,) the dofs that it holds, ascending."""
+        return (3 * self.nodes[:, None] + self.columns).ravel()
 
     def holds(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether the nodes are held at the times `t_s` (T,)."""
@@ -97,18 +119,25 @@ class Grasp:
 
 
 def held_nodes(grasps: Sequence[Grasp]) -> Index:
-    """Return all nodes that are grasped at some time, sorted.
+    """Return all nodes that are grasped at some time along some axis, sorted."""
+    return np.unique(held_dofs(grasps) // 3)
+
+
+def held_dofs(grasps: Sequence[Grasp]) -> Index:
+    """Return all dofs, 3 node + axis, that are grasped at some time, sorted.
 
     Raises
     ------
     InputError
-        If two grasps hold the same node at the same time.
+        If two grasps hold the same node at the same time along the same axis.
     """
     for (i, first), (j, second) in combinations(enumerate(grasps, start=1), 2):
-        shared = np.intersect1d(first.nodes, second.nodes)
+        shared = np.intersect1d(first.dofs, second.dofs)
         if shared.size and max(first.from_s, second.from_s) <= min(first.until_s, second.until_s):
+            node, axis = divmod(int(shared[0]), 3)
+            along = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
             raise InputError(
-                f"node {shared[0]} is held by the grasps {i} and {j} at the same time; "
+                f"node {node} is held by the grasps {i} and {j} at the same time{along}; "
                 "select nodes so that each is held once"
             )
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(g.nodes for g in grasps)]))
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(g.dofs for g in grasps)]))

@@ -1,4 +1,4 @@
-"""Pose files: CSV with quaternions or 4x4 matrices, and NumPy archives of matrices."""
+"""Pose files: CSV with quaternions, 4x4 matrices or shifts alone, and archives of matrices."""
 
 from __future__ import annotations
 
@@ -73,6 +73,40 @@ def read_poses(
     positions_m = _columns(table, axes) * METRES_PER_UNIT[unit]
     quaternions = _columns(table, components)
     return _sequence(path, t_s, positions_m, quaternions, lines)
+
+
+def read_displacement(path: str | Path) -> PoseSequence:
+    """Read shifts from the undeformed place over time, such as those of a test bench's crosshead.
+
+    A CSV has the columns t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), in any order; along
+    the other axes nothing moves.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
+        does not increase; the line is named.
+    """
+    table = read_grid(path, decode(read_bytes(path), path))
+    axes = [name for name in table.columns if name != "t_s"]
+    known = {f"{axis}_{unit}": (axis, unit) for unit in METRES_PER_UNIT for axis in "xyz"}
+    moved = [known[name][0] for name in axes if name in known]
+    bare = [name for name in axes if name in tuple("xyz")]
+    if table.columns.count("t_s") != 1 or not axes or len(set(moved)) != len(axes):
+        hint = f"; the column {bare[0]} names no unit: call it {bare[0]}_m or {bare[0]}_mm"
+        raise InputError(
+            f"the columns are {listed(table.columns)}; expected t_s and any of x_m, y_m, z_m (or "
+            f"_cm, _mm, _in), each axis once{hint if bare else ''}",
+            path,
+            "line 1",
+        )
+    positions_m = np.zeros((len(table.rows), 3))
+    for name, values in zip(axes, _columns(table, axes).T, strict=True):
+        axis, unit = known[name]
+        positions_m[:, "xyz".index(axis)] = values * METRES_PER_UNIT[unit]
+    unturned = np.tile([0.0, 0.0, 0.0, 1.0], (len(positions_m), 1))
+    lines = [f"line {line}" for line in table.lines]
+    return _sequence(path, _columns(table, ["t_s"])[:, 0], positions_m, unturned, lines)
 
 
 def _sequence(

@@ -106,16 +106,13 @@ def _nothing(collocation: Collocation) -> list[Array]:
 
 
 def carried_rigidly(segment: Segment, theta: Array) -> Array:
-    """(N, 3n) start shape moved with the first grasp, held nodes where their grasps are."""
+    """(N, 3n) start shape carried rigidly, held nodes where their grasps are."""
     experiment, t_s = segment.experiment, segment.dynamics.t_s
     try:
         x0, _ = start_state(experiment, theta, Solver(experiment))
     except SimulationError:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
-    x = np.tile(x0, (len(t_s), 1))
-    if experiment.grasps:
-        rotations, translations = experiment.grasps[0].poses.at(t_s)
-        shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
-        carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
-        x = carried.reshape(len(t_s), -1)
-    return segment.grasped(x, segment.guess_phi)
+    rotations, translations = experiment.rigid_motion(t_s)
+    shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
+    carried = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
+    return segment.grasped(carried.reshape(len(t_s), -1), segment.guess_phi)

@@ -77,9 +77,15 @@ class Described:
 
 
 def carrying(experiment: Experiment) -> Grasp | None:
-    """The grasp that carries the body throughout, if all others that hold move with it."""
+    """The grasp that carries the body throughout, if all others that hold move with it.
+
+    One that holds some axes only carries none.
+    """
     holding = [grasp for grasp in experiment.grasps if grasp.holds(experiment.t_s).any()]
-    if not holding or not all(grasp.holds(experiment.t_s).all() for grasp in holding):
+    holding.sort(key=lambda grasp: grasp.axes != "xyz")
+    if not holding or holding[0].axes != "xyz":
+        return None
+    if not all(grasp.holds(experiment.t_s).all() for grasp in holding):
         return None
     motions = [grasp.poses.at(experiment.t_s) for grasp in holding]
     together = all(
@@ -119,10 +125,9 @@ class Sway:
     def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Sway:
         """Of an experiment; of the constants only ratios count."""
         body, markers = experiment.body, experiment.markers
-        free = (3 * experiment.free_nodes[:, None] + np.arange(3)).ravel()
         forces = Forces.of(experiment, experiment.t_s[:1])
         theta = body.theta(constants)
-        modes = natural_modes(body, body.nodes_m, free, theta, MODES, forces)
+        modes = natural_modes(body, body.nodes_m, experiment.free_dofs, theta, MODES, forces)
         weighed = modes.shapes * forces.mass_kg[0, ::3, None]
         omega = modes.angular_frequencies_rad_s
         return cls(

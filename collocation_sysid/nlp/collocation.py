@@ -141,14 +141,15 @@ class Collocation:
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
         """One of each experiment that is fitted."""
-        options = (self.parameters, self.scheme, self.substeps, self.explicit_grasps, self.huber)
+        options = (self.explicit_grasps, self.huber)
         found, first = [], First(self.nq, self.nq, 0)
         for experiment in self.experiments:
             if not experiment.validation:
                 chart = self.charts.get(experiment.name)
                 if chart is None or not chart.suits(experiment):
                     chart = Chart.of(experiment)
-                found.append(Segment(experiment, *options, first, chart))
+                grid = self.scheme, 1 if experiment.static else self.substeps
+                found.append(Segment(experiment, self.parameters, *grid, *options, first, chart))
                 first = found[-1].after
         return tuple(found)
 

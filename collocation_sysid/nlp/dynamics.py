@@ -15,7 +15,7 @@ from ..fem.memory import Carried
 from ..fem.pattern import SymmetricPattern
 from .forces import Forces, per_dof
 from .memory import History
-from .schemes import Scheme, as_scheme
+from .schemes import QUASI_STATIC, Scheme, as_scheme
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,8 @@ class Tables:
 class Dynamics:
     """c_t(x; θ) for rows t = `first_row` … N − 1 of a uniform grid, all dofs included.
 
-    Row 0 exists when the experiment starts in equilibrium and is the static problem.
+    Row 0 exists when the experiment starts in equilibrium and is the static problem; so are all
+    rows of a static experiment, whose times need not be evenly spaced.
 
     Attributes
     ----------
@@ -62,6 +63,8 @@ class Dynamics:
     start_velocity_m_s : (3n,)
     loaded_since_s : float
         How long the body has been in its start shape; infinite where its memory has relaxed.
+    static : bool
+        Whether each row is an equilibrium of its own.
     """
 
     body: Body
@@ -73,27 +76,34 @@ class Dynamics:
     taken: NDArray[np.bool_]
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
+    static: bool = False
 
     @classmethod
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
-        """Discretise an experiment with `substeps` steps between samples."""
-        rows = (len(experiment.t_s) - 1) * substeps + 1
-        t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
-        first_row = 0 if experiment.start == "equilibrium" else 1
-        tables = Tables.of(as_scheme(scheme, experiment.start_rule), rows, first_row)
+        """Discretise an experiment with `substeps` steps between samples; a static one has none."""
+        if experiment.static:
+            t_s, table = experiment.t_s, QUASI_STATIC
+        else:
+            rows = (len(experiment.t_s) - 1) * substeps + 1
+            t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
+            table = as_scheme(scheme, experiment.start_rule)
+        rows, first_row = len(t_s), 0 if experiment.start == "equilibrium" else 1
+        tables = Tables.of(table, rows, first_row)
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
-        lag_s = tables.p @ np.arange(tables.p.shape[1]) * (t_s[1] - t_s[0])
+        lags = tables.p @ np.arange(tables.p.shape[1])
+        evaluated_s = t_s - lags * experiment.timestep_s / substeps
         return cls(
             body=experiment.body,
             tables=tables,
             t_s=t_s,
             first_row=first_row,
             mass_kg=per_dof(experiment.node_mass_kg(t_s)),
-            forces=Forces.of(experiment, t_s - lag_s),
+            forces=Forces.of(experiment, evaluated_s),
             taken=_taken(experiment, t_s),
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
+            static=experiment.static,
         )
 
     def under_gravity(self, change_m_s2: Array) -> Dynamics:
@@ -124,8 +134,8 @@ class Dynamics:
 
     @property
     def step_s(self) -> float:
-        """Δt of the grid."""
-        return float(self.t_s[1] - self.t_s[0])
+        """Δt of the grid; of a static experiment, where nothing depends on it, a second."""
+        return 1.0 if self.static else float(self.t_s[1] - self.t_s[0])
 
     @property
     def reach(self) -> int:
@@ -141,6 +151,8 @@ class Dynamics:
     @property
     def until_next_s(self) -> Array:
         """(N,) time from each evaluation to the next."""
+        if self.static:
+            return np.append(np.diff(self.t_s), 1.0)
         lags = self.tables.p @ np.arange(self.reach + 1.0)
         return self.step_s * np.append(np.diff(np.arange(self.rows) - lags), 1.0)
 
@@ -238,6 +250,6 @@ class Dynamics:
 
 
 def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
-    held, _ = experiment.grasped(t_s)
-    held[:, experiment.held_nodes] = False
-    return np.repeat(held, 3, axis=1)
+    held = experiment.grasped(t_s)[0].reshape(len(t_s), -1)
+    held[:, experiment.held_dofs] = False
+    return held

@@ -76,6 +76,12 @@ class Forces:
             self, gravity_m_s2=share * self.gravity_m_s2, applied_n=share * self.applied_n
         )
 
+    def towards(self, other: Forces, share: float) -> Forces:
+        """The same with a share of the way to what acts at other times."""
+        mass_kg = self.mass_kg + share * (other.mass_kg - self.mass_kg)
+        applied_n = self.applied_n + share * (other.applied_n - self.applied_n)
+        return replace(self, mass_kg=mass_kg, applied_n=applied_n)
+
     @property
     def external_n(self) -> Array:
         """(T, 3n) those that do not depend on the state."""

@@ -1,6 +1,6 @@
 """Where the grasps hold a body's dofs, as a function of how it is off in them.
 
-A grasped node is at U_t H(φ) X, see `nuisance`.
+A grasped node is at U_t H(φ) X, see `nuisance`, along the axes that are held.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
-from ..experiment.grasp import held_nodes
-from ..fem.pattern import dofs_of
+from ..experiment.grasp import held_dofs
 from .nuisance import NuisanceMap
 
 
@@ -55,44 +54,43 @@ class Grasping:
     t_s: Array
 
     @cached_property
-    def nodes(self) -> Index:
-        """(h,) nodes that are grasped at some time."""
-        return held_nodes(self.experiment.grasps)
-
-    @cached_property
     def dofs(self) -> Index:
-        """(3h,) their dofs."""
-        return dofs_of(self.nodes)
+        """(g,) dofs that are grasped at some time."""
+        return held_dofs(self.experiment.grasps)
 
     def at(self, phi: Array) -> Held:
         """The goals at φ."""
         if not self.nuisance.moves_grasps:
             return self._fixed
-        moved, slopes = self.nuisance.carried(self._places_m, phi)
-        rotated = np.zeros((*self._translations.shape, len(self.nuisance.moving)))
-        rotated[..., self._columns] = np.einsum("thij,hjk->thik", self._rotations, slopes)
-        positions = np.einsum("thij,hj->thi", self._rotations, moved) + self._translations
-        rows = len(self.t_s)
-        free = np.isnan(positions)
-        rotated[free] = 0.0
-        return Held(
-            self.dofs,
-            positions.reshape(rows, -1),
-            rotated.reshape(rows, len(self.dofs), -1),
-        )
+        moved, slopes = (each[self._node] for each in self.nuisance.carried(self._places_m, phi))
+        rotated = np.zeros((*self._shifts.shape, len(self.nuisance.moving)))
+        rotated[..., self._columns] = np.einsum("tgj,gjk->tgk", self._turns, slopes)
+        positions = np.einsum("tgj,gj->tg", self._turns, moved) + self._shifts
+        rotated[np.isnan(positions)] = 0.0
+        return Held(self.dofs, positions, rotated)
 
     def curvature(self, phi: Array, weights: Array) -> Array:
         """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
         second = self.nuisance.carried_curvature(self._places_m, phi)
-        by_node = weights.reshape(len(self.t_s), -1, 3)
-        pulled = np.einsum("thij,thi->hj", np.nan_to_num(self._rotations), by_node)
+        pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._turns), weights)
         found = np.zeros((len(self.nuisance.moving),) * 2)
-        found[np.ix_(self._columns, self._columns)] = np.einsum("hj,hjkl->kl", pulled, second)
+        of_dofs = np.einsum("gj,gjkl->kl", pulled, second[self._node])
+        found[np.ix_(self._columns, self._columns)] = of_dofs
         return found
+
+    @cached_property
+    def _nodes(self) -> tuple[Index, Index]:
+        """Nodes that are grasped at some time, and of each dof the place of its node in them."""
+        nodes, places = np.unique(self.dofs // 3, return_inverse=True)
+        return nodes, places
+
+    @property
+    def _node(self) -> Index:
+        return self._nodes[1]
 
     @property
     def _places_m(self) -> Array:
-        return self.experiment.body.nodes_m[self.nodes]
+        return self.experiment.body.nodes_m[self._nodes[0]]
 
     @property
     def _columns(self) -> Index:
@@ -106,22 +104,20 @@ class Grasping:
 
     @cached_property
     def _poses(self) -> tuple[Array, Array]:
-        """Rotations (N, h, 3, 3) and translations (N, h, 3) of every node, NaN while free."""
-        rows, count = len(self.t_s), len(self.nodes)
-        rotations, translations = (np.full((rows, count, *s), np.nan) for s in ((3, 3), (3,)))
+        """Of each dof its row of U_t, (N, g, 3) and (N, g), NaN while free."""
+        turns, shifts = (np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ()))
         for grasp in self.experiment.grasps:
-            here = np.ix_(
-                np.flatnonzero(grasp.holds(self.t_s)), np.searchsorted(self.nodes, grasp.nodes)
-            )
-            turned, moved = grasp.poses.at(self.t_s[here[0].ravel()])
-            rotations[here] = turned[:, None]
-            translations[here] = moved[:, None]
-        return rotations, translations
+            here = np.flatnonzero(grasp.holds(self.t_s))
+            place, axis = np.searchsorted(self.dofs, grasp.dofs), grasp.dofs % 3
+            turned, moved = grasp.poses.at(self.t_s[here])
+            turns[np.ix_(here, place)] = turned[:, axis]
+            shifts[np.ix_(here, place)] = moved[:, axis]
+        return turns, shifts
 
     @property
-    def _rotations(self) -> Array:
+    def _turns(self) -> Array:
         return self._poses[0]
 
     @property
-    def _translations(self) -> Array:
+    def _shifts(self) -> Array:
         return self._poses[1]

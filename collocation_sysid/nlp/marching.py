@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from ..fem.memory import Carried
 from .dynamics import Dynamics
 from .lapack import one_blas_thread
-from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
+from .newton import (
+    NewtonFailure,
+    NewtonOptions,
+    Solver,
+    Solvers,
+    followed,
+    simulation_error,
+)
 from .rest import start_state
 from .row import Row, weighted
 from .stopwatch import Stopwatch
@@ -90,8 +98,11 @@ def march_on(
         carried = memory.ahead(intervals[t - 1]) if memory else None
         row = _Step(dynamics, theta, x, forces, t, carried)
         solver = solvers.holding(held[t])
-        guess = _predicted(x[:t], dynamics.step_s * v0)
         goal = held_positions[t].ravel()[solver.held]
+        if dynamics.static:
+            guess = _carried_on(x[:t], solver.held, goal)
+        else:
+            guess = _predicted(x[:t], dynamics.step_s * v0)
         try:
             x[t] = _solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
@@ -113,6 +124,15 @@ def _predicted(x: Array, first_step: Array) -> Array:
     return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
 
 
+def _carried_on(x: Array, held: Index, goal: Array) -> Array:
+    """The next equilibrium, as far on as what is held goes on from the last two."""
+    if len(x) < 2:
+        return x[-1]
+    before, way = x[-1, held] - x[-2, held], goal - x[-1, held]
+    share = float(before @ way) / max(float(before @ before), np.finfo(float).tiny)
+    return x[-1] + share * (x[-1] - x[-2])
+
+
 class _Step:
     """Row t of the discrete equations as a function of x_t alone."""
 
@@ -125,8 +145,9 @@ class _Step:
         t: int,
         carried: Carried | None = None,
     ) -> None:
-        self.theta, self.row = theta, Row.of(dynamics, t)
+        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t)
         self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
+        self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
         row = self.row
         first, shape = max(0, t - dynamics.reach), x.shape[1:]
         past, past_forces = x[first:t][::-1], forces[first:t][::-1]
@@ -135,6 +156,13 @@ class _Step:
         self.known = weighted(row.w, past_forces, shape)
         self.known -= row.mass_kg * weighted(row.s, past, shape)
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
+
+    def under(self, share: float) -> _Step:
+        """The same when a share of the change of a static load has come."""
+        found = copy(self)
+        if self.forces_before is not None:
+            found.forces = self.forces_before.towards(self.forces, share)
+        return found
 
     def force(self, x: Array) -> Array:
         """F_t."""
@@ -161,23 +189,15 @@ class _Step:
 
 
 def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: Array) -> Array:
-    """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way."""
-    try:
-        start = guess.copy()
-        start[solver.held] = held
-        return solver.newton(start, row.residual, row.linearise)
-    except NewtonFailure:
-        pass
-    x, reached, increment = previous.copy(), 0.0, 1.0
+    """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way.
+
+    So does a static load change then. Static rows keep to the branch that is stable.
+    """
     origin = previous[solver.held]
-    while reached < 1.0:
-        goal = min(1.0, reached + increment)
-        start = x.copy()
-        start[solver.held] = origin + goal * (held - origin)
-        try:
-            x, reached = solver.newton(start, row.residual, row.linearise), goal
-        except NewtonFailure:
-            increment /= 2
-            if increment < 0.5**solver.options.halvings:
-                raise
-    return x
+
+    def solve(near: Array, share: float) -> Array:
+        start, step = near.copy(), row.under(share)
+        start[solver.held] = origin + share * (held - origin)
+        return solver.newton(start, step.residual, step.linearise, row.dynamics.static)
+
+    return followed(solve, previous, solver.options.halvings, guess)

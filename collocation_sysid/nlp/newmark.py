@@ -166,10 +166,11 @@ class _Stepper:
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
             times = np.clip([time_s - h, time_s, time_s + h], first, last)
-            before, now, after = grasp.carry(nodes_m, times)
+            before, now, after = grasp.carry(nodes_m, times)[..., grasp.columns]
             velocity = (after - before) / (times[2] - times[0])
             whole = times[2] - times[1] > 0.5 * h
             acceleration = (after - 2 * now + before) / h**2 if whole else np.zeros_like(now)
-            motion[:, grasp.nodes] = now, velocity, acceleration
+            place = np.ix_(grasp.nodes, grasp.columns)
+            motion[:, *place] = now, velocity, acceleration
         now, velocity, acceleration = motion.reshape(3, -1)[:, solver.held]
         return now, velocity, acceleration

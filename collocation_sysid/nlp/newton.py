@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
-from ..fem.pattern import dofs_of
 from .factorisation import Factor, Factoriser
 from .stopwatch import Stopwatch
 
@@ -65,8 +64,8 @@ class Solver:
         Its body and grasps.
     options : NewtonOptions
     stopwatch : Stopwatch, optional
-    held : (n,) bool, optional
-        Which nodes are held; those at the experiment's first time by default.
+    held : (n, 3) bool, optional
+        Which coordinates are held; those at the experiment's first time by default.
     """
 
     def __init__(
@@ -81,8 +80,7 @@ class Solver:
         self.options = options or NewtonOptions()
         at_start = experiment.grasped(experiment.t_s[:1])[0][0]
         holding = at_start if held is None else held
-        self.free = dofs_of(np.flatnonzero(~holding))
-        self.held = dofs_of(np.flatnonzero(holding))
+        self.free, self.held = np.flatnonzero(~holding), np.flatnonzero(holding)
         self.factoriser = Factoriser.of(experiment.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 
@@ -177,8 +175,39 @@ class Solver:
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
 
 
+def followed(
+    solve: Callable[[Array, float], Array], x: Array, halvings: int, guess: Array | None = None
+) -> Array:
+    """Follow x(s), what `solve(near, s)` finds, from x(0) to x(1) in steps that shrink on failure.
+
+    A guess of x(1) is tried first, and the way there is taken where that fails.
+
+    Raises
+    ------
+    NewtonFailure
+        Where a step that has been halved so often fails.
+    """
+    if guess is not None:
+        try:
+            return solve(guess, 1.0)
+        except NewtonFailure:
+            pass
+    rate, reached, increment = np.zeros_like(x), 0.0, 1.0
+    while reached < 1.0:
+        step = min(increment, 1.0 - reached)
+        try:
+            found = solve(x + step * rate, reached + step)
+        except NewtonFailure:
+            increment = step / 2
+            if increment < 0.5**halvings:
+                raise
+        else:
+            x, rate, reached = found, (found - x) / step, reached + step
+    return x
+
+
 class Solvers:
-    """The solvers of an experiment, one for each set of nodes that is held at some time."""
+    """The solvers of an experiment, one for each set of dofs that is held at some time."""
 
     def __init__(
         self,
@@ -190,7 +219,7 @@ class Solvers:
         self._known: dict[bytes, Solver] = {}
 
     def holding(self, held: NDArray[np.bool_]) -> Solver:
-        """The solver with these nodes (n,) held."""
+        """The solver with these coordinates (n, 3) held."""
         key = held.tobytes()
         if key not in self._known:
             self._known[key] = Solver(*self._arguments, held)

@@ -231,7 +231,7 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
 
     for marker in markers.names:
         add("offset", f"camera offset of {marker}", "m", "x y z", wanted.camera_offset_m)
-    if wanted.time_shift_s:
+    if wanted.time_shift_s and not experiment.static:
         entries.append(("time", "time shift [s]", wanted.time_shift_s))
     add("turn", "turn of the pose", "rad", "x y z", wanted.pose_turn_rad)
     add("shift", "shift of the pose", "m", "x y z", wanted.pose_shift_m)

@@ -11,7 +11,7 @@ from .factorisation import NONE
 from .forces import Forces
 from .lapack import one_blas_thread
 from .memory import start_carried
-from .newton import NewtonFailure, Solver, simulation_error
+from .newton import NewtonFailure, Solver, followed, simulation_error
 
 
 @one_blas_thread()
@@ -56,20 +56,10 @@ def rest_state(
         moved[solver.held] = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
         return solver.newton(moved, residual, linearise, keep_definite=True)
 
-    x = shape.ravel() if start is None else start
-    rate, reached, increment = np.zeros_like(x), 0.0, 1.0
-    while reached < 1.0:
-        step = min(increment, 1.0 - reached)
-        try:
-            found = solve(x + step * rate, reached + step)
-        except NewtonFailure as failure:
-            increment = step / 2
-            if increment < 0.5**solver.options.halvings:
-                raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
-            x = shape.ravel() if reached == 0 else x
-        else:
-            x, rate, reached = found, (found - x) / step, reached + step
-    return x
+    try:
+        return followed(solve, shape.ravel(), solver.options.halvings, start)
+    except NewtonFailure as failure:
+        raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
 
 
 def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
@@ -83,14 +73,16 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
         if not grasp.holds(time_s):
             continue
         start, nodes = carried[grasp.nodes], grasp.nodes
+        place = np.ix_(nodes, grasp.columns)
         goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
         if share == 1:
-            positions[nodes] = goal
+            positions[place] = goal[:, grasp.columns]
             continue
         turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
         part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
         middle, way = start.mean(axis=0), (goal - start).mean(axis=0)
-        positions[nodes] = middle + share * way + part.apply(start - middle)
+        moved = middle + share * way + part.apply(start - middle)
+        positions[place] = moved[:, grasp.columns]
     return positions
 
 

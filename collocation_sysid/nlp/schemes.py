@@ -56,6 +56,8 @@ class Scheme:
 
 
 STATIC = Stencil(p=(1.0,), q=(0.0,), w=(1.0,), s=(0.0,))
+# Every sample is an equilibrium of its own: that of static experiments, whatever the others'.
+QUASI_STATIC = Scheme("quasi-static", 1, STATIC, ())
 
 BACKWARD_EULER = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -2.0, 1.0))
 _FIRST_STEP = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -1.0), r=-1.0)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..fem.body import Body
-from ..fem.pattern import SymmetricPattern, dofs_of
+from ..fem.pattern import SymmetricPattern
 from .block_band import Block, BlockBand, Term
 from .charts import Chart
 from .dynamics import Dynamics
@@ -173,12 +173,12 @@ class Segment:
     @cached_property
     def free_dofs(self) -> Index:
         """Dofs that are free at some time."""
-        return dofs_of(self.experiment.free_nodes)
+        return self.experiment.free_dofs
 
     @cached_property
     def held_dofs(self) -> Index:
         """Dofs that are held throughout."""
-        return dofs_of(self.experiment.held_nodes)
+        return self.experiment.held_dofs
 
     @cached_property
     def row_dofs(self) -> Index:

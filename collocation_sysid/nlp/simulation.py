@@ -46,7 +46,7 @@ def simulate(
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
 ) -> Trajectory:
-    """Simulate an experiment forward from its start.
+    """Simulate an experiment forward from its start; a static one from equilibrium to equilibrium.
 
     Parameters
     ----------
@@ -78,7 +78,10 @@ def simulate(
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
-    if integrator == "newmark":
+    if experiment.static:
+        x = march(experiment, Dynamics.of(experiment, integrator), theta, options, progress)
+        v = np.zeros_like(x)
+    elif integrator == "newmark":
         step = timestep_s or experiment.timestep_s / 4
         count = max(1, round(experiment.timestep_s / step))
         x, v = newmark(experiment, theta, count, options, progress)

@@ -39,7 +39,7 @@ class Replay:
     surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
     surface_parts : (F,) number of the part of the body that each belongs to
     part_names : (P,) str, "" for what no region claims
-    held : (T, n) bool, which nodes are grasped
+    held : (T, n) bool, which nodes are grasped along some axis
     up : (3,) unit vector against gravity; z where there is none
     marker_names : (M,) str
     marker_places_m : (M, 3) where the markers sit on the undeformed body, as found
@@ -93,7 +93,7 @@ class Replay:
             body.mesh.surface,
             body.part_of_cells[body.mesh.surface_cells],
             [part.name for part in body.parts],
-            experiment.grasped(experiment.t_s)[0],
+            experiment.grasped(experiment.t_s)[0].any(axis=2),
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
             given_m if places_m is None else places_m,

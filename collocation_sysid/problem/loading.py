@@ -71,7 +71,8 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """The files of data that a problem names, whether they are there or not."""
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
-        names += [section.markers.file, *(grasp.poses for grasp in section.grasps)]
+        names += [section.markers.file]
+        names += [grasp.poses or grasp.displacement for grasp in section.grasps]
         names += [force.file for force in section.force]
     return tuple(folder / name for name in names if name is not None)
 

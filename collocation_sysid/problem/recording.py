@@ -23,7 +23,8 @@ from ..experiment import (
     PointMass,
     PoseSequence,
     align,
-    held_nodes,
+    held_dofs,
+    read_displacement,
     read_forces,
     read_poses,
 )
@@ -133,6 +134,7 @@ class RecordingReader:
         def build(markers: Markers) -> Experiment:
             return Experiment(
                 name=section.name,
+                kind=section.kind,
                 body=self.body,
                 t_s=t_s,
                 grasps=grasps,
@@ -148,7 +150,7 @@ class RecordingReader:
             )
 
         n = len(self.body.nodes_m)
-        if len(held_nodes(grasps)) == n:
+        if len(held_dofs(grasps)) == 3 * n:
             raise InputError(
                 f"the selected nodes are all {n} there are, so nothing can move; select fewer, and "
                 "check length_unit of the object",
@@ -163,6 +165,10 @@ class RecordingReader:
     def _poses(self, k: int, grasp: GraspSection) -> PoseSequence:
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
+        if grasp.displacement is not None:
+            key = self._grasp_key(k, "displacement")
+            moved = read_displacement(existing_file(self.folder, grasp.displacement, key))
+            return replace(moved, interpolation=grasp.interpolation)
         if grasp.poses is None:
             return PoseSequence.fixed()
         file = existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses"))
@@ -214,7 +220,7 @@ class RecordingReader:
             nodes,
             poses,
             **grasp.model_dump(
-                include={"from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
+                include={"axes", "from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
             ),
             selection=selection(grasp.nodes),
         )
@@ -242,7 +248,7 @@ class RecordingReader:
         """The measured tracks; to simulate without them, zeros at the poses' times."""
         if self._recorded is not None:
             return self._fitted(self._recorded)
-        markers = self.section.markers
+        section, markers = self.section, self.section.markers
         names = tuple(markers.names or markers.reference_m)
         lacking = [name for name in names if name not in markers.reference_m]
         if lacking or not names:
@@ -254,9 +260,10 @@ class RecordingReader:
                 "markers.reference_m",
             )
         times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
-        if len(times) < 3:
+        fewest = 1 if section.kind == "static" else 3
+        if len(times) < fewest:
             raise InputError(
-                "neither markers.file nor poses with at least 3 times are there; "
+                f"neither markers.file nor poses with at least {fewest} times are there; "
                 "expected one of them, to simulate at its times",
                 None,
                 "grasp",
@@ -295,10 +302,16 @@ class RecordingReader:
         ]
         try:
             aligned = align(
-                poses, table, section.window_s, section.resample_hz, section.every, held_s
+                poses,
+                table,
+                section.window_s,
+                section.resample_hz,
+                section.every,
+                held_s,
+                section.kind == "static",
             )
         except InputError as error:
-            files = [*(grasp.poses for grasp in section.grasps), section.markers.file]
+            files = [*(g.poses or g.displacement for g in section.grasps), section.markers.file]
             named = " and ".join(dict.fromkeys(name for name in files if name))
             raise InputError(error.message, None, named) from error
         self._note(*aligned.notes)

@@ -80,14 +80,23 @@ class TransformSection(Section):
 
 
 class GraspSection(Section):
-    """Nodes held by a gripper, and how it moves."""
+    """Nodes held by a gripper or a test bench, and how it moves."""
 
     nodes: Nodes = Field(
         description="Selection: a table of box_m, ball_m or indices, or the name of a point array "
         "or physical group."
     )
+    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = Field(
+        "xyz",
+        description="Axes of the world along which it holds; the nodes slide along the others.",
+    )
     poses: Text | None = Field(
         None, description="Poses, CSV or .npz; held where they are without poses or markers."
+    )
+    displacement: Text | None = Field(
+        None,
+        description="CSV with t_s and any of x_m, y_m, z_m (or _cm, _mm, _in): a motion without "
+        "turns from the undeformed place, as of a test bench's crosshead, in place of poses.",
     )
     quaternion: Literal["xyzw", "wxyz"] | None = Field(
         None, description="Order of a quaternion whose columns in poses do not name it."
@@ -138,8 +147,9 @@ class GraspSection(Section):
 
     @model_validator(mode="after")
     def _one_source_of_poses(self) -> GraspSection:
-        if self.poses is not None and self.markers is not None:
-            raise ValueError("found poses and markers; expected one of them")
+        sources = given_keys(self, "poses", "displacement", "markers")
+        if len(sources) > 1:
+            raise ValueError(f"found {' and '.join(sources)}; expected one of them")
         if self.gripper_to_body is not None and self.markers is not None:
             raise ValueError(
                 "found gripper_to_body and markers; expected no gripper_to_body, since the places "
@@ -389,6 +399,11 @@ class ExperimentSection(Section):
     """One recording."""
 
     name: Annotated[str, AfterValidator(_file_name)]
+    kind: Literal["dynamic", "static"] = Field(
+        "dynamic",
+        description="A motion; or samples each of which is an equilibrium of its own, at any times "
+        "(with memory, quasi-static in time).",
+    )
     grasp: Grasps = Field(
         default_factory=list, description="A table of nodes and poses, or a list of them."
     )
@@ -437,6 +452,25 @@ class ExperimentSection(Section):
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
             )
         return self
+
+    @model_validator(mode="after")
+    def _static(self) -> ExperimentSection:
+        if self.kind == "dynamic":
+            return self
+        moving = [key for key in ("start", "start_rule", "resample_hz") if self._differs(key)]
+        if isinstance(self.nuisance, NuisanceSection) and isinstance(
+            self.nuisance.time_shift, TimePrior
+        ):
+            moving.append("nuisance.time_shift")
+        if moving:
+            raise ValueError(
+                f'found {moving[0]} beside kind = "static"; expected none, since each sample is an '
+                "equilibrium of its own and nothing moves"
+            )
+        return self
+
+    def _differs(self, key: str) -> bool:
+        return getattr(self, key) != type(self).model_fields[key].default
 
 
 def _at_least_three(places: dict[str, Any], key: str) -> None:

@@ -135,15 +135,16 @@ def _add_noise(
     if len(grasp.poses.t_s) < 2:
         return
     rows = np.flatnonzero(grasp.holds(t_s))
-    dofs = np.searchsorted(held.dofs, (3 * grasp.nodes[:, None] + np.arange(3)).ravel())
-    _, translations = grasp.poses.at(t_s[rows])
-    arms = held.positions_m[np.ix_(rows, dofs)].reshape(len(rows), -1, 3) - translations[:, None]
+    dofs = np.searchsorted(held.dofs, grasp.dofs)
+    arms = grasp.poses.at(t_s[rows])[0] @ segment.body.nodes_m[grasp.nodes].T
+    arms = np.moveaxis(arms, 1, 2)
     white = rng.normal(size=(2, len(grasp.poses.t_s), 3 * count))
     shifts, turns = (
         _between(grasp.poses, sigma * values, t_s[rows]).reshape(len(rows), 1, count, 3)
         for sigma, values in zip((noise.sigma_m, noise.sigma_rad), white, strict=True)
     )
     change = shifts + np.cross(turns, arms[:, :, None])  # (rows, nodes, c, 3)
+    change = change[..., grasp.columns]
     moved[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(len(rows), len(dofs), count)
 
 
