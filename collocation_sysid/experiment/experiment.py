@@ -19,6 +19,7 @@ from .grasp import Grasp, held_dofs
 from .loads import Force, PointMass
 from .markers import Markers
 from .nuisance import Nuisance
+from .wrench_files import within
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -299,6 +300,8 @@ class Experiment:
             raise InputError("no marker sample is present; check the marker file and window_s")
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
+            if grasp.wrench is not None:
+                within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp")
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)

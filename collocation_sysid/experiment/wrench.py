@@ -82,7 +82,9 @@ class Wrench:
             expected = ", ".join(get_args(Frame))
             raise InputError(f"frame of a wrench is {self.frame!r}; expected one of {expected}")
         if np.isinf(self.values).any():
-            raise InputError("a wrench holds an infinite value; expected numbers, or NaN if missing")
+            raise InputError(
+                "a wrench holds an infinite value; expected numbers, or NaN if missing"
+            )
         if not self.measured.any():
             raise InputError("a wrench has no sample of any component")
         if self.sigma_nm is None and self.measured[3:].any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError, hint_at
@@ -15,6 +16,8 @@ from .wrench import COMPONENTS
 
 WRENCH_COLUMNS = tuple(f"{c}_{'n' if c.startswith('f') else 'nm'}" for c in COMPONENTS)
 
+# So many samples must lie within an experiment.
+FEWEST = 3
 # What people write, and what it says.
 _OTHER_UNITS = {
     "kg": "kilograms, which are a mass",
@@ -61,6 +64,31 @@ def read_wrench(path: str | Path) -> tuple[Array, Array]:
     if len(t_s) < 2:
         raise InputError(f"{len(t_s)} sample; expected at least 2", path)
     return unrounded_s(t_s), values
+
+
+def within(at_s: Array, t_s: Array, name: str) -> NDArray[np.bool_]:
+    """Return which samples at `at_s` (S,) of a file lie within an experiment's times `t_s` (T,).
+
+    Raises
+    ------
+    InputError
+        If fewer than three do: clocks or units differ.
+    """
+    inside = (at_s >= t_s[0]) & (at_s <= t_s[-1])
+    if inside.sum() >= FEWEST:
+        return inside
+    span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (at_s, t_s)]
+    ratio = np.ptp(at_s) / np.ptp(t_s)
+    thousand = 300 < ratio < 3000
+    hint = (
+        f"{name} seems to be in milliseconds"
+        if thousand
+        else "both need one clock, in seconds; subtract where they began"
+    )
+    raise InputError(
+        f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(inside.sum())} samples "
+        f"are in common; expected {FEWEST} at least. {hint}"
+    )
 
 
 def _blank(values: Array, name: str) -> bool:

@@ -97,13 +97,20 @@ class HeldForces:
         self.force[:done], self.slopes[:done] = known.force, known.slopes
 
 
+def forces_on(dynamics: Dynamics, x: Array, theta: Array, dofs: Index) -> Array:
+    """F (N, g) on some dofs at the evaluations of x (N, 3n), also those that grasps take."""
+    force = np.zeros((len(x), len(dofs)))
+    force[dynamics.first_row :] = dynamics.force(x, theta)[:, dofs]
+    return force
+
+
 def reactions(dynamics: Dynamics, force: Array, x: Array, dofs: Index) -> Array:
     """R (N, g) [N] from the forces F (N, g) on the dofs and the positions x (N, 3n)."""
     return dynamics.inertia(x)[:, dofs] - dynamics.combine(dynamics.tables.w, force)
 
 
 def reaction_slopes(dynamics: Dynamics, slopes: Array, moved: Array, dofs: Index) -> Array:
-    """dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
+    """DR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
     mass = dynamics.mass_kg[:, dofs, None] / dynamics.step_s**2
     inertia = mass * dynamics.combine(dynamics.tables.s, moved)
     return inertia - dynamics.combine(dynamics.tables.w, slopes)

@@ -1,4 +1,4 @@
-"""What the sensor of a grasp reads: the wrench that the grasp gives the body, seen by an instrument.
+"""What the sensor of a grasp reads: the wrench that the grasp gives the body.
 
 On the grid, in the frame of the sensor with axes Q_k and the point o_k,
 
@@ -52,6 +52,55 @@ class Forced:
     reaction_by: Array
     position_by: Array
 
+    @classmethod
+    def still(cls, reaction: Array, position_m: Array) -> Forced:
+        """Reactions that do not change by anything."""
+        nothing = np.zeros((*reaction.shape, 0))
+        return cls(reaction, position_m, nothing, nothing)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Times of the rows that tell reactions.
+
+    Attributes
+    ----------
+    t_s : (N,) evenly spaced
+    rows : (N,) bool, those that tell one
+    late : int
+        Row t tells of the time t − late.
+    reach : int
+        It depends on the grasp from the time t − reach on.
+    """
+
+    t_s: Array
+    rows: NDArray[np.bool_]
+    late: int
+    reach: int
+
+    @classmethod
+    def of(cls, dynamics: Dynamics) -> Grid:
+        """That of discrete equations of motion."""
+        return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.reach)
+
+    @classmethod
+    def at(cls, t_s: Array) -> Grid:
+        """Where the reactions at the very times are known."""
+        return cls(t_s, np.ones(len(t_s), dtype=bool), 0, 0)
+
+    @property
+    def step_s(self) -> float:
+        """Time between rows."""
+        return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
+
+    def told(self, grasp: Grasp) -> Index:
+        """Times, by their numbers, at which the reactions of a grasp are known."""
+        held = grasp.holds(self.t_s)
+        rows = self.rows & held
+        for lag in range(1, self.reach + 1):
+            rows[lag:] &= held[:-lag]
+        return np.flatnonzero(rows) - self.late
+
 
 @dataclass(frozen=True, eq=False)
 class Tool:
@@ -79,7 +128,7 @@ class Sensor:
         Of the sensor among those of the experiment.
     grasp : Grasp
     wrench : Wrench
-    dynamics : Dynamics
+    on : Grid
     nuisance : NuisanceMap
     places : (d,) of the grasp's dofs among those that are sensed
     """
@@ -87,26 +136,21 @@ class Sensor:
     number: int
     grasp: Grasp
     wrench: Wrench
-    dynamics: Dynamics
+    on: Grid
     nuisance: NuisanceMap
     places: Index
 
     # Where and when --------------------------------------------------------------------------
 
     @cached_property
-    def late(self) -> int:
-        """Row t tells of the time t − late."""
-        return centred_rows(self.dynamics)[1]
-
-    @cached_property
     def grid(self) -> Index:
         """(n,) grid times whose wrench is known, one after the other."""
-        rows, late = centred_rows(self.dynamics)
-        held = self.grasp.holds(self.dynamics.t_s)
-        for lag in range(1, self.dynamics.reach + 1):
-            before = np.concatenate([np.ones(lag, dtype=bool), held[:-lag]])
-            rows = rows & before[: len(rows)]
-        return np.flatnonzero(rows & held) - late
+        return self.on.told(self.grasp)
+
+    @property
+    def late(self) -> int:
+        """How late the rows are that tell them."""
+        return self.on.late
 
     def reached(self, rows: int) -> int:
         """How many of them the first grid rows tell."""
@@ -123,15 +167,15 @@ class Sensor:
         count, t_s = self.reached(rows), self.wrench.t_s
         if count < 2:
             return np.zeros(len(t_s), dtype=bool)
-        known = self.dynamics.t_s[self.grid[[0, count - 1]]]
-        rounding = 1e-6 * self.dynamics.step_s
+        known = self.on.t_s[self.grid[[0, count - 1]]]
+        rounding = 1e-6 * self.on.step_s
         early, late = known[0] + self.limit_s - rounding, known[1] - self.limit_s + rounding
         return (t_s >= early) & (t_s <= late)
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
         """(S, 6) components that are compared."""
-        return self.wrench.present & self.covered(self.dynamics.rows)[:, None]
+        return self.wrench.present & self.covered(len(self.on.t_s))[:, None]
 
     @cached_property
     def frames(self) -> tuple[Array, Array]:
@@ -143,7 +187,7 @@ class Sensor:
         return np.tile(np.eye(3), (*shape, 1)), np.tile(self.wrench.point_m, shape)
 
     def _poses(self, rows: Index) -> tuple[Array, Array]:
-        return self.grasp.poses.at(self.dynamics.t_s[rows])
+        return self.grasp.poses.at(self.on.t_s[rows])
 
     # Its φ ------------------------------------------------------------------------------------
 
@@ -182,13 +226,14 @@ class Sensor:
         """What the tool takes; None where there is none."""
         if not len(self.phi_places("tool-mass")):
             return None
-        (mass,), centre = self._value("tool-mass", phi), self._value("tool-centre", phi)
+        (mass,), off = self._value("tool-mass", phi), self._value("tool-centre", phi)
         k = self.grid[:count]
         turns, points = (each[:count] for each in self.frames)
         pose, shift = self._poses(k)
         turn_rate, shift_rate = self._accelerations(count)
         about = self.wrench.frame == "grasp"
-        centre = centre + (self.wrench.point_m if about else self.nuisance.grasp_pivot_m)
+        centre = self.wrench.point_m if about else self.nuisance.grasp_pivot_m
+        centre = centre + off if len(off) else centre
         pull = turn_rate @ centre + shift_rate - gravity_m_s2  # (n, 3)
         arm = pose @ centre + shift - points
         axes, crossed = np.swapaxes(turns, 1, 2), _cross(arm)
@@ -203,14 +248,15 @@ class Sensor:
         return Tool(mass * unit, unit, by_centre, by_gravity)
 
     def _accelerations(self, count: int) -> tuple[Array, Array]:
-        """Second derivatives (n, 3, 3) and (n, 3) of the poses, by the stencil of the rows."""
-        rows = self.grid[:count] + self.late
-        stencils = self.dynamics.tables.s[rows] / self.dynamics.step_s**2
-        turn, shift = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        for lag in np.flatnonzero(stencils.any(axis=0)):
-            pose, place = self._poses(rows - lag)
-            turn += stencils[:, lag, None, None] * pose
-            shift += stencils[:, lag, None] * place
+        """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
+        step_s, poses = self.on.step_s, self.grasp.poses
+        if len(poses.t_s) < 3:
+            return np.zeros((count, 3, 3)), np.zeros((count, 3))
+        around = poses.t_s[0] + step_s, poses.t_s[-1] - step_s
+        middle = np.clip(self.on.t_s[self.grid[:count]], *around)
+        before, now, after = (poses.at(middle + way * step_s) for way in (-1, 0, 1))
+        pairs = zip(before, now, after, strict=True)
+        turn, shift = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
         return turn, shift
 
     # At the samples ---------------------------------------------------------------------------
@@ -221,18 +267,17 @@ class Sensor:
         The last is of shape (0, 0) where no lag is estimated.
         """
         shift = self._value("sensor-time", phi)
-        covered = self.covered(self.grid[count - 1] + self.late + 1) if count else np.zeros(0)
-        at_s = self.wrench.t_s[covered] + (shift[0] if len(shift) else 0.0)
-        begin_s, step_s = self.dynamics.t_s[self.grid[0]], self.dynamics.step_s
-        value, slope = _interpolation((at_s - begin_s) / step_s, count)
-        shape, rows = (len(covered), count), np.flatnonzero(covered)
-        spread = sp.csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), (shape[0], len(rows)))
-        value, slope = spread @ value, spread @ slope / step_s
+        covered = self.covered(int(self.grid[count - 1]) + self.late + 1)
+        at_s = self.wrench.t_s + (float(shift[0]) if len(shift) else 0.0)
+        begin_s, step_s = self.on.t_s[self.grid[0]], self.on.step_s
+        value, slope = _interpolation((at_s - begin_s) / step_s, count, covered)
+        slope = slope / step_s
         lag = self._value("sensor-lag", phi)
         if not len(lag):
             return value, slope, np.zeros((0, 0))
         smoothing, by_lag = low_pass(float(lag[0]), step_s, count)
-        return sp.csr_array(value @ smoothing), sp.csr_array(slope @ smoothing), value @ by_lag
+        smooth = (sp.csr_array(np.asarray(each @ smoothing)) for each in (value, slope))
+        return next(smooth), next(smooth), np.asarray(value @ by_lag)
 
     def read(
         self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
@@ -258,7 +303,8 @@ class Sensor:
             slope[..., first:] += tool.by_gravity @ gravity[1]
             (mass,), centre = self.phi_places("tool-mass"), self.phi_places("tool-centre")
             slope[..., first + mass] += scales[mass] * tool.by_mass
-            slope[..., first + centre] += scales[centre] * tool.by_centre
+            if len(centre):
+                slope[..., first + centre] += scales[centre] * tool.by_centre
         if len(value) < 2:
             return np.zeros((len(self.wrench.t_s), 6)), np.zeros((len(self.wrench.t_s), 6, size))
         return self._sampled(value, slope, phi, first)
@@ -278,6 +324,13 @@ class Sensor:
         of_read[:, components, first + tare] += scales[tare]
         return read, of_read
 
+    def readings(self, forced: Forced, phi: Array, gravity_m_s2: Array) -> Array:
+        """ŷ (S, 6), NaN where it is not known."""
+        still = gravity_m_s2, np.zeros((3, len(phi)))
+        nothing = np.zeros(0, dtype=np.int64)
+        read, _ = self.read(forced, nothing, phi, still, len(phi))
+        return np.where(self.covered(len(forced.reaction))[:, None], read, np.nan)
+
     # Residuals --------------------------------------------------------------------------------
 
     def linearised(
@@ -292,15 +345,13 @@ class Sensor:
         return residual.reshape(-1, 2, 3), slope.reshape(len(slope), 2, 3, size)
 
 
-def sensors_of(
-    experiment: Experiment, dynamics: Dynamics, nuisance: NuisanceMap
-) -> tuple[Sensor, ...]:
+def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tuple[Sensor, ...]:
     """The sensors of an experiment's grasps."""
     dofs, found = sensed_dofs(experiment), []
     for grasp in experiment.grasps:
         if grasp.wrench is not None:
             places = np.searchsorted(dofs, dofs_of(grasp.nodes))
-            found.append(Sensor(len(found), grasp, grasp.wrench, dynamics, nuisance, places))
+            found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places))
     return tuple(found)
 
 
@@ -324,8 +375,10 @@ def _by_component(blocks: Array) -> Array:
     return blocks.transpose(0, 2, 1, 3).reshape(count, 6, 3 * nodes)
 
 
-def _interpolation(at: Array, count: int) -> tuple[sp.csr_array, sp.csr_array]:
-    """Weights (S, count) of grid times 0, 1, … at places between them, and their slopes."""
+def _interpolation(
+    at: Array, count: int, covered: NDArray[np.bool_]
+) -> tuple[sp.csr_array, sp.csr_array]:
+    """Weights (S, count) of grid times 0, 1, … at covered places between them, and slopes."""
     used = min(NEIGHBOURS, count)
     first = np.clip(np.floor(at).astype(int) - (used // 2 - 1), 0, count - used)
     place = at - first
@@ -338,11 +391,11 @@ def _interpolation(at: Array, count: int) -> tuple[sp.csr_array, sp.csr_array]:
             slopes[:, i] += np.delete(factors, m, axis=0).prod(axis=0) / (i - j)
     rows = np.repeat(np.arange(len(at)), used)
     columns = (first[:, None] + np.arange(used)).ravel()
-    shape = (len(at), count)
-    return (
-        sp.csr_array((values.ravel(), (rows, columns)), shape=shape),
-        sp.csr_array((slopes.ravel(), (rows, columns)), shape=shape),
-    )
+    both = [
+        sp.csr_array(((weights * covered[:, None]).ravel(), (rows, columns)), (len(at), count))
+        for weights in (values, slopes)
+    ]
+    return both[0], both[1]
 
 
 def low_pass(lag_s: float, step_s: float, count: int) -> tuple[Array, Array]:
