@@ -80,6 +80,15 @@ class Sensing:
             for sensor in self.segment.sensors
         ]
 
+    def response(self, forced: Forced) -> list[Array]:
+        """Changes (S, 2, 3, c) of the residuals of each sensor by the c changes of `forced`."""
+        count = forced.reaction_by.shape[2]
+        columns, size = np.arange(count), count + len(self.phi)
+        return [
+            sensor.linearised(forced, columns, self.phi, self.gravity, size)[1][..., :count]
+            for sensor in self.segment.sensors
+        ]
+
     def projected(self, x: Array, held: HeldForces, moved: Array) -> list[tuple[Array, Array]]:
         """The same after a feasibility step, which is the first of the columns, to first order."""
         forced = self.along(x, held, moved)

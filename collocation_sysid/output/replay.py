@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -48,6 +49,9 @@ class Replay:
     positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
     rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
     natural_hz : (k,) natural frequencies with the answer, ascending
+    wrenches : sequence of (S, 19)
+        Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
+        out, NaN where there are none.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Replay:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
+    wrenches: Sequence[Array] = ()
 
     @classmethod
     def of(
@@ -77,6 +82,7 @@ class Replay:
         rolled_out: tuple[Array, Array] | None = None,
         natural_hz: Array | None = None,
         places_m: Array | None = None,
+        wrenches: Sequence[Array] = (),
     ) -> Replay:
         """Gather an experiment with (positions, markers) as fitted, and as rolled out.
 
@@ -102,6 +108,7 @@ class Replay:
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
             natural_hz,
+            wrenches,
         )
 
     @property
@@ -125,7 +132,7 @@ class Replay:
             "held": self.held,
             "up": self.up,
             "natural_hz": self.natural_hz,
-        }
+        } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
         shared: dict[str, Any] = {
             "undeformed_m": self.undeformed_m,
             "tetrahedra": self.tetrahedra.astype(np.int32),
@@ -156,6 +163,8 @@ class Replay:
         found: dict[str, Any] = {key: arrays[key] for key in SHARED}
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
+        keys = (f"{prefix}wrench_{k}" for k in count(1))
+        found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
         parts = [str(part) for part in arrays["part_names"]]
         return cls(name=name, marker_names=names, part_names=parts, **found)
