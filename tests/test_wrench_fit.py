@@ -70,7 +70,7 @@ def test_error_bars_are_those_of_the_slopes():
     collocation = Collocation([swung()], GUESS)
     solution = ReducedSpace()(collocation)
     markers, sensor = linearised_fit(collocation, solution.z).blocks
-    assert sensor.of_sensor and not markers.of_sensor
+    assert (sensor.of_sensor, markers.of_sensor) == (True, False)
     assert sensor.measurements == int(collocation.segments[0].sensors[0].present.sum())
     rows = [b.slope.reshape(-1, 4)[b.seen.ravel()] for b in (markers, sensor)]
     of_both = np.linalg.inv(sum(r.T @ r for r in rows))
@@ -106,7 +106,6 @@ def test_tare_clock_lag_and_tool_are_found():
     true[["mass of the tool" in name for name in names]] = 0.012
     true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
     phi = true / scales
-    plain = blind(swung(0, wanted, 60))
     made = simulate(swung(0, wanted, 60), TRUTH, "midpoint")
     grid, forced = made.reactions
     (sensor,) = segment.sensors
@@ -119,14 +118,13 @@ def test_tare_clock_lag_and_tool_are_found():
     # Priors around zero pull a little.
     np.testing.assert_allclose(found, true, atol=0.1 * scales.max(), rtol=0.1)
     np.testing.assert_allclose(relative_errors(solution), 0, atol=0.01)
-    del plain
 
 
 def test_a_run_tells_of_the_wrench(tmp_path: Path):
     experiment = swung(1, Nuisance.none(tare=10.0, sensor_time_s=0.002))
-    problem = Problem([experiment], UNKNOWN)
+    problem = Problem([experiment], UNKNOWN, rollout=cs.RolloutOptions(integrator="scheme"))
     run = cs.run(problem, method="reduced-space", seek_causes=False)
-    assert run.trust.verdict == "good"
+    assert run.trust.verdict == "good", run.trust.reasons
     folder = run.save(tmp_path / "run", frames=False)
     result = json.loads((folder / "result.json").read_text())
     assert result["fit"]["wrench_rms_n"] == pytest.approx(SIGMA_N, rel=0.3)
@@ -141,6 +139,7 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
 
     said = plain_text(summary(run, folder))
     assert "wrench of 'hung cube'" in said
-    assert "tare up to" in said and "sensor late by" in said
+    assert "tare up to" in said
+    assert "sensor late by" in said
     assert "Wrench of a grasp" in run_page(folder)
     assert any(file.name.startswith("wrench") for file in redraw(folder, tmp_path / "again"))
