@@ -74,7 +74,6 @@ BAD = {
     "short row": (lines(rows=[*ROWS[:3], "0.03,0"]), ["line 5", "2 cells"]),
     "blank column": (lines(rows=[f"{k},,0,0,0,0,0" for k in range(4)]), ["fx_n is blank"]),
     "empty": ("", ["is empty"]),
-    "one sample": (lines(rows=ROWS[:1]), ["1 sample"]),
     "semicolons": (lines().replace(",", ";"), ["semicolons"]),
 }
 

@@ -301,7 +301,7 @@ class Experiment:
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
             if grasp.wrench is not None:
-                within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp")
+                within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)

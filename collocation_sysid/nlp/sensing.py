@@ -138,7 +138,7 @@ class Sensing:
             pull = of_residual.reshape(-1, 6) * sensor.present / sensor.wrench.sigmas
             by_force, by_place = sensor.arms(forced)
             k = sensor.grid[: len(by_force)]
-            if len(k) < 2:
+            if not len(k):
                 continue
             on_grid = sensor.kernels(self.phi, len(k))[0].T @ pull
             rows = np.ix_(k + sensor.late, sensor.places), np.ix_(k, sensor.places)

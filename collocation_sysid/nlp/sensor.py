@@ -24,6 +24,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
+from ..experiment.clock import TIME_TOLERANCE_S
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp
 from ..experiment.wrench import Wrench
@@ -71,17 +72,20 @@ class Grid:
         Row t tells of the time t − late.
     reach : int
         It depends on the grasp from the time t − reach on.
+    static : bool
+        Equilibria, at times that need not be evenly spaced; between them the wrench is linear.
     """
 
     t_s: Array
     rows: NDArray[np.bool_]
     late: int
     reach: int
+    static: bool = False
 
     @classmethod
     def of(cls, dynamics: Dynamics) -> Grid:
         """That of discrete equations of motion."""
-        return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.reach)
+        return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.reach, dynamics.static)
 
     @classmethod
     def at(cls, t_s: Array) -> Grid:
@@ -90,8 +94,8 @@ class Grid:
 
     @property
     def step_s(self) -> float:
-        """Time between rows."""
-        return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
+        """Time between rows, on the average."""
+        return float(self.t_s[-1] - self.t_s[0]) / max(1, len(self.t_s) - 1)
 
     def told(self, grasp: Grasp) -> Index:
         """Times, by their numbers, at which the reactions of a grasp are known."""
@@ -130,7 +134,8 @@ class Sensor:
     wrench : Wrench
     on : Grid
     nuisance : NuisanceMap
-    places : (d,) of the grasp's dofs among those that are sensed
+    places : (d,) of the dofs of the grasp's nodes among those that are sensed
+    held : (d,) one along the axes that it holds, else zero
     """
 
     number: int
@@ -139,6 +144,7 @@ class Sensor:
     on: Grid
     nuisance: NuisanceMap
     places: Index
+    held: Array
 
     # Where and when --------------------------------------------------------------------------
 
@@ -165,10 +171,10 @@ class Sensor:
     def covered(self, rows: int) -> NDArray[np.bool_]:
         """(S,) samples that the first grid rows suffice to read, however the clock is shifted."""
         count, t_s = self.reached(rows), self.wrench.t_s
-        if count < 2:
+        if not count:
             return np.zeros(len(t_s), dtype=bool)
         known = self.on.t_s[self.grid[[0, count - 1]]]
-        rounding = 1e-6 * self.on.step_s
+        rounding = 1e-6 * self.on.step_s + TIME_TOLERANCE_S
         early, late = known[0] + self.limit_s - rounding, known[1] - self.limit_s + rounding
         return (t_s >= early) & (t_s <= late)
 
@@ -207,11 +213,12 @@ class Sensor:
         k = self.grid[:count]
         turns, points = (each[:count] for each in self.frames)
         arm = forced.position_m[k][:, self.places].reshape(count, -1, 3) - points[:, None]
-        force = forced.reaction[k + self.late][:, self.places].reshape(count, -1, 3)
+        own = forced.reaction[k + self.late][:, self.places] * self.held
+        force = own.reshape(count, -1, 3)
         axes = np.swapaxes(turns, 1, 2)[:, None]
         of_force = np.concatenate([np.broadcast_to(axes, (*arm.shape, 3)), axes @ _cross(arm)], 2)
         of_place = np.concatenate([np.zeros((*arm.shape, 3)), -axes @ _cross(force)], 2)
-        return _by_component(of_force), _by_component(of_place)
+        return _by_component(of_force) * self.held, _by_component(of_place)
 
     def on_grid(self, forced: Forced) -> tuple[Array, Array]:
         """W (n, 6) without the tool, and its changes (n, 6, c)."""
@@ -250,7 +257,7 @@ class Sensor:
     def _accelerations(self, count: int) -> tuple[Array, Array]:
         """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
         step_s, poses = self.on.step_s, self.grasp.poses
-        if len(poses.t_s) < 3:
+        if len(poses.t_s) < 3 or self.on.static:
             return np.zeros((count, 3, 3)), np.zeros((count, 3))
         around = poses.t_s[0] + step_s, poses.t_s[-1] - step_s
         middle = np.clip(self.on.t_s[self.grid[:count]], *around)
@@ -269,13 +276,12 @@ class Sensor:
         shift = self._value("sensor-time", phi)
         covered = self.covered(int(self.grid[count - 1]) + self.late + 1)
         at_s = self.wrench.t_s + (float(shift[0]) if len(shift) else 0.0)
-        begin_s, step_s = self.on.t_s[self.grid[0]], self.on.step_s
-        value, slope = _interpolation((at_s - begin_s) / step_s, count, covered)
-        slope = slope / step_s
+        used = 2 if self.on.static else NEIGHBOURS
+        value, slope = _interpolation(at_s, self.on.t_s[self.grid[:count]], used, covered)
         lag = self._value("sensor-lag", phi)
         if not len(lag):
             return value, slope, np.zeros((0, 0))
-        smoothing, by_lag = low_pass(float(lag[0]), step_s, count)
+        smoothing, by_lag = low_pass(float(lag[0]), self.on.step_s, count)
         smooth = (sp.csr_array(np.asarray(each @ smoothing)) for each in (value, slope))
         return next(smooth), next(smooth), np.asarray(value @ by_lag)
 
@@ -305,7 +311,7 @@ class Sensor:
             slope[..., first + mass] += scales[mass] * tool.by_mass
             if len(centre):
                 slope[..., first + centre] += scales[centre] * tool.by_centre
-        if len(value) < 2:
+        if not len(value):
             return np.zeros((len(self.wrench.t_s), 6)), np.zeros((len(self.wrench.t_s), 6, size))
         return self._sampled(value, slope, phi, first)
 
@@ -350,8 +356,9 @@ def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tup
     dofs, found = sensed_dofs(experiment), []
     for grasp in experiment.grasps:
         if grasp.wrench is not None:
-            places = np.searchsorted(dofs, dofs_of(grasp.nodes))
-            found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places))
+            own = dofs_of(grasp.nodes)
+            held, places = np.isin(own, grasp.dofs) * 1.0, np.searchsorted(dofs, own)
+            found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places, held))
     return tuple(found)
 
 
@@ -376,23 +383,25 @@ def _by_component(blocks: Array) -> Array:
 
 
 def _interpolation(
-    at: Array, count: int, covered: NDArray[np.bool_]
+    at_s: Array, t_s: Array, most: int, covered: NDArray[np.bool_]
 ) -> tuple[sp.csr_array, sp.csr_array]:
-    """Weights (S, count) of grid times 0, 1, … at covered places between them, and slopes."""
-    used = min(NEIGHBOURS, count)
-    first = np.clip(np.floor(at).astype(int) - (used // 2 - 1), 0, count - used)
-    place = at - first
-    values, slopes = np.zeros((2, len(at), used))
+    """Lagrange's weights (S, n) of values at `t_s` (n,) for those at covered times, and slopes."""
+    count, used = len(t_s), min(most, len(t_s))
+    first = np.searchsorted(t_s, at_s, side="right") - 1 - (used - 1) // 2
+    around = np.clip(first, 0, count - used)[:, None] + np.arange(used)
+    values, slopes = np.zeros((2, len(at_s), used))
     for i in range(used):
-        others = [j for j in range(used) if j != i]
-        factors = np.array([(place - j) / (i - j) for j in others])
-        values[:, i] = factors.prod(axis=0)
-        for m, j in enumerate(others):
-            slopes[:, i] += np.delete(factors, m, axis=0).prod(axis=0) / (i - j)
-    rows = np.repeat(np.arange(len(at)), used)
-    columns = (first[:, None] + np.arange(used)).ravel()
+        others = np.delete(around, i, axis=1)
+        spans = t_s[around[:, [i]]] - t_s[others]
+        factors = (at_s[:, None] - t_s[others]) / spans
+        values[:, i] = factors.prod(axis=1)
+        for m in range(used - 1):
+            slopes[:, i] += np.delete(factors, m, axis=1).prod(axis=1) / spans[:, m]
+    rows = np.repeat(np.arange(len(at_s)), used)
     both = [
-        sp.csr_array(((weights * covered[:, None]).ravel(), (rows, columns)), (len(at), count))
+        sp.csr_array(
+            ((weights * covered[:, None]).ravel(), (rows, around.ravel())), (len(at_s), count)
+        )
         for weights in (values, slopes)
     ]
     return both[0], both[1]

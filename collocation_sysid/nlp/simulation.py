@@ -89,20 +89,19 @@ def simulate(
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
-    if experiment.static:
-        x = march(experiment, Dynamics.of(experiment, integrator), theta, options, progress)
-        v = np.zeros_like(x)
-    elif integrator == "newmark":
+    if integrator == "newmark" and not experiment.static:
         step = timestep_s or experiment.timestep_s / 4
         count = max(1, round(experiment.timestep_s / step))
         x, v, forced = newmark(experiment, theta, count, options, progress, sensed)
         rows = (len(x) - 1) * count + 1
         at = Grid.at(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:
-        dynamics = Dynamics.of(experiment, integrator, substeps)
+        taken = 1 if experiment.static else substeps
+        dynamics = Dynamics.of(experiment, integrator, taken)
         grid = march(experiment, dynamics, theta, options, progress)
-        x = grid[::substeps]
-        v = np.gradient(grid, dynamics.step_s, axis=0)[::substeps]
+        x = grid[::taken]
+        still = np.zeros_like(grid)
+        v = still if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::taken]
         at, force = Grid.of(dynamics), forces_on(dynamics, grid, theta, sensed)
         forced = Forced.still(reactions(dynamics, force, grid, sensed), grid[:, sensed])
     shape = (len(x), -1, 3)

@@ -243,7 +243,7 @@ class RecordingReader:
                 given["sigma_nm"] = section.sigma_nm or 1.0
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **given)
             at_s, values = read_wrench(existing_file(self.folder, section.file, f"{key}.file"))
-            inside = within(at_s, t_s, section.file)
+            inside = within(at_s, t_s, section.file, self.section.kind == "static")
             self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
             return Wrench(at_s[inside], values[inside], **given)
         except InputError as error:
