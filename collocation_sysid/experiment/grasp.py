@@ -16,6 +16,7 @@ from ..fem.selection import Selection
 from .arrays import on_body, some_nodes
 from .clock import TIME_TOLERANCE_S
 from .poses import PoseSequence
+from .wrench import Wrench
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -38,6 +39,8 @@ class Grasp:
         rough the poses are where they are not given.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
+    wrench : Wrench, optional
+        What it was measured to give the body.
     """
 
     nodes: Index
@@ -47,6 +50,7 @@ class Grasp:
     sigma_m: float | None
     sigma_rad: float | None
     selection: Selection | None
+    wrench: Wrench | None
 
     def __init__(
         self,
@@ -57,6 +61,7 @@ class Grasp:
         sigma_m: float | None = None,
         sigma_rad: float | None = None,
         selection: Selection | None = None,
+        wrench: Wrench | None = None,
     ) -> None:
         if not from_s <= until_s:
             raise InputError(
@@ -74,6 +79,7 @@ class Grasp:
             sigma_m=sigma_m,
             sigma_rad=sigma_rad,
             selection=held if isinstance(held, Selection) else selection,
+            wrench=wrench,
         )
 
     def on(self, body: Body, t_s: Array) -> Grasp:
