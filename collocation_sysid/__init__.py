@@ -18,6 +18,7 @@ from .experiment import (
     Placement,
     PointMass,
     PoseSequence,
+    Wrench,
     place_markers,
 )
 from .fem.body import Body
@@ -86,6 +87,7 @@ __all__ = [
     "Trajectory",
     "UncertaintyOptions",
     "Unknown",
+    "Wrench",
     "place_markers",
     "refine",
     "run",

@@ -12,7 +12,9 @@ from .pose_files import read_displacement, read_poses
 from .poses import PoseSequence
 from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
-from .writers import write_markers_csv, write_poses_csv
+from .wrench import Wrench
+from .wrench_files import read_wrench
+from .writers import write_markers_csv, write_poses_csv, write_wrench_csv
 
 __all__ = [
     "Aligned",
@@ -27,6 +29,7 @@ __all__ = [
     "PoseSequence",
     "RigidFit",
     "TemplateFit",
+    "Wrench",
     "align",
     "align_to_template",
     "fit_poses",
@@ -37,7 +40,9 @@ __all__ = [
     "read_forces",
     "read_markers",
     "read_poses",
+    "read_wrench",
     "sample_interval_s",
     "write_markers_csv",
     "write_poses_csv",
+    "write_wrench_csv",
 ]

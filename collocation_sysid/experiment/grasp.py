@@ -17,6 +17,7 @@ from ..fem.selection import Selection
 from .arrays import on_body, some_nodes
 from .clock import TIME_TOLERANCE_S
 from .poses import PoseSequence
+from .wrench import Wrench
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -45,6 +46,8 @@ class Grasp:
     axes : str
         Along which axes of the world they are held, such as "z" for a platen on which the body
         slides; "xyz" by default.
+    wrench : Wrench, optional
+        What it was measured to give the body.
     """
 
     nodes: Index
@@ -55,6 +58,7 @@ class Grasp:
     sigma_rad: float | None
     selection: Selection | None
     axes: str
+    wrench: Wrench | None
 
     def __init__(
         self,
@@ -66,6 +70,7 @@ class Grasp:
         sigma_rad: float | None = None,
         selection: Selection | None = None,
         axes: str = "xyz",
+        wrench: Wrench | None = None,
     ) -> None:
         if not from_s <= until_s:
             raise InputError(
@@ -86,6 +91,7 @@ class Grasp:
             sigma_rad=sigma_rad,
             selection=held if isinstance(held, Selection) else selection,
             axes=axes,
+            wrench=wrench,
         )
 
     def on(self, body: Body, t_s: Array) -> Grasp:

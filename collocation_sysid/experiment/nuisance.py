@@ -36,6 +36,16 @@ class Nuisance:
         the markers, such as that of cameras. It turns the body against gravity.
     camera_offset_m : float or None
         A constant vector by which the cameras see each marker off.
+    tare : float or None
+        Offset of each component of a measured wrench, constant in time, in its sigmas.
+    sensor_time_s : float or None
+        How much later than their times say the wrenches were measured, on the clock of the grasps;
+        three deviations at most.
+    sensor_lag_s : float or None
+        Time constant of a first-order low-pass in the sensor; from zero to three deviations.
+    tool_kg, tool_m : float or None
+        Mass of what is between a sensor and the body, and each coordinate of its centre about the
+        sensor's point (in the world's frame, about the middle of the grasped nodes).
     """
 
     marker_offset_m: float | None = 1e-3
@@ -46,6 +56,11 @@ class Nuisance:
     pose_shift_m: float | None = None
     pose_turn_rad: float | None = None
     camera_offset_m: float | None = None
+    tare: float | None = 10.0
+    sensor_time_s: float | None = 5e-3
+    sensor_lag_s: float | None = None
+    tool_kg: float | None = None
+    tool_m: float = 0.05
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -56,5 +71,5 @@ class Nuisance:
     @classmethod
     def none(cls, **deviations: float | None) -> Nuisance:
         """Nothing is estimated but what is named."""
-        nothing: dict[str, float | None] = {field.name: None for field in fields(cls)}
+        nothing = {field.name: None for field in fields(cls) if field.name != "tool_m"}
         return cls(**(nothing | deviations))

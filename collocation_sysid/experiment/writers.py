@@ -1,4 +1,4 @@
-"""Pose and marker files as this project writes them: CSV in metres and seconds."""
+"""Pose, marker and wrench files as this project writes them: CSV in metres and seconds."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ..arrays import Array
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
 from .readers import MarkerTable
+from .wrench_files import WRENCH_COLUMNS
 
 _DIGITS = "%.12g"
 
@@ -33,6 +34,17 @@ def write_markers_csv(
     header = ["t_s", *(f"{name}_{axis}" for name in table.names for axis in "xyz")]
     tracks = table.positions_m.reshape(len(table.t_s), -1)
     _write_csv(path, header, np.column_stack([table.t_s, tracks]))
+
+
+def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> None:
+    """Write wrenches (S, 3) or (S, 6) as `read_wrench` reads them, blank for NaN.
+
+    Components that are never there are left out.
+    """
+    rows = np.asarray(values, dtype=float)
+    there = np.flatnonzero(np.isfinite(rows).any(axis=0))
+    header = ["t_s", *(WRENCH_COLUMNS[k] for k in there)]
+    _write_csv(path, header, np.column_stack([np.asarray(t_s), rows[:, there]]))
 
 
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..errors import SimulationError
-from ..nlp.collocation import Collocation
+from ..nlp.collocation import Collocation, Part
 from ..nlp.factorisation import Choice
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
@@ -132,13 +132,15 @@ class Horizon:
                 segment.moving,
                 nq,
             )
-            slope = np.zeros((residual.size, len(p)))
-            slope[:, segment.places] = here.reshape(residual.size, -1)
-            residual = residual.ravel()
-            if collocation.huber is not None:
-                residual, slope = huberised(residual, slope, collocation.huber)
-            residuals.append(residual)
-            slopes.append(slope)
+            sensed = _sensed(part, tangent) if segment.sensors else []
+            for values, by in ((residual, here), *sensed):
+                residuals.append(values.ravel())
+                slopes.append(np.zeros((values.size, len(p))))
+                slopes[-1][:, segment.places] = by.reshape(values.size, -1)
+        if collocation.huber is not None:
+            pairs = zip(residuals, slopes, strict=True)
+            reweighted = [huberised(r, s, collocation.huber) for r, s in pairs]
+            residuals, slopes = map(list, zip(*reweighted, strict=True))
         if self.prior is not None:
             residuals.append((p[:nq] - collocation.parameters.guess_q) / self.prior)
             slopes.append(np.eye(nq, len(p)) / self.prior)
@@ -157,3 +159,10 @@ class Horizon:
     ) -> tuple[list[Array], SimulationError | None]:
         """Trajectories at p as far as they go, continuing those given; and why they stopped."""
         return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch)
+
+
+def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:
+    """Residuals of the sensors after the feasibility step, and their slopes by (q, φ)."""
+    dofs = part.segment.sensed_dofs
+    moved = np.concatenate([tangent.step[:, dofs, None], tangent.by_p[:, dofs]], axis=2)
+    return part.sensing.projected(part.x, tangent.held, moved)

@@ -25,7 +25,10 @@ def constraint_multipliers(
     found = []
     for part in collocation.parts(z):
         segment = part.segment
-        gradient = collocation.loss_scale * segment.observation.gradient(part.x, part.phi)[0]
+        gradient = segment.observation.gradient(part.x, part.phi)[0]
+        if segment.sensors:
+            gradient = gradient + part.sensing.gradient(part.x)[0]
+        gradient *= collocation.loss_scale
         solver = BlockSolver(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(part.x, part.setting, gradient)
         found.append(segment.of_rows(y))

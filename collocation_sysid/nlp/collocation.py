@@ -40,6 +40,7 @@ from .charts import Chart
 from .parameters import Parameters
 from .schemes import Scheme
 from .segment import First, Segment
+from .sensing import Sensing
 from .setting import Setting
 
 
@@ -82,10 +83,15 @@ class Part:
         """The physical parameters."""
         return self.segment.setting(self.q, self.phi)
 
+    @cached_property
+    def sensing(self) -> Sensing:
+        """Its sensors."""
+        return Sensing(self.segment, self.setting, self.phi)
+
     @property
     def loss(self) -> float:
-        """Of the markers, without priors."""
-        return self.segment.observation.loss(self.x, self.phi)
+        """Of markers and wrenches, without priors."""
+        return self.segment.observation.loss(self.x, self.phi) + self.sensing.loss(self.x)
 
     @property
     def residual_n(self) -> Array:
@@ -176,7 +182,10 @@ class Collocation:
     @property
     def measurements(self) -> int:
         """Scalar measurements that are present."""
-        return sum(segment.observation.count for segment in self.segments)
+        return sum(
+            segment.observation.count + sum(int(s.present.sum()) for s in segment.sensors)
+            for segment in self.segments
+        )
 
     @property
     def loss_scale(self) -> float:
@@ -303,6 +312,10 @@ class Collocation:
             of_x, of_phi = part.segment.observation.gradient(part.x, part.phi)
             by_x.append(of_x.ravel() * part.segment.length_m)
             by_p[part.segment.places[self.nq :]] += of_phi
+            if part.segment.sensors:
+                through_x, of_p = part.sensing.gradient(part.x)
+                by_x[-1] += through_x.ravel() * part.segment.length_m
+                by_p[part.segment.places] += of_p
         return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :]])
 
     # Constraints ------------------------------------------------------------------------------

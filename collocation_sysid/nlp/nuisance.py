@@ -12,6 +12,10 @@ shift of the pose      d (3) [m]
 tilt of gravity        two angles about axes across it [rad]
 turn in the grasp      a_h (3), likewise, about axes of the undeformed body
 shift in the grasp     d_h (3) [m]
+tare of a sensor       of each component that it measures [N] or [N m], see `sensor`
+its clock              τ, how much later than its times say it measured [s]
+its lag                T of a first-order low-pass [s]
+its tool               mass [kg], and centre (3) about the sensor's point [m]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
@@ -34,11 +38,14 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import held_nodes
+from ..experiment.wrench import COMPONENTS, UNITS
 
 # Samples are read between neighbours, up to this many away from the chart's.
 LARGEST_SHIFT_SAMPLES = 2.0
 # A time shift may be this share of the recording.
 LARGEST_SHIFT_SHARE = 0.25
+# The clock and the lag of a sensor may be this many deviations of their priors.
+SENSOR_DEVIATIONS = 3.0
 # A place may move this many edges of the mesh in a step.
 EDGES_A_STEP = 2.0
 KINDS = (
@@ -51,6 +58,8 @@ KINDS = (
     "grasp-turn",
     "grasp-shift",
 )
+# Those of a sensor have its number behind them: "tare 0".
+OF_SENSOR = ("tare", "sensor-time", "sensor-lag", "tool-mass", "tool-centre")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +69,7 @@ class NuisanceMap:
     Attributes
     ----------
     names : (k,) with units, such as "swing: place of tip, x [m]"
-    kinds : (k,) of `KINDS`
+    kinds : (k,) of `KINDS`, or of `OF_SENSOR` with the sensor's number
     scales : (k,) prior standard deviations, in the names' units
     reach : (k,) φ that a step may move at a time: what enters linearly needs no trust region
     interval_s : float, between samples
@@ -88,8 +97,8 @@ class NuisanceMap:
         scales = np.array(scales, dtype=float)
         body = experiment.body
         edge_m = float(body.mesh.quality().edge_mean_m)
-        linear = np.isin(kinds, ("offset", "shift"))
-        reach = np.where(linear, 1e3, 1.0)
+        linear = np.array([k in ("offset", "shift") or k.startswith("tare") for k in kinds])
+        reach = np.where(linear, 1e3, 1.0).astype(float)
         of_place = np.array([kind == "place" for kind in kinds], dtype=bool)
         reach[of_place] = np.minimum(1e3, EDGES_A_STEP * edge_m / scales[of_place])
         held = held_nodes(experiment.grasps)
@@ -133,7 +142,15 @@ class NuisanceMap:
             furthest = max(around, LARGEST_SHIFT_SHARE * self.duration_s)
             low[k] = max(about - around, -furthest) / unit
             high[k] = min(about + around, furthest) / unit
+        for k, kind in enumerate(self.kinds):
+            if kind.startswith(("sensor-time", "sensor-lag", "tool-mass")):
+                low[k] = -SENSOR_DEVIATIONS if kind.startswith("sensor-time") else 0.0
+                high[k] = np.inf if kind.startswith("tool-mass") else SENSOR_DEVIATIONS
         return low, high
+
+    def of_sensor(self, kind: str, number: int) -> NDArray[np.int64]:
+        """Positions in φ of what is not known of a sensor."""
+        return self.places(f"{kind} {number}")
 
     @cached_property
     def of_grasps(self) -> NDArray[np.int64]:
@@ -240,6 +257,28 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
     if experiment.grasps and experiment.start == "equilibrium":
         add("grasp-turn", "turn in the grasp", "rad", "x y z", wanted.hand_eye_rad)
         add("grasp-shift", "shift in the grasp", "m", "x y z", wanted.hand_eye_m)
+    return entries + _sensor_entries(experiment)
+
+
+def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
+    """The same of the sensors of the grasps."""
+    wanted, entries = experiment.nuisance, []
+    wrenches = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    for number, wrench in enumerate(wrenches):
+        which = "" if len(wrenches) == 1 else f" {number + 1}"
+
+        def add(kind: str, what: str, unit: str, deviation: float | None, number: int = number):
+            if deviation:
+                entries.append((f"{kind} {number}", f"{what} [{unit}]", deviation))
+
+        for k in np.flatnonzero(wrench.measured) if wanted.tare else ():
+            what = f"tare{which} of {COMPONENTS[k]}"
+            add("tare", what, UNITS[k], wanted.tare * float(wrench.sigmas[k]))
+        add("sensor-time", f"time shift of the sensor{which}", "s", wanted.sensor_time_s)
+        add("sensor-lag", f"lag of the sensor{which}", "s", wanted.sensor_lag_s)
+        add("tool-mass", f"mass of the tool{which}", "kg", wanted.tool_kg)
+        for axis in "xyz" if wanted.tool_kg else "":
+            add("tool-centre", f"centre of the tool{which}, {axis}", "m", wanted.tool_m)
     return entries
 
 

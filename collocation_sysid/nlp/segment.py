@@ -29,6 +29,7 @@ from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
 from .row import Row
 from .schemes import Scheme
+from .sensor import Sensor, sensed_dofs, sensors_of
 from .setting import Setting
 from .unsymmetric import adding_skew, skew_values
 
@@ -110,6 +111,16 @@ class Segment:
             self.huber,
             from_rest=not self.dynamics.start_velocity_m_s.any(),
         )
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """Of the grasps whose wrench is measured."""
+        return sensors_of(self.experiment, self.dynamics, self.nuisance)
+
+    @cached_property
+    def sensed_dofs(self) -> Index:
+        """Dofs of the nodes of these grasps."""
+        return sensed_dofs(self.experiment)
 
     def with_chart(self, chart: Chart) -> Segment:
         """The same, read elsewhere."""
@@ -470,15 +481,21 @@ class Segment:
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
         """Derivatives of multipliers · c through the memory, by scaled x (N, 3n) and by q."""
+        by_x, by_q = self.pulled_through_memory(x, setting, self._force_weights(multipliers))
+        return self.length_m * by_x, by_q
+
+    def pulled_through_memory(
+        self, x: Array, setting: Setting, weights: Array
+    ) -> tuple[Array, Array]:
+        """Slopes of Σ weights · F through the memory, by x and by q, at weights (N, 3n)."""
         dynamics = setting.dynamics
         history = dynamics.history(x, setting.theta)
         if history is None:
             return np.zeros_like(x), np.zeros(self.nq)
-        weights = self._force_weights(multipliers)
         by_xi, by_q = history.pulled(weights, setting.theta_q)
         by_x = dynamics.combine_transposed(dynamics.tables.p, by_xi)
         by_x[: dynamics.first_row] += by_xi[: dynamics.first_row]
-        return self.length_m * by_x, by_q
+        return by_x, by_q
 
     @cached_property
     def linearisation_rows(self) -> Array:

@@ -29,6 +29,7 @@ from ..fem.body import Linearisation
 from .factorisation import NONE, Choice, Factor, Factoriser, Room
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
+from .reaction import HeldForces, HeldRows
 from .row import Row, weighted
 from .segment import Segment
 from .setting import Setting
@@ -55,6 +56,8 @@ class Tangent:
         Timesteps whose block −∂c_t/∂x_t is not positive definite.
     memory : Memory
         To continue with later rows.
+    held : HeldForces
+        Of the dofs of grasps whose wrench is measured, by the step and by p.
     """
 
     step: Array
@@ -62,6 +65,7 @@ class Tangent:
     violation_n: float
     indefinite: int
     memory: Memory
+    held: HeldForces
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +143,8 @@ class BlockSolver:
         self._held_source = source[beside][order]
         self._held_signs = signs_by_column(self.pattern)[beside][order]
         self._held = self._held.astype(float)
+        self.sensed = segment.sensed_dofs
+        self.sensed_rows = HeldRows(self.pattern, self.sensed)
         counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
         indptr = np.concatenate([[0], np.cumsum(counts)])
         self._matrix = sp.csr_array(
@@ -170,11 +176,14 @@ class BlockSolver:
         inertia = self.dynamics.inertia(x)
         given = GivenMotion.of(self, setting, x)
         memory = known.memory if known else None
-        march = _Forward(self, setting, (len(self.free), count), memory)
+        held = HeldForces.nothing(len(x), len(self.sensed), count)
+        if known is not None:
+            held.begin(known.held)
+        march = _Forward(self, setting, (len(self.free), count), memory, held)
         march.remember(history, theta_q, done)
         for step in self._steps(x, setting, first=done, history=history):
             indefinite += not step.factor.positive_definite
-            right, force = np.zeros(march.shape), np.zeros(march.shape)
+            right, force = np.zeros(march.shape), np.zeros((x.shape[1], count))
             residual = march.residual(step, inertia[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
@@ -183,10 +192,13 @@ class BlockSolver:
                 columns[step.t, self.free] = march.advance(step, right, force, given)
         if given is not None:
             columns[done:, given.held_dofs] = given.of_held[done:]
-        return Tangent(columns[:, :, 0], columns[:, :, 1:], violation, indefinite, march.memory)
+        step_m, by_p = columns[:, :, 0], columns[:, :, 1:]
+        return Tangent(step_m, by_p, violation, indefinite, march.memory, held)
 
-    def sensitivities(self, x: Array, setting: Setting) -> Iterator[Array]:
-        """Z_t (3n, m), row by row; nothing but the last few rows is kept.
+    def sensitivities(
+        self, x: Array, setting: Setting, held: HeldForces | None = None
+    ) -> Iterator[Array]:
+        """Z_t (3n, m), row by row; nothing but the last few rows is kept, and `held` filled.
 
         Raises
         ------
@@ -194,7 +206,7 @@ class BlockSolver:
             Where a timestep's equations are singular or not finite.
         """
         shape = (x.shape[1], len(self.segment.moving))
-        march = _Forward(self, setting, (len(self.free), shape[1]))
+        march = _Forward(self, setting, (len(self.free), shape[1]), held=held)
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
         march.remember(history, setting.columns(shape[1], first=0))
         yield from np.zeros((self.dynamics.first_row, *shape))
@@ -205,8 +217,12 @@ class BlockSolver:
                 row[given.held_dofs] = given.of_held[step.t]
             yield row
 
-    def response(self, x: Array, setting: Setting, moved: Array) -> Iterator[Array]:
+    def response(
+        self, x: Array, setting: Setting, moved: Array, held: HeldForces | None = None
+    ) -> Iterator[Array]:
         """How every row of x, (3n, c), follows grasped dofs that move by `moved` (N, g, c).
+
+        `held` is filled on the way.
 
         Raises
         ------
@@ -215,13 +231,13 @@ class BlockSolver:
         """
         count = moved.shape[2]
         given = GivenMotion.along(self, setting.held.dofs, moved)
-        march = _Forward(self, setting, (len(self.free), count))
+        march = _Forward(self, setting, (len(self.free), count), held=held)
         history = self.dynamics.history(x, setting.theta)
         march.remember(history, np.zeros((len(setting.theta), count)))
         yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
         for step in self._steps(x, setting, history=history):
-            row, nothing = np.zeros((x.shape[1], count)), np.zeros((2, *march.shape))
-            row[self.free] = march.advance(step, nothing[0], nothing[1], given)
+            row, right = np.zeros((x.shape[1], count)), np.zeros(march.shape)
+            row[self.free] = march.advance(step, right, np.zeros_like(row), given)
             row[given.held_dofs] = given.of_held[step.t]
             yield row
 
@@ -465,8 +481,10 @@ class _Forward:
         setting: Setting,
         shape: tuple[int, int],
         memory: Memory | None = None,
+        held: HeldForces | None = None,
     ) -> None:
         self.solver = solver
+        self.held = held if len(solver.sensed) else None
         self.setting = setting
         self.shape = shape
         reach = solver.dynamics.reach
@@ -509,40 +527,61 @@ class _Forward:
         return solver.without_taken(step.t, total)
 
     def force_slopes(self, step: _Step) -> Array:
-        """∂F/∂p on the free dofs."""
+        """∂F/∂p (3n, m)."""
         weighed = self.setting.dynamics.forces.mass_kg[step.t]
-        return self.setting.force_slopes(step.by_theta, weighed)[self.solver.free]
+        return self.setting.force_slopes(step.by_theta, weighed)
 
     def advance(
         self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None
     ) -> Array:
-        """Y_t from R_t and F_R, each (free, columns), and from how grasped dofs move."""
+        """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
         row = Row.of(solver.dynamics, t)
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)
-        force += self._of_past(step, row)
         if self.slopes is not None:
-            force += self.slopes.force()[solver.free]
+            force = force + self.slopes.force()
+        forced = force[solver.free] + self._of_past(step, row)
         if given is not None:
-            force += given.force(solver, step)
+            forced += given.force(solver, step)
         solver.without_taken(t, right)
-        solver.without_taken(t, force)
-        solution = step.factor.solve(right + w[0] * force)
+        solver.without_taken(t, forced)
+        solution = step.factor.solve(right + w[0] * forced)
         if self.weighs_past:
             self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
         if given is not None:
             given.place_taken(t, solution)
         if self.slopes is not None:
-            of_state = np.zeros((solver.pattern.size, self.shape[1]))
-            of_past = weighted(row.p, self.past, self.shape) if row.p[1:].any() else 0.0
-            of_state[solver.free] = row.p[0] * solution + of_past
-            if given is not None:
-                of_state[given.held_dofs] = given.of_evaluations[0][t, given.places < 0]
-            self.slopes.advance(of_state)
+            self.slopes.advance(self._evaluated(row.p, solution, t, given, 0))
+        if self.held is not None:
+            state, rate = (
+                self._evaluated(weights, solution, t, given, order)
+                for order, weights in enumerate((row.p, row.q))
+            )
+            self._sense(self.held, step, force, state, rate)
         self.past.appendleft(solution)
         return solution
+
+    def _sense(
+        self, held: HeldForces, step: _Step, force: Array, state: Array, rate: Array
+    ) -> None:
+        """Note F_t and dF_t of the dofs whose grasp has a sensor."""
+        t, rows, dofs = step.t, self.solver.sensed_rows, self.solver.sensed
+        held.force[t] = step.force[dofs]
+        held.slopes[t] = force[dofs] + rows.of(step.by_position, step.skew) @ state
+        held.slopes[t] += rows.of(step.by_velocity, NONE) @ rate
+
+    def _evaluated(
+        self, weights: Array, solution: Array, t: int, given: GivenMotion | None, order: int
+    ) -> Array:
+        """Σ_i weights[i] Y_{t−i} (3n, columns) of all dofs: how ξ, or ν, of row t changes."""
+        found = np.zeros((self.solver.pattern.size, self.shape[1]))
+        of_past = weighted(weights, self.past, self.shape) if weights[1:].any() else 0.0
+        found[self.solver.free] = weights[0] * solution + of_past
+        if given is not None:
+            found[given.held_dofs] = given.of_evaluations[order][t, given.places < 0]
+        return found
 
     def _of_past(self, step: _Step, row: Row) -> Array:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""

@@ -1,0 +1,109 @@
+"""What the grasps give a body: what the equations of motion lack on the dofs that are held.
+
+On the dofs g of grasps whose wrench is measured,
+
+    R_t = M a_t − Σ_j w_j F_{t−j} = −c_{t,g},
+
+with the stencils of the rows, see `nlp.schemes`. Its changes along the equations of motion come
+from the same blocks as the others', rows g of G = ∂F/∂ξ and C = ∂F/∂ν:
+
+    dF_k = G Σ_i p_i Y_{k−i} + C Σ_i q_i Y_{k−i} + ∂F/∂p + what the memory brings.
+
+A row belongs to the time in the middle of its stencil: of the midpoint rule row t is the balance
+of momentum about t − 1. Rows of the start know the acceleration to first order only, and are left
+out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from ..arrays import Array, Index
+from ..fem.pattern import SymmetricPattern
+from .dynamics import Dynamics
+from .unsymmetric import signs_by_column
+
+
+def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
+    """Rows (N,) whose acceleration is that of the middle of their stencil, and how late they are.
+
+    Of a static problem all its rows, at their own times.
+    """
+    t, lags = dynamics.tables, np.arange(dynamics.reach + 1.0)
+    second = np.column_stack([t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r])
+    whole = np.isclose(t.w.sum(axis=1), 1.0)
+    moving = whole & np.isclose(second, 0.0).all(axis=1)
+    rows = moving if moving.any() else whole & ~t.s.any(axis=1)
+    evaluated = t.p @ lags
+    last = int(np.flatnonzero(rows)[-1]) if rows.any() else 0
+    late = sum(t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1]))
+    return rows, round(float(late))
+
+
+class HeldRows:
+    """Rows of the slopes of the forces on some dofs.
+
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+    dofs : (g,) ascending
+    """
+
+    def __init__(self, pattern: SymmetricPattern, dofs: Index) -> None:
+        rows, columns, source = pattern.full
+        place = np.full(pattern.size, -1)
+        place[dofs] = np.arange(len(dofs))
+        kept = np.flatnonzero(place[rows] >= 0)
+        numbers = np.arange(1.0, len(kept) + 1)
+        shape = (len(dofs), pattern.size)
+        self._matrix = sp.csr_array((numbers, (place[rows[kept]], columns[kept])), shape=shape)
+        # Its data are their own numbers, in the order that compressing them gave.
+        kept = kept[self._matrix.data.astype(np.int64) - 1]
+        self._source, self._signs = source[kept], signs_by_column(pattern)[kept]
+
+    def of(self, lower: Array, skew: Array) -> sp.csr_array:
+        """(g, 3n) from the lower triangles of a matrix's two parts; valid until the next call."""
+        self._matrix.data = lower[self._source]
+        if skew.size:
+            self._matrix.data += self._signs * skew[self._source]
+        return self._matrix
+
+
+@dataclass(frozen=True, eq=False)
+class HeldForces:
+    """F on the dofs g at every evaluation, and how it changes.
+
+    Attributes
+    ----------
+    force : (rows, g)
+    slopes : (rows, g, columns)
+    """
+
+    force: Array
+    slopes: Array
+
+    @classmethod
+    def nothing(cls, rows: int, dofs: int, columns: int) -> HeldForces:
+        """Room for them."""
+        return cls(np.zeros((rows, dofs)), np.zeros((rows, dofs, columns)))
+
+    def begin(self, known: HeldForces) -> None:
+        """Take over the first rows."""
+        done = len(known.force)
+        self.force[:done], self.slopes[:done] = known.force, known.slopes
+
+
+def reactions(dynamics: Dynamics, force: Array, x: Array, dofs: Index) -> Array:
+    """R (N, g) [N] from the forces F (N, g) on the dofs and the positions x (N, 3n)."""
+    return dynamics.inertia(x)[:, dofs] - dynamics.combine(dynamics.tables.w, force)
+
+
+def reaction_slopes(dynamics: Dynamics, slopes: Array, moved: Array, dofs: Index) -> Array:
+    """dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
+    mass = dynamics.mass_kg[:, dofs, None] / dynamics.step_s**2
+    inertia = mass * dynamics.combine(dynamics.tables.s, moved)
+    return inertia - dynamics.combine(dynamics.tables.w, slopes)

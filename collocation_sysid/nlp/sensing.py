@@ -1,0 +1,167 @@
+"""The part of the loss that measured wrenches have, at positions x of one experiment.
+
+L_w = Σ ρ(‖(ŷ − w) / σ‖) over the forces, and the torques, of all samples of all sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..arrays import Array, Index
+from .reaction import HeldForces, HeldRows, reaction_slopes, reactions
+from .sensor import Forced, Sensor
+
+if TYPE_CHECKING:
+    from .segment import Segment
+    from .setting import Setting
+
+
+@dataclass(frozen=True, eq=False)
+class Sensing:
+    """The sensors of a segment at a point.
+
+    Attributes
+    ----------
+    segment : Segment
+    setting : Setting
+    phi : (k,)
+    """
+
+    segment: Segment
+    setting: Setting
+    phi: Array
+
+    @property
+    def size(self) -> int:
+        """Length of (q, φ)."""
+        return self.segment.nq + len(self.phi)
+
+    @property
+    def gravity(self) -> tuple[Array, Array]:
+        """Gravity (3,) and its slopes (3, k) by φ."""
+        nuisance = self.segment.nuisance
+        if not any(kind.startswith("tool") for kind in nuisance.kinds):
+            return nuisance.gravity_m_s2, np.zeros((3, len(self.phi)))
+        return nuisance.gravity(self.phi)[:2]
+
+    # What acts on the sensed dofs -------------------------------------------------------------
+
+    def at(self, x: Array) -> Forced:
+        """The reactions at positions x (N, 3n)."""
+        dynamics, dofs = self.setting.dynamics, self.segment.sensed_dofs
+        force = np.zeros((len(x), len(dofs)))
+        force[dynamics.first_row :] = dynamics.force(x, self.setting.theta)[:, dofs]
+        nothing = np.zeros((len(x), len(dofs), 0))
+        reaction = reactions(dynamics, force, x, dofs)
+        return Forced(reaction, x[:, dofs], nothing, nothing)
+
+    def along(self, x: Array, held: HeldForces, moved: Array) -> Forced:
+        """The same of the first rows x, from their forces, and how they change.
+
+        Parameters
+        ----------
+        moved : (rows, g, c) how the dofs move
+        """
+        dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
+        reaction = reactions(dynamics, held.force, x, dofs)
+        by = reaction_slopes(dynamics, held.slopes, moved, dofs)
+        return Forced(reaction, x[:, dofs], by, moved)
+
+    # Residuals --------------------------------------------------------------------------------
+
+    def linearised(self, forced: Forced, columns: Index) -> list[tuple[Array, Array]]:
+        """Residuals (S, 2, 3) of each sensor, and slopes (S, 2, 3, size) by (q, φ)."""
+        return [
+            sensor.linearised(forced, columns, self.phi, self.gravity, self.size)
+            for sensor in self.segment.sensors
+        ]
+
+    def projected(self, x: Array, held: HeldForces, moved: Array) -> list[tuple[Array, Array]]:
+        """The same after a feasibility step, which is the first of the columns, to first order."""
+        forced = self.along(x, held, moved)
+        after = Forced(
+            forced.reaction + forced.reaction_by[..., 0],
+            forced.position_m + forced.position_by[..., 0],
+            forced.reaction_by[..., 1:],
+            forced.position_by[..., 1:],
+        )
+        return self.linearised(after, self.segment.moving)
+
+    def readings(self, x: Array) -> list[Array]:
+        """What each sensor should read (S, 6), NaN where that is not known."""
+        return [read for _, read, _ in self._read(self.at(x))]
+
+    def _read(self, forced: Forced) -> Iterator[tuple[Sensor, Array, Array]]:
+        nothing = np.zeros(0, dtype=np.int64)
+        for sensor in self.segment.sensors:
+            read, slope = sensor.read(forced, nothing, self.phi, self.gravity, self.size)
+            known = sensor.covered(len(forced.reaction))[:, None]
+            yield sensor, np.where(known, read, np.nan), slope
+
+    # Loss -------------------------------------------------------------------------------------
+
+    def loss(self, x: Array) -> float:
+        """L_w."""
+        if not self.segment.sensors:
+            return 0.0
+        nothing = np.zeros(0, dtype=np.int64)
+        found = self.linearised(self.at(x), nothing)
+        return float(sum(self._rho(residual)[0].sum() for residual, _ in found))
+
+    def _rho(self, residual: Array) -> tuple[Array, Array]:
+        """ρ (S, 2) of residuals (S, 2, 3), and its slopes by them."""
+        huber, square = self.segment.huber, np.sum(residual**2, axis=2)
+        if huber is None:
+            return square, 2 * residual
+        length = np.sqrt(np.maximum(square, huber**2))
+        rho = np.where(square > huber**2, 2 * huber * length - huber**2, square)
+        return rho, 2 * residual * (huber / length)[..., None]
+
+    def gradient(self, x: Array) -> tuple[Array, Array]:
+        """∂L_w/∂x (N, 3n) and ∂L_w/∂(q, φ) (nq + k,)."""
+        forced, by_p = self.at(x), np.zeros(self.size)
+        of_reaction, of_place = np.zeros((2, *forced.reaction.shape))
+        for sensor, _, slope in self._read(forced):
+            residual, _ = sensor.linearised(
+                forced, np.zeros(0, dtype=np.int64), self.phi, self.gravity, self.size
+            )
+            weight = sensor.present / sensor.wrench.sigmas
+            pull = self._rho(residual)[1].reshape(-1, 6) * weight
+            by_p += np.einsum("sa,sap->p", pull, slope)
+            by_force, by_place = sensor.arms(forced)
+            k = sensor.grid[: len(by_force)]
+            on_grid = sensor.kernels(self.phi, len(k))[0].T @ pull
+            rows = np.ix_(k + sensor.late, sensor.places), np.ix_(k, sensor.places)
+            of_reaction[rows[0]] += np.einsum("ka,kag->kg", on_grid, by_force)
+            of_place[rows[1]] += np.einsum("ka,kag->kg", on_grid, by_place)
+        by_x, through = self.pulled(x, of_reaction)
+        by_x[:, self.segment.sensed_dofs] += of_place
+        by_p[self.segment.moving] += through
+        return by_x, by_p
+
+    def pulled(self, x: Array, weights: Array) -> tuple[Array, Array]:
+        """Slopes of Σ weights · R by x (N, 3n) and by what moves the body, at weights (N, g)."""
+        setting, segment, dofs = self.setting, self.segment, self.segment.sensed_dofs
+        dynamics, t = setting.dynamics, setting.dynamics.tables
+        first, whole = dynamics.first_row, np.zeros_like(x)
+        whole[:, dofs] = -dynamics.combine_transposed(t.w, weights)
+        at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
+        slopes = setting.force_slopes(at.by_theta, dynamics.evaluated.mass_kg)
+        by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
+        rows, state, rate = HeldRows(dynamics.pattern, dofs), *np.zeros((2, *x.shape))
+        for k, weight in enumerate(whole[first:, dofs]):
+            if weight.any():
+                skew = at.by_position_skew[k]
+                state[first + k] = rows.of(at.by_position[k], skew).T @ weight
+                rate[first + k] = rows.of(at.by_velocity[k], skew[:0]).T @ weight
+        by_x = dynamics.combine_transposed(t.p, state)
+        by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
+        inertia = dynamics.combine_transposed(t.s, dynamics.mass_kg[:, dofs] * weights)
+        by_x[:, dofs] += inertia / dynamics.step_s**2
+        of_memory, of_q = segment.pulled_through_memory(x, setting, whole)
+        by_p[: segment.nq] += of_q
+        return by_x + of_memory, by_p

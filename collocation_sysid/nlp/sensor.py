@@ -1,0 +1,374 @@
+"""What the sensor of a grasp reads: the wrench that the grasp gives the body, seen by an instrument.
+
+On the grid, in the frame of the sensor with axes Q_k and the point o_k,
+
+    W_k = (Q_kᵀ Σ_g R_g, Q_kᵀ Σ_g (x_g − o_k) × R_g) + what the tool takes,
+
+R being the reactions of `nlp.reaction` and x_g the grasped nodes. A tool of the mass m between
+sensor and body, with its centre at c in the frame of the grasp, takes m (a_c − g) at its centre.
+A sample at s reads
+
+    ŷ(s) = Σ_k ℓ_k(s + τ) (L W)_k + tare,
+
+ℓ the cubic weights of the four grid times around it and L a first-order low-pass. Each sample is
+compared at its own time, however many there are in a step, so that no average hides a motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from ..arrays import Array, Index
+from ..experiment.experiment import Experiment
+from ..experiment.grasp import Grasp
+from ..experiment.wrench import Wrench
+from ..fem.pattern import dofs_of
+from .dynamics import Dynamics
+from .nuisance import SENSOR_DEVIATIONS, NuisanceMap
+from .reaction import centred_rows
+
+# Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
+NEIGHBOURS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Forced:
+    """The reactions on the sensed dofs of the first grid rows, and how they change.
+
+    Attributes
+    ----------
+    reaction : (N, g) R of each row [N]
+    position_m : (N, g) where the dofs are
+    reaction_by, position_by : (N, g, c) their changes
+    """
+
+    reaction: Array
+    position_m: Array
+    reaction_by: Array
+    position_by: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Tool:
+    """What a tool takes on the grid, (n, 6), and its slopes.
+
+    Attributes
+    ----------
+    value, by_mass : (n, 6)
+    by_centre, by_gravity : (n, 6, 3)
+    """
+
+    value: Array
+    by_mass: Array
+    by_centre: Array
+    by_gravity: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """The sensor of one grasp on the grid of its experiment.
+
+    Attributes
+    ----------
+    number : int
+        Of the sensor among those of the experiment.
+    grasp : Grasp
+    wrench : Wrench
+    dynamics : Dynamics
+    nuisance : NuisanceMap
+    places : (d,) of the grasp's dofs among those that are sensed
+    """
+
+    number: int
+    grasp: Grasp
+    wrench: Wrench
+    dynamics: Dynamics
+    nuisance: NuisanceMap
+    places: Index
+
+    # Where and when --------------------------------------------------------------------------
+
+    @cached_property
+    def late(self) -> int:
+        """Row t tells of the time t − late."""
+        return centred_rows(self.dynamics)[1]
+
+    @cached_property
+    def grid(self) -> Index:
+        """(n,) grid times whose wrench is known, one after the other."""
+        rows, late = centred_rows(self.dynamics)
+        held = self.grasp.holds(self.dynamics.t_s)
+        for lag in range(1, self.dynamics.reach + 1):
+            before = np.concatenate([np.ones(lag, dtype=bool), held[:-lag]])
+            rows = rows & before[: len(rows)]
+        return np.flatnonzero(rows & held) - late
+
+    def reached(self, rows: int) -> int:
+        """How many of them the first grid rows tell."""
+        return int(np.count_nonzero(self.grid + self.late < rows))
+
+    @cached_property
+    def limit_s(self) -> float:
+        """Largest shift of the clock."""
+        here = self.phi_places("sensor-time")
+        return float(SENSOR_DEVIATIONS * self.nuisance.scales[here].sum())
+
+    def covered(self, rows: int) -> NDArray[np.bool_]:
+        """(S,) samples that the first grid rows suffice to read, however the clock is shifted."""
+        count, t_s = self.reached(rows), self.wrench.t_s
+        if count < 2:
+            return np.zeros(len(t_s), dtype=bool)
+        known = self.dynamics.t_s[self.grid[[0, count - 1]]]
+        rounding = 1e-6 * self.dynamics.step_s
+        early, late = known[0] + self.limit_s - rounding, known[1] - self.limit_s + rounding
+        return (t_s >= early) & (t_s <= late)
+
+    @cached_property
+    def present(self) -> NDArray[np.bool_]:
+        """(S, 6) components that are compared."""
+        return self.wrench.present & self.covered(self.dynamics.rows)[:, None]
+
+    @cached_property
+    def frames(self) -> tuple[Array, Array]:
+        """Q (n, 3, 3) and o (n, 3)."""
+        turns, shifts = self._poses(self.grid)
+        if self.wrench.frame == "grasp":
+            return turns, shifts + turns @ self.wrench.point_m
+        shape = (len(self.grid), 1)
+        return np.tile(np.eye(3), (*shape, 1)), np.tile(self.wrench.point_m, shape)
+
+    def _poses(self, rows: Index) -> tuple[Array, Array]:
+        return self.grasp.poses.at(self.dynamics.t_s[rows])
+
+    # Its φ ------------------------------------------------------------------------------------
+
+    def phi_places(self, kind: str) -> Index:
+        """Positions in φ of what is not known of this sensor."""
+        return self.nuisance.of_sensor(kind, self.number)
+
+    def _value(self, kind: str, phi: Array) -> Array:
+        here = self.phi_places(kind)
+        return phi[here] * self.nuisance.scales[here]
+
+    # On the grid ------------------------------------------------------------------------------
+
+    def arms(self, forced: Forced) -> tuple[Array, Array]:
+        """A and B (n, 6, d) of dW = A dR + B dx, W = A R."""
+        count = self.reached(len(forced.reaction))
+        k = self.grid[:count]
+        turns, points = (each[:count] for each in self.frames)
+        arm = forced.position_m[k][:, self.places].reshape(count, -1, 3) - points[:, None]
+        force = forced.reaction[k + self.late][:, self.places].reshape(count, -1, 3)
+        axes = np.swapaxes(turns, 1, 2)[:, None]
+        of_force = np.concatenate([np.broadcast_to(axes, (*arm.shape, 3)), axes @ _cross(arm)], 2)
+        of_place = np.concatenate([np.zeros((*arm.shape, 3)), -axes @ _cross(force)], 2)
+        return _by_component(of_force), _by_component(of_place)
+
+    def on_grid(self, forced: Forced) -> tuple[Array, Array]:
+        """W (n, 6) without the tool, and its changes (n, 6, c)."""
+        of_force, of_place = self.arms(forced)
+        k = self.grid[: len(of_force)]
+        reaction = forced.reaction[k + self.late][:, self.places]
+        by_reaction = forced.reaction_by[k + self.late][:, self.places]
+        value = np.einsum("kag,kg->ka", of_force, reaction)
+        return value, of_force @ by_reaction + of_place @ forced.position_by[k][:, self.places]
+
+    def tool(self, gravity_m_s2: Array, phi: Array, count: int) -> Tool | None:
+        """What the tool takes; None where there is none."""
+        if not len(self.phi_places("tool-mass")):
+            return None
+        (mass,), centre = self._value("tool-mass", phi), self._value("tool-centre", phi)
+        k = self.grid[:count]
+        turns, points = (each[:count] for each in self.frames)
+        pose, shift = self._poses(k)
+        turn_rate, shift_rate = self._accelerations(count)
+        about = self.wrench.frame == "grasp"
+        centre = centre + (self.wrench.point_m if about else self.nuisance.grasp_pivot_m)
+        pull = turn_rate @ centre + shift_rate - gravity_m_s2  # (n, 3)
+        arm = pose @ centre + shift - points
+        axes, crossed = np.swapaxes(turns, 1, 2), _cross(arm)
+
+        def both(force: Array) -> Array:
+            return np.concatenate([axes @ force, axes @ crossed @ force], axis=1)
+
+        unit = both(pull[:, :, None])[:, :, 0]
+        by_centre = mass * both(turn_rate)
+        by_centre[:, 3:] -= mass * axes @ _cross(pull) @ pose
+        by_gravity = -mass * both(np.broadcast_to(np.eye(3), crossed.shape))
+        return Tool(mass * unit, unit, by_centre, by_gravity)
+
+    def _accelerations(self, count: int) -> tuple[Array, Array]:
+        """Second derivatives (n, 3, 3) and (n, 3) of the poses, by the stencil of the rows."""
+        rows = self.grid[:count] + self.late
+        stencils = self.dynamics.tables.s[rows] / self.dynamics.step_s**2
+        turn, shift = np.zeros((count, 3, 3)), np.zeros((count, 3))
+        for lag in np.flatnonzero(stencils.any(axis=0)):
+            pose, place = self._poses(rows - lag)
+            turn += stencils[:, lag, None, None] * pose
+            shift += stencils[:, lag, None] * place
+        return turn, shift
+
+    # At the samples ---------------------------------------------------------------------------
+
+    def kernels(self, phi: Array, count: int) -> tuple[sp.csr_array, sp.csr_array, Array]:
+        """From the grid to the samples (S, n): ℓ L, its slope by the shift, and that by the lag.
+
+        The last is of shape (0, 0) where no lag is estimated.
+        """
+        shift = self._value("sensor-time", phi)
+        covered = self.covered(self.grid[count - 1] + self.late + 1) if count else np.zeros(0)
+        at_s = self.wrench.t_s[covered] + (shift[0] if len(shift) else 0.0)
+        begin_s, step_s = self.dynamics.t_s[self.grid[0]], self.dynamics.step_s
+        value, slope = _interpolation((at_s - begin_s) / step_s, count)
+        shape, rows = (len(covered), count), np.flatnonzero(covered)
+        spread = sp.csr_array(
+            (np.ones(len(rows)), (rows, np.arange(len(rows)))), (shape[0], len(rows))
+        )
+        value, slope = spread @ value, spread @ slope / step_s
+        lag = self._value("sensor-lag", phi)
+        if not len(lag):
+            return value, slope, np.zeros((0, 0))
+        smoothing, by_lag = low_pass(float(lag[0]), step_s, count)
+        return sp.csr_array(value @ smoothing), sp.csr_array(slope @ smoothing), value @ by_lag
+
+    def read(
+        self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
+    ) -> tuple[Array, Array]:
+        """ŷ (S, 6) and its slopes (S, 6, size); zero where it cannot be read.
+
+        Parameters
+        ----------
+        forced : Forced
+        columns : (c,) positions in (q, φ) of what `forced` changes by
+        phi : (k,) the last of (q, φ)
+        gravity : (3,) and (3, k) its slopes by φ
+        size : int
+            Length of (q, φ).
+        """
+        value, changes = self.on_grid(forced)
+        slope = np.zeros((*value.shape, size))
+        slope[..., columns] = changes
+        first = size - len(phi)
+        if (tool := self.tool(gravity[0], phi, len(value))) is not None:
+            value = value + tool.value
+            scales = self.nuisance.scales
+            slope[..., first:] += tool.by_gravity @ gravity[1]
+            (mass,), centre = self.phi_places("tool-mass"), self.phi_places("tool-centre")
+            slope[..., first + mass] += scales[mass] * tool.by_mass
+            slope[..., first + centre] += scales[centre] * tool.by_centre
+        if len(value) < 2:
+            return np.zeros((len(self.wrench.t_s), 6)), np.zeros((len(self.wrench.t_s), 6, size))
+        return self._sampled(value, slope, phi, first)
+
+    def _sampled(self, value: Array, slope: Array, phi: Array, first: int) -> tuple[Array, Array]:
+        kernel, by_shift, by_lag = self.kernels(phi, len(value))
+        count, size = len(value), slope.shape[2]
+        read = kernel @ value
+        of_read = (kernel @ slope.reshape(count, 6 * size)).reshape(len(read), 6, size)
+        scales = self.nuisance.scales
+        for kind, own in (("sensor-time", by_shift), ("sensor-lag", by_lag)):
+            for place in self.phi_places(kind):
+                of_read[..., first + place] += scales[place] * (own @ value)
+        tare = self.phi_places("tare")
+        components = np.flatnonzero(self.wrench.measured)[: len(tare)]
+        read[:, components] += self._value("tare", phi)
+        of_read[:, components, first + tare] += scales[tare]
+        return read, of_read
+
+    # Residuals --------------------------------------------------------------------------------
+
+    def linearised(
+        self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
+    ) -> tuple[Array, Array]:
+        """Residuals (ŷ − w) / σ, (S, 2, 3) force and torque, and slopes; zero where missing."""
+        read, slope = self.read(forced, columns, phi, gravity, size)
+        here = self.wrench.present & self.covered(len(forced.reaction))[:, None]
+        weight = here / self.wrench.sigmas
+        residual = weight * (read - np.nan_to_num(self.wrench.values))
+        slope = weight[..., None] * slope
+        return residual.reshape(-1, 2, 3), slope.reshape(len(slope), 2, 3, size)
+
+
+def sensors_of(
+    experiment: Experiment, dynamics: Dynamics, nuisance: NuisanceMap
+) -> tuple[Sensor, ...]:
+    """The sensors of an experiment's grasps."""
+    dofs, found = sensed_dofs(experiment), []
+    for grasp in experiment.grasps:
+        if grasp.wrench is not None:
+            places = np.searchsorted(dofs, dofs_of(grasp.nodes))
+            found.append(Sensor(len(found), grasp, grasp.wrench, dynamics, nuisance, places))
+    return tuple(found)
+
+
+def sensed_dofs(experiment: Experiment) -> Index:
+    """(g,) dofs of the nodes of all grasps with a sensor, ascending."""
+    held = [dofs_of(grasp.nodes) for grasp in experiment.grasps if grasp.wrench is not None]
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *held]))
+
+
+def _cross(vectors: Array) -> Array:
+    """(…, 3, 3) matrices of a × b by the vectors a (…, 3)."""
+    found = np.zeros((*vectors.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        found[..., i, j], found[..., j, i] = -vectors[..., k], vectors[..., k]
+    return found
+
+
+def _by_component(blocks: Array) -> Array:
+    """(n, 6, d) from the blocks (n, h, 6, 3) of each node."""
+    count, nodes = blocks.shape[:2]
+    return blocks.transpose(0, 2, 1, 3).reshape(count, 6, 3 * nodes)
+
+
+def _interpolation(at: Array, count: int) -> tuple[sp.csr_array, sp.csr_array]:
+    """Weights (S, count) of grid times 0, 1, … at places between them, and their slopes."""
+    used = min(NEIGHBOURS, count)
+    first = np.clip(np.floor(at).astype(int) - (used // 2 - 1), 0, count - used)
+    place = at - first
+    values, slopes = np.zeros((2, len(at), used))
+    for i in range(used):
+        others = [j for j in range(used) if j != i]
+        factors = np.array([(place - j) / (i - j) for j in others])
+        values[:, i] = factors.prod(axis=0)
+        for m, j in enumerate(others):
+            slopes[:, i] += np.delete(factors, m, axis=0).prod(axis=0) / (i - j)
+    rows = np.repeat(np.arange(len(at)), used)
+    columns = (first[:, None] + np.arange(used)).ravel()
+    shape = (len(at), count)
+    return (
+        sp.csr_array((values.ravel(), (rows, columns)), shape=shape),
+        sp.csr_array((slopes.ravel(), (rows, columns)), shape=shape),
+    )
+
+
+def low_pass(lag_s: float, step_s: float, count: int) -> tuple[Array, Array]:
+    """L (n, n) of y' = (W − y) / T, W linear between grid times and steady before, and ∂L/∂T."""
+    e, a, b = _fading(lag_s, step_s)
+    value, slope = np.zeros((2, count, count))
+    value[0, 0] = 1.0
+    for k in range(1, count):
+        value[k] = e[0] * value[k - 1]
+        slope[k] = e[0] * slope[k - 1] + e[1] * value[k - 1]
+        value[k, k - 1 : k + 1] += a[0], b[0]
+        slope[k, k - 1 : k + 1] += a[1], b[1]
+    return value, slope
+
+
+def _fading(
+    lag_s: float, step_s: float
+) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+    """e, a and b of y_k = e y_{k−1} + a W_{k−1} + b W_k, each with its slope by T."""
+    if lag_s < 1e-6 * step_s:
+        return (0.0, 0.0), (0.0, 1 / step_s), (1.0, -1 / step_s)
+    share = lag_s / step_s
+    e = float(np.exp(-1 / share))
+    by_e = e / (share * lag_s)
+    a = share * (1 - e) - e
+    by_a = (1 - e) / step_s - share * by_e - by_e
+    return (e, by_e), (a, by_a), (1 - e - a, -by_e - by_a)

@@ -1,0 +1,251 @@
+"""What grasps give the body, on the grid and along the equations of motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checks import relative_error
+from memories_small import guesses, remembering, truth
+from problems_small import (
+    GUESS,
+    SMALL_EXPERIMENTS,
+    TRUTH,
+    as_theta,
+    bar_in_two_hands,
+    bar_let_go,
+    hung_cube,
+    times,
+    with_papers_damping,
+)
+from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
+
+from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.shooting import adjoint_gradient, simulated
+from collocation_sysid.nlp.collocation import Collocation, Part
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.sensor import low_pass
+from collocation_sysid.nlp.simulation import simulate
+
+EVERYTHING = Nuisance(
+    gravity_rad=0.03,
+    hand_eye_m=0.002,
+    hand_eye_rad=0.02,
+    sensor_time_s=0.001,
+    sensor_lag_s=0.003,
+    tool_kg=0.01,
+    tool_m=0.02,
+)
+
+
+def at_truth(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Part:
+    collocation = Collocation([experiment], Parameters.of(TRUTH), scheme, substeps)
+    (segment,) = collocation.segments
+    x = march(experiment, segment.dynamics, as_theta(TRUTH))
+    (part,) = collocation.parts_at(np.zeros(collocation.nphi), [x])
+    return part
+
+
+def total_on_grid(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    """Grid times and the wrenches (n, 6) of all grasps together."""
+    forced = part.sensing.at(part.x)
+    wrenches = [sensor.on_grid(forced)[0] for sensor in part.segment.sensors]
+    return part.segment.sensors[0].grid, np.sum(wrenches, axis=0)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("experiment", [hung_cube(14), bar_in_two_hands(14)], ids=lambda e: e.name)
+def test_all_grasps_together_give_weight_and_rate_of_momentum(experiment: Experiment, scheme: str):
+    """Newton's third law, of a body that no drag brakes, with the scheme's own stencils."""
+    part = at_truth(sensing(experiment, point_m=(0, 0, 0)), scheme)
+    undragged = TRUTH | {"gamma_m_1_s": 0.0}
+    theta = as_theta(undragged)
+    x = march(experiment, part.segment.dynamics, theta)
+    collocation = Collocation([part.segment.experiment], Parameters.of(undragged), scheme)
+    (part,) = collocation.parts_at(np.zeros(0), [x])
+    grid, found = total_on_grid(part)
+    dynamics = part.segment.dynamics
+    mass = dynamics.mass_kg[0, ::3]
+    stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
+    acceleration = stencil[grid + part.segment.sensors[0].late].reshape(len(grid), -1, 3)
+    pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
+    weight_n = 9.81 * mass.sum()
+    assert np.abs(found[:, :3] - pull.sum(axis=1)).max() < 1e-9 * weight_n
+
+
+def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
+    part = at_truth(sensing(bar_in_two_hands(14), point_m=(0.1, 0.2, -0.1)))
+    experiment = part.segment.experiment
+    theta = as_theta(TRUTH | {"gamma_m_1_s": 0.0})
+    x = march(experiment, part.segment.dynamics, theta)
+    collocation = Collocation([experiment], Parameters.of(TRUTH | {"gamma_m_1_s": 0.0}))
+    (part,) = collocation.parts_at(np.zeros(0), [x])
+    grid, found = total_on_grid(part)
+    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass_kg[0, ::3]
+    at = x.reshape(len(x), -1, 3)
+    second = (at[2:] - 2 * at[1:-1] + at[:-2]) / dynamics.step_s**2
+    arm = at[1:-1] - [0.1, 0.2, -0.1]
+    pull = mass[:, None] * (second - experiment.gravity_m_s2)
+    expected = np.cross(arm, pull).sum(axis=1)
+    np.testing.assert_array_equal(grid, np.arange(1, len(x) - 1))
+    # The internal forces act in the middle of the intervals, where they have no torque of their own.
+    assert relative_error(found[:, 3:], expected) < 1e-2
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_body_at_rest_is_carried(scheme: str):
+    still = hung_cube(8)
+    (grasp,) = still.grasps
+    at_rest = replace(grasp, poses=replace(grasp.poses, positions_m=0 * grasp.poses.positions_m))
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(still.t_s), 1))
+    at_rest = replace(at_rest, poses=replace(at_rest.poses, quaternions_xyzw=turns))
+    _, found = total_on_grid(at_truth(sensing(replace(still, grasps=[at_rest])), scheme))
+    weight_n = 9.81 * still.body.mass_kg
+    np.testing.assert_allclose(found[:, :3], np.tile([0, 0, weight_n], (len(found), 1)), atol=1e-9)
+
+
+def test_the_frame_of_the_grasp_moves_along():
+    world = at_truth(wristed_cube())
+    moving = at_truth(wristed_cube(frame="grasp"))
+    grid, in_world = total_on_grid(world)
+    _, in_grasp = total_on_grid(moving)
+    turns, shifts = world.segment.experiment.grasps[0].poses.at(world.segment.dynamics.t_s[grid])
+    np.testing.assert_allclose(
+        np.einsum("kij,kj->ki", turns, in_grasp[:, :3]), in_world[:, :3], atol=1e-12
+    )
+    point = world.segment.sensors[0].wrench.point_m
+    arm = shifts + turns @ point - point
+    about = np.einsum("kij,kj->ki", turns, in_grasp[:, 3:]) + np.cross(arm, in_world[:, :3])
+    np.testing.assert_allclose(about, in_world[:, 3:], atol=1e-12)
+
+
+def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
+    part = at_truth(sensing(bar_let_go(12)))
+    still, moving = part.segment.sensors
+    assert still.grid[-1] == 11
+    # It holds up to the third grid time; the first two rows are those of the start.
+    np.testing.assert_array_equal(moving.grid, [1])
+
+
+# Derivatives --------------------------------------------------------------------------------------
+
+
+def cases() -> list:
+    own = times(33, 0.0031) + 0.0017
+    with_everything = replace(wristed_cube(nuisance=EVERYTHING, frame="grasp"), name="everything")
+    made = [(name, make(12)) for name, make in SMALL_EXPERIMENTS.items()]
+    found = [(name, sensing(each), "midpoint", {}) for name, each in made]
+    found += [(f"cube-{scheme}", wristed_cube(), scheme, {}) for scheme in SCHEMES]
+    found += [
+        (f"everything-{scheme}", sensing(with_everything, own, frame="grasp"), scheme, {})
+        for scheme in SCHEMES
+    ]
+    found += [
+        ("everything-in-the-world", sensing(with_everything, own), "midpoint", {}),
+        ("substeps", sensing(hung_cube(8), own[:20]), "midpoint", {"substeps": 2}),
+        ("huber", sensing(hung_cube(8), own[:20]), "midpoint", {"huber": 1.5}),
+        ("papers-damping", sensing(with_papers_damping(hung_cube(8))), "midpoint", {}),
+    ]
+    return [pytest.param(*each[1:], id=each[0]) for each in found]
+
+
+def noisy_wrenches(experiment: Experiment) -> Experiment:
+    rng = np.random.default_rng(3)
+    values = [
+        np.where(rng.random(w.values.shape) < 0.1, np.nan, 0.01 * rng.normal(size=w.values.shape))
+        for w in (grasp.wrench for grasp in experiment.grasps)
+        if w is not None
+    ]
+    return with_wrenches(experiment, values)
+
+
+def some_p(collocation: Collocation) -> np.ndarray:
+    low, high = collocation.bounds_p
+    phi = np.abs(0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)) + 0.1
+    return np.clip(np.concatenate([collocation.parameters.guess_q, phi]), low, high)
+
+
+@pytest.mark.parametrize(("experiment", "scheme", "options"), cases())
+def test_slopes_forward_and_backward_are_those_of_the_loss(
+    experiment: Experiment, scheme: str, options: dict
+):
+    collocation = Collocation([noisy_wrenches(experiment)], GUESS, scheme, **options)
+    assert_slopes(collocation)
+
+
+def test_slopes_with_memory():
+    cube = noisy_wrenches(sensing(remembering("cube-with-nuisance", 12, 2)))
+    assert_slopes(Collocation([cube], guesses(truth(2))))
+
+
+def assert_slopes(collocation: Collocation) -> None:
+    p = some_p(collocation)
+    z = simulated(collocation, p)
+    (segment,) = collocation.segments
+    point = Horizon(collocation, [segment.grid_rows]).evaluate(p, collocation.unpack(z)[1])
+    scale = 1 / collocation.loss_scale
+    assert point.loss == pytest.approx(scale * collocation.objective(z), rel=1e-9)
+    forward = 2 * point.slope.T @ point.residual
+    backward = scale * adjoint_gradient(collocation, z)
+    assert relative_error(backward, forward) < 1e-8
+    direction = np.random.default_rng(2).standard_normal(len(p))
+
+    def loss(steps: float) -> float:
+        return scale * collocation.objective(simulated(collocation, p + 1e-4 * steps * direction))
+
+    differences = (8 * (loss(1) - loss(-1)) - (loss(2) - loss(-2))) / 12e-4
+    assert forward @ direction == pytest.approx(differences, rel=2e-6)
+
+
+def test_rows_that_are_continued_sense_the_same():
+    collocation = Collocation([noisy_wrenches(wristed_cube(nuisance=EVERYTHING))], GUESS)
+    p = some_p(collocation)
+    (x,) = collocation.unpack(simulated(collocation, p))[1]
+    part = Horizon(collocation, [8]).evaluate(p, [x[:8]])
+    whole = Horizon(collocation, [len(x)])
+    continued = whole.evaluate(p, [x], part)
+    afresh = whole.evaluate(p, [x])
+    np.testing.assert_allclose(continued.residual, afresh.residual, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(continued.slope, afresh.slope, rtol=1e-9, atol=1e-7)
+
+
+# At the samples -----------------------------------------------------------------------------------
+
+
+def test_samples_between_grid_times_are_read_to_the_third_order():
+    """A faster sensor sees the wrench between grid times, not that of the nearest one."""
+    errors = []
+    for refinement in (1, 2, 4):
+        steps = 16 * refinement
+        cube = hung_cube(steps)
+        t_s = times(steps, 0.01 / refinement)
+        slow = replace(cube, t_s=t_s, markers=replace(cube.markers, t_s=t_s))
+        fine = np.linspace(0.03, 0.13, 87)
+        part = at_truth(sensing(slow, fine))
+        (read,) = part.sensing.readings(part.x)
+        dense = at_truth(sensing(slow, fine), substeps=8 // refinement)
+        (expected,) = dense.sensing.readings(dense.x)
+        errors.append(relative_error(read[:, :3], expected[:, :3]))
+    assert errors[1] < 0.4 * errors[0]
+
+
+def test_a_low_pass_follows_a_ramp_by_its_time_constant():
+    step_s, lag_s = 0.01, 0.025
+    smoothing, _ = low_pass(lag_s, step_s, 60)
+    ramp = step_s * np.arange(60)
+    lag = ramp - smoothing @ ramp
+    assert lag[-1] == pytest.approx(lag_s * (1 - np.exp(-ramp[-1] / lag_s)), rel=1e-12)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.002, 0.05])
+def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float):
+    signal = np.random.default_rng(0).standard_normal(20)
+    _, slope = low_pass(lag_s, 0.01, 20)
+    step = 1e-6
+    before = low_pass(max(0.0, lag_s - step), 0.01, 20)[0]
+    change = (low_pass(lag_s + step, 0.01, 20)[0] - before) / (step + min(step, lag_s))
+    np.testing.assert_allclose(slope @ signal, change @ signal, rtol=1e-3, atol=0.02)

@@ -1,0 +1,65 @@
+"""Small experiments whose grasps have sensors, with the wrenches that the truth gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from problems_small import TRUTH, as_theta, hung_cube, measured_with
+
+from collocation_sysid.experiment import Experiment, Nuisance, Wrench
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.parameters import Parameters
+
+SIGMA_N, SIGMA_NM = 1e-3, 1e-4
+POINT_M = (0.02, -0.01, 0.12)
+
+
+def sensing(experiment: Experiment, t_s: np.ndarray | None = None, **changes) -> Experiment:
+    """The experiment with a sensor of all components at every grasp, not measured yet."""
+    times = experiment.t_s if t_s is None else t_s
+    given = {"sigma_nm": SIGMA_NM, "point_m": POINT_M} | changes
+    sensor = Wrench(times, np.zeros((len(times), 6)), SIGMA_N, **given)
+    grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]
+    return replace(experiment, grasps=grasps)
+
+
+def fitted(
+    experiment: Experiment, parameters: Parameters, scheme: str = "midpoint", **options
+) -> Collocation:
+    """The problem of one experiment."""
+    return Collocation([experiment], parameters, scheme, **options)
+
+
+def with_wrenches(experiment: Experiment, values: list[np.ndarray]) -> Experiment:
+    """The experiment with other wrenches at the grasps that have a sensor."""
+    found = iter(values)
+    return replace(
+        experiment,
+        grasps=[
+            grasp
+            if grasp.wrench is None
+            else replace(grasp, wrench=replace(grasp.wrench, values=next(found)))
+            for grasp in experiment.grasps
+        ],
+    )
+
+
+def sensed(
+    experiment: Experiment, truth: Mapping[str, float] = TRUTH, scheme: str = "midpoint"
+) -> Experiment:
+    """The experiment with the tracks, and the wrenches, that parameters give it in a scheme."""
+    made = measured_with(experiment, truth, scheme)
+    collocation = fitted(made, Parameters.of(dict(truth)), scheme)
+    (segment,) = collocation.segments
+    x = march(experiment, segment.dynamics, as_theta(truth))
+    (part,) = collocation.parts_at(np.zeros(collocation.nphi), [x])
+    return with_wrenches(made, part.sensing.readings(x))
+
+
+def wristed_cube(steps: int = 12, nuisance: Nuisance | None = None, **changes) -> Experiment:
+    """The hung cube in a hand with a sensor."""
+    cube = hung_cube(steps) if nuisance is None else hung_cube(steps, nuisance=nuisance)
+    return sensing(cube, **changes)
