@@ -20,6 +20,7 @@ from rich.text import Text
 
 from .errors import InputError, SimulationError
 from .folders import require_possible, run_name
+from .starting import heed_interrupts
 
 if TYPE_CHECKING:
     from .problem import Problem
@@ -586,6 +587,7 @@ def _show(content: RenderableType) -> None:
 
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
+    heed_interrupts()
     try:
         app(prog_name="collocation-sysid")
     except InputError as error:

@@ -12,6 +12,7 @@ import tomli_w
 from pydantic import ValidationError
 
 from ..errors import InputError
+from ..files import require_regular
 from .explaining import explain
 from .schema import ProblemFile
 
@@ -43,10 +44,7 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
     """
     path = Path(path)
     text = _read_text(path)
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise _bad_syntax(str(error), text, path) from error
+    content = parse_toml(text, path)
     for override in overrides:
         _apply(content, override)
     if overrides:
@@ -57,7 +55,30 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
         raise explain(error, content, path) from error
 
 
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """The content of a TOML text.
+
+    Raises
+    ------
+    InputError
+        Where it is none, with the line where there is one.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise _bad_syntax(str(error), text, path) from error
+    except (RecursionError, ValueError) as error:  # Python's limits of depth and of digits
+        raise InputError(_beyond_limits(error), path) from error
+
+
+def _beyond_limits(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "nests tables or lists too deeply; expected a few levels"
+    return "holds a whole number of too many digits; expected a number that can be"
+
+
 def _read_text(path: Path) -> str:
+    require_regular(path)
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -155,3 +176,5 @@ def _value(text: str, key: str) -> Any:
                 "--set",
             ) from None
         return text.strip()
+    except (RecursionError, ValueError) as error:
+        raise InputError(_beyond_limits(error), "--set", key.strip()) from error

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError
+from ...files import require_regular
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,7 @@ def read_bytes(path: str | Path) -> bytes:
     InputError
         If it cannot be read.
     """
+    require_regular(path)
     try:
         return Path(path).read_bytes()
     except OSError as error:

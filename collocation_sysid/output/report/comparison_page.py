@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError
-from .page import number, picture, read_json, rendered
+from ...files import damage_refused, read_json
+from .page import number, picture, rendered
 
+SUMMARY_FILE = "summary.json"
 MODEL_COLUMNS = {
     "model": "model",
     "chosen": "to use",
@@ -44,8 +45,8 @@ def comparison_page(folder: str | Path) -> str:
         If it is not such a folder, or damaged.
     """
     folder = Path(folder)
-    summary = read_json(folder / "summary.json", "a folder of compare or sweep")
-    try:
+    summary = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
+    with damage_refused(folder, SUMMARY_FILE, "repeat the study, finished runs are kept"):
         runs = summary["runs"]
         methods = summary.get("methods", [])
         swept = summary.get("swept", [])
@@ -62,14 +63,9 @@ def comparison_page(folder: str | Path) -> str:
             pictures=[
                 {"source": picture(file), "caption": file.stem.replace("_", " ")}
                 for file in sorted(folder.glob("*.png"))
+                if file.is_file()
             ],
         )
-    except (KeyError, TypeError, OSError) as error:
-        raise InputError(
-            f"summary.json is damaged ({type(error).__name__}: {error}); repeat the study, "
-            "finished runs are kept",
-            folder,
-        ) from error
 
 
 def _run_columns(runs: list[dict[str, Any]], swept: list[str]) -> list[str]:

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
 from ...fem.constants import symbol_of, unit_of
-from .page import millimetres, number, picture, read_json, rendered
+from ...files import read_json
+from ..replay import LARGEST, RESULT_FILE, read_arrays, reading_run
+from .page import millimetres, number, picture, rendered
 
 SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
@@ -39,8 +40,8 @@ def run_page(run: str | Path) -> str:
         If it is not a run folder, or damaged.
     """
     run = Path(run)
-    result = read_json(run / "result.json", "a run folder")
-    try:
+    result = read_json(run / RESULT_FILE, "a run folder")
+    with reading_run(run):
         return rendered(
             "run.html",
             result=result,
@@ -54,12 +55,6 @@ def run_page(run: str | Path) -> str:
             pictures=_pictures(run),
             problem=_text(run / "problem.toml"),
         )
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise InputError(
-            f"result.json or trajectory.npz is damaged ({type(error).__name__}: {error}); "
-            "solve the problem again",
-            run,
-        ) from error
 
 
 def verdict(result: dict[str, Any]) -> list[str]:
@@ -175,14 +170,15 @@ def _size(value: float | None, unit: str) -> str:
 
 def _worst_errors(run: Path) -> list[dict[str, Any]]:
     """The largest residuals, with time and marker."""
-    with np.load(run / "trajectory.npz") as stored:
-        names = [key for key in stored.files if key.rpartition("/")[2] == "residuals_m"]
-        found = []
-        for key in names:
-            prefix = key.removesuffix("residuals_m")
-            errors = np.linalg.norm(stored[key], axis=2)
-            t_s, markers = stored[f"{prefix}t_s"], stored[f"{prefix}marker_names"]
-            found += _peaks(prefix.rstrip("/"), np.nan_to_num(errors), t_s, markers)
+    arrays, found = read_arrays(run), []
+    for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
+        prefix = key.removesuffix("residuals_m")
+        t_s, markers = arrays[f"{prefix}t_s"], arrays[f"{prefix}marker_names"]
+        shape, residuals_m = (len(t_s), len(markers), 3), arrays[key]
+        if residuals_m.shape != shape or np.nanmax(np.abs(residuals_m), initial=0.0) > LARGEST:
+            raise ValueError(f"{key} does not go with its times and markers")
+        errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
+        found += _peaks(prefix.rstrip("/"), errors, t_s, markers)
     return sorted(found, key=lambda item: -item["error_m"])[:WORST]
 
 
@@ -214,7 +210,8 @@ def _pictures(run: Path) -> list[dict[str, str]]:
         return next((k for k in order if file.stem.startswith(k)), "")
 
     files = sorted(
-        run.glob("*.png"), key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name)
+        (file for file in run.glob("*.png") if file.is_file()),
+        key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name),
     )
     found = []
     for file in files:
