@@ -581,8 +581,9 @@ def _root(
 
 
 def _show(content: RenderableType) -> None:
-    """Print on stdout; a terminal wraps long lines itself, and files keep them whole."""
-    Console(highlight=False).print(content, soft_wrap=True)
+    """Print on stdout: on a terminal wrapped between words, in files with lines kept whole."""
+    console = Console(highlight=False)
+    console.print(content, soft_wrap=not console.is_terminal)
 
 
 def main() -> None:

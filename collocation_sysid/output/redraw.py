@@ -37,4 +37,5 @@ def _iteration(line: dict[str, Any]) -> Iteration:
         line["violation_n"],
         line["parameters"],
         line["time_s"],
+        line.get("share", 1.0),
     )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
+from ..fem.quadratic import EDGES
 from ..files import damage_refused, read_json
 
 RESULT_FILE = "result.json"
@@ -30,6 +31,7 @@ LAYOUT = {
     "tetrahedra": ("iu", "E4"),
     "surface": ("iu", "F3"),
     "surface_parts": ("iu", "F"),
+    "surface_nodes": ("iu", "Fs"),
     "t_s": ("f", "T"),
     "held": ("b", "Tn"),
     "up": ("f", "3"),
@@ -59,6 +61,7 @@ class Replay:
     tetrahedra : (E, 4) corners of the elements
     surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
     surface_parts : (F,) number of the part of the body that each belongs to
+    surface_nodes : (F, 3) or (F, 6) nodes of each triangle, those on its sides besides its corners
     part_names : (P,) str, "" for what no region claims
     held : (T, n) bool, which nodes are grasped
     up : (3,) unit vector against gravity; z where there is none
@@ -77,6 +80,7 @@ class Replay:
     tetrahedra: NDArray[np.integer]
     surface: NDArray[np.integer]
     surface_parts: NDArray[np.integer]
+    surface_nodes: NDArray[np.integer]
     part_names: Sequence[str]
     held: NDArray[np.bool_]
     up: Array
@@ -113,6 +117,7 @@ class Replay:
             body.mesh.tetrahedra,
             body.mesh.surface,
             body.part_of_cells[body.mesh.surface_cells],
+            nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
             experiment.grasped(experiment.t_s)[0],
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
@@ -152,6 +157,7 @@ class Replay:
             "tetrahedra": self.tetrahedra.astype(np.int32),
             "surface": self.surface.astype(np.int32),
             "surface_parts": self.surface_parts.astype(np.int32),
+            "surface_nodes": self.surface_nodes.astype(np.int32),
             "part_names": np.array(self.part_names),
         }
         return shared | {prefix + key: value for key, value in own.items() if value is not None}
@@ -175,6 +181,7 @@ class Replay:
             "natural_hz",
         )
         found: dict[str, Any] = {key: arrays[key] for key in SHARED}
+        found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
         _require_shapes(found)
@@ -186,6 +193,15 @@ class Replay:
         if numbers.min() < 0 or numbers.max() >= len(parts):
             raise ValueError("surface_parts names parts that are not there")
         return cls(name=name, marker_names=names, part_names=parts, **found)
+
+
+def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Corners of each face (F, 3), and of quadratic cells (F, 10) the nodes on its sides too."""
+    if cells.shape[1] != 10:
+        return faces
+    ends = cells[:, np.array(EDGES)]  # (F, 6, 2)
+    on_face = (ends[..., None] == faces[:, None, None]).any(axis=3).all(axis=2)
+    return np.hstack([faces, cells[:, 4:][on_face].reshape(len(faces), 3)])
 
 
 def _require_shapes(arrays: Mapping[str, Any]) -> None:
@@ -205,7 +221,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             raise ValueError(f"{key} holds numbers that are not finite")
         if kinds == "f" and np.nanmax(np.abs(array), initial=0.0) > LARGEST:
             raise ValueError(f"{key} holds numbers above {LARGEST:g}")
-    for key in ("tetrahedra", "surface"):
+    for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} names nodes that are not there")
     if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(np.linalg.norm(arrays["up"]), 1.0):

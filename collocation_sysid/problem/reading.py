@@ -16,6 +16,8 @@ from ..files import require_regular
 from .explaining import explain
 from .schema import ProblemFile
 
+# Levels of tables and lists that a problem file may have: it needs seven.
+DEEPEST = 20
 # What the TOML parser says where people see something simpler.
 _PLAINER = {
     "Cannot overwrite a value": "this key is given twice",
@@ -64,11 +66,24 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         Where it is none, with the line where there is one.
     """
     try:
-        return tomllib.loads(text)
+        content = tomllib.loads(text)
+        if _depth(content) > DEEPEST:
+            raise RecursionError
+        return content
     except tomllib.TOMLDecodeError as error:
         raise _bad_syntax(str(error), text, path) from error
     except (RecursionError, ValueError) as error:  # Python's limits of depth and of digits
         raise InputError(_beyond_limits(error), path) from error
+
+
+def _depth(content: Any) -> int:
+    """How many levels of tables and lists there are, as far as it matters."""
+    level, depth = [content], 0
+    while level and depth <= DEEPEST:
+        tables = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [each for table in tables for each in table if isinstance(each, (dict, list))]
+        depth += 1
+    return depth
 
 
 def _beyond_limits(error: Exception) -> str:
@@ -108,6 +123,8 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, value = override.partition("=")
     parts = key.strip().split(".")
+    if len(parts) > DEEPEST:
+        raise InputError(f"found a key of {len(parts)} parts; expected a few", "--set")
     if not equals or not all(parts):
         raise InputError(
             f"found {override!r}, expected key=value such as parameters.mu_pa.guess=200", "--set"
