@@ -61,7 +61,7 @@ def _content(replay: Replay) -> dict[str, Any]:
         "t_s": replay.t_s[kept].tolist(),
         "nodes": len(outer),
         "markers": replay.measured_m.shape[1],
-        "corners": _packed(nodes[:, :3], "<i4"),
+        "faces": _packed(nodes[:, :3], "<i4"),
         "sides": _packed(nodes[:, 3:], "<i4"),
         "strains": {name: _packed(_bytes(x / largest), "u1") for name, x in stretched.items()},
         "largest": largest,
