@@ -8,9 +8,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..arrays import Array
 from ..experiment.turning import turning_warnings
 from ..methods.method import Method
@@ -24,11 +21,12 @@ from ..problem import Problem
 from ..statistics.cause import Cause
 from ..statistics.stillness import stillness_notes
 from .cost import Cost, cost_notes, cost_warnings, costs
-from .derivatives import SAMPLES, derivative_errors, first_samples, shortened
+from .derivatives import SAMPLES, derivative_errors, shortened
 from .description import description_causes
 from .elements import ElementShape
 from .hold import Hold, hold_warnings, holds_of
 from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
+from .memory import nonzeros
 from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
 from .shape import BodyFinding, body_finding
 
@@ -126,7 +124,7 @@ def check_problem(problem: Problem) -> Findings:
     z, start_notes = initial_variables(collocation)
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
-    jacobian, hessian = _nonzeros(problem)
+    jacobian, hessian = nonzeros(problem)
     method = _name(problem.method)
     found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
     chosen = next((cost for cost in found_costs if cost.method == method), None)
@@ -222,22 +220,3 @@ def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[R
         at_samples = part.x[part.segment.observation.grid_rows]
         simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
-
-
-def _nonzeros(problem: Problem) -> tuple[int, int]:
-    """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many."""
-    short = shortened(problem, SAMPLES)
-    total = few = _counted(short)
-    for k, experiment in enumerate(problem.experiments):
-        if not experiment.validation:
-            parts = list(short.experiments)
-            parts[k] = first_samples(experiment, SAMPLES + 1)
-            more = _counted(replace(problem, experiments=parts)) - few
-            total = total + max(0, len(experiment.t_s) - SAMPLES) * more
-    return int(total[0]), int(total[1])
-
-
-def _counted(problem: Problem) -> NDArray[np.int64]:
-    collocation = problem.collocation()
-    structures = (collocation.jacobian_structure, collocation.hessian_structure)
-    return np.array([len(indices) for _, indices in structures])

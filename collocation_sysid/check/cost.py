@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from ..methods.reduced_space import memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.tangent import BlockSolver
+from .memory import interior_point_mb, machine_memory_mb
 
 # Rows timed, and sweeps that the reduced space mostly takes.
 ROWS, SWEEPS = 12, 10
@@ -22,7 +22,6 @@ ROWS, SWEEPS = 12, 10
 # iteration grows with the nonzeros and with the unknowns of a timestep to this power.
 ITERATIONS = 10
 SECONDS, POWER = 4.5e-10, 1.4
-BYTES = 280.0
 # A method is recommended to those who would wait this long, if it takes this share of the time.
 LONG_S, MUCH_QUICKER = 60.0, 0.1
 
@@ -67,7 +66,7 @@ def costs(
         reduced,
         Cost(
             "interior-point",
-            BYTES * nonzeros / 1e6,
+            interior_point_mb(nonzeros),
             ITERATIONS * SECONDS * nonzeros * width**POWER,
         ),
     )
@@ -88,7 +87,7 @@ def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
 
 def cost_warnings(chosen: Cost, others: Sequence[Cost]) -> list[str]:
     """Whether the chosen method will run out of memory."""
-    available = _machine_memory_mb()
+    available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
         return []
     fitting = [cost for cost in others if cost.memory_mb < available]
@@ -112,10 +111,3 @@ def _sweeps_s(collocation: Collocation, z: Array, factorisation: Choice) -> floa
             return None
         total += len(part.x) / rows * (time.perf_counter() - began)
     return SWEEPS * total
-
-
-def _machine_memory_mb() -> float | None:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
-    except (AttributeError, OSError, ValueError):  # not on every system
-        return None

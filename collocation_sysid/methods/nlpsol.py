@@ -138,18 +138,25 @@ def _run(
 
 @contextmanager
 def _interruptible(monitor: Monitor) -> Iterator[None]:
-    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program."""
+    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program.
+
+    So does SIGTERM where it is heeded as Ctrl-C is.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.getsignal(signal.SIGINT)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if handlers[signal.SIGTERM] is not signal.default_int_handler:
+        del handlers[signal.SIGTERM]
 
-    def request(_number: int, _frame: object) -> None:
+    def request(number: int, _frame: object) -> None:
         monitor.stop = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(number, signal.default_int_handler)
 
-    signal.signal(signal.SIGINT, request)
+    for number in handlers:
+        signal.signal(number, request)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, previous in handlers.items():
+            signal.signal(number, previous)
