@@ -14,7 +14,7 @@ from ..fem.body import Body, Linearisation
 from ..fem.memory import Carried
 from ..fem.pattern import SymmetricPattern
 from .forces import Forces, per_dof
-from .memory import History
+from .memory import History, Recursion, recursions_of
 from .schemes import Scheme, as_scheme
 
 
@@ -62,6 +62,9 @@ class Dynamics:
     start_velocity_m_s : (3n,)
     loaded_since_s : float
         How long the body has been in its start shape; infinite where its memory has relaxed.
+    brought : (N, all branches) or None
+        What the evaluations bring from the past, m_{k−1} of each branch in turn, where it is given
+        instead of following from x.
     """
 
     body: Body
@@ -73,6 +76,7 @@ class Dynamics:
     taken: NDArray[np.bool_]
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
+    brought: Array | None = None
 
     @classmethod
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
@@ -139,6 +143,13 @@ class Dynamics:
         return xi[self.first_row :], nu[self.first_row :]
 
     @property
+    def state_weights(self) -> Array:
+        """(N, reach + 1) p, and that of a given start: nothing is evaluated there but its stress."""
+        weights = self.tables.p.copy()
+        weights[: self.first_row, 0] = 1.0
+        return weights
+
+    @property
     def until_next_s(self) -> Array:
         """(N,) time from each evaluation to the next."""
         lags = self.tables.p @ np.arange(self.reach + 1.0)
@@ -148,10 +159,13 @@ class Dynamics:
         """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing."""
         if not self.body.remembers:
             return None
-        xi = self.combine(self.tables.p[: len(x)], x)
-        xi[: self.first_row] = x[: self.first_row]
+        xi = self.combine(self.state_weights[: len(x)], x)
         intervals = self.until_next_s[: len(x)]
-        return History.of(self.body, xi, theta, intervals, self.loaded_since_s)
+        return History.of(self.body, xi, theta, intervals, self.loaded_since_s, self.brought)
+
+    def recursions(self, theta: Array) -> list[Recursion]:
+        """How each branch of the memory fades over all evaluations."""
+        return recursions_of(self.body, theta, self.until_next_s, self.loaded_since_s)
 
     def carried(self, history: History | None, rows: slice | None = None) -> Carried | None:
         """What rows `first_row`…, or some, bring from the past."""
