@@ -18,6 +18,7 @@ import numpy as np
 from ..arrays import Array, Index
 from .collocation import Collocation, Part
 from .overstress import Overstress, Places
+from .segment import Segment
 from .widened import Widened
 
 
@@ -31,6 +32,11 @@ def with_explicit_memory(collocation: Collocation) -> Collocation:
     return made
 
 
+def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
+    """Variables of one of the two programs as the other has them."""
+    return z if of.variables == to.variables else to.pack(*of.unpack(z))
+
+
 class ExplicitMemory(Collocation):
     """A collocation NLP whose bodies' memory is among its variables."""
 
@@ -40,7 +46,7 @@ class ExplicitMemory(Collocation):
         return Collocation(**{f.name: getattr(self, f.name) for f in fields(self)})
 
     @cached_property
-    def segments(self):
+    def segments(self) -> tuple[Segment, ...]:
         """One of each experiment that is fitted."""
         return self.plain.segments
 
@@ -160,13 +166,9 @@ class ExplicitMemory(Collocation):
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Positions of the diagonal entries of q, and of x and m, in the values of the Hessian."""
-        of_q, of_x = (self._hessian.kept[places] for places in self.plain.hessian_diagonals)
-        own, used = [], 0
-        for memory in self.memories.values():
-            own.append(self._hessian.added[used + memory.hessian_diagonal])
-            used += len(memory.hessian_entries()[0])
-        return of_q, np.concatenate([of_x, *own])
+        """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        of_q, of_x = self.plain.hessian_diagonals
+        return self._hessian.kept[of_q], self._hessian.kept[of_x]
 
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None

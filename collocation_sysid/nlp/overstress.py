@@ -269,18 +269,11 @@ class Overstress:
         """The same of the upper triangle of the Lagrangian's Hessian, in the columns of m."""
         nq, (_, own, dofs, _) = self.segment.nq, self._slopes
         variables = np.arange(self.variables.start, self.variables.stop)
-        # By q, and the diagonal, which is zero
-        rows = [np.repeat(np.arange(nq), self.count), variables]
-        columns = [np.tile(variables, nq), variables]
+        rows, columns = [np.repeat(np.arange(nq), self.count)], [np.tile(variables, nq)]
         for each in self._state_lags:
             rows.append(self._states(each, dofs))
             columns.append(self._brought(each, own))
         return np.concatenate(rows), np.concatenate(columns)
-
-    @property
-    def hessian_diagonal(self) -> Index:
-        """Which of these entries are on the diagonal."""
-        return self.segment.nq * self.count + np.arange(self.count)
 
     def hessian_values(self, setting: Setting, multipliers: Array) -> Array:
         """The values of these entries; multipliers are those of all of g."""
@@ -290,7 +283,6 @@ class Overstress:
         for r, mu in zip(recursions, self.weights(multipliers), strict=True):
             slopes = theta_q[[r.branch.share, r.branch.tau]].T @ r.d_by[:, 1:]
             by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", slopes, mu[1:])
-        values = [(by_q * self.unit_pa).ravel(), np.zeros(self.count)]
         place, own, _, _ = self._slopes
         scale = segment.length_m * self.unit_pa[own]
         # f_H is linear in x and in H, so that its slope by both is that by H at the weights.
@@ -300,9 +292,8 @@ class Overstress:
             found = segment.body.stresses.force_slopes(weights[times], setting.theta)
             return found[:, place] * scale
 
-        return np.concatenate(
-            [*values, *(each.ravel() for each in self._spread(self._state_lags, slopes))]
-        )
+        found = [by_q * self.unit_pa, *self._spread(self._state_lags, slopes)]
+        return np.concatenate([each.ravel() for each in found])
 
     @staticmethod
     def _spread(lags: list[_Lag], slopes: Callable[[slice], Array]) -> list[Array]:
