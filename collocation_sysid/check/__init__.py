@@ -18,6 +18,7 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import started
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import ExplicitMemory, with_explicit_memory
 from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
@@ -64,6 +65,13 @@ class Findings:
         Distance of the markers from their measurements in the simulation at the guess.
     recordings : tuple of Recording, one for each experiment
     motions : tuple of Motion, one for each fitted experiment
+    variables, constraints : int
+        Of the program, without memory.
+    overstresses : int
+        As many of either are there beside them, of bodies with memory, for interior point and
+        others that see the whole program.
+    jacobian_nonzeros, hessian_nonzeros : int
+        With these.
     method : str
         The chosen one; `memory_mb` is what it takes, if it is among the `costs`.
     costs : tuple of Cost, one for each method of which they are known
@@ -86,6 +94,7 @@ class Findings:
     motions: tuple[Motion, ...]
     variables: int
     constraints: int
+    overstresses: int
     jacobian_nonzeros: int
     hessian_nonzeros: int
     method: str
@@ -126,7 +135,8 @@ def check_problem(problem: Problem) -> Findings:
     z, start_notes = initial_variables(collocation)
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
-    jacobian, hessian = _nonzeros(problem)
+    whole = with_explicit_memory(collocation)
+    jacobian, hessian = _nonzeros(problem, whole)
     method = _name(problem.method)
     found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
     chosen = next((cost for cost in found_costs if cost.method == method), None)
@@ -169,6 +179,7 @@ def check_problem(problem: Problem) -> Findings:
         motions=motions,
         variables=collocation.variables,
         constraints=collocation.constraints,
+        overstresses=whole.constraints - collocation.constraints,
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
         method=method,
@@ -224,8 +235,9 @@ def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[R
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
 
 
-def _nonzeros(problem: Problem) -> tuple[int, int]:
+def _nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
     """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many."""
+    further = whole.further_nonzeros if isinstance(whole, ExplicitMemory) else (0, 0)
     short = shortened(problem, SAMPLES)
     total = few = _counted(short)
     for k, experiment in enumerate(problem.experiments):
@@ -234,7 +246,7 @@ def _nonzeros(problem: Problem) -> tuple[int, int]:
             parts[k] = first_samples(experiment, SAMPLES + 1)
             more = _counted(replace(problem, experiments=parts)) - few
             total = total + max(0, len(experiment.t_s) - SAMPLES) * more
-    return int(total[0]), int(total[1])
+    return int(total[0]) + further[0], int(total[1]) + further[1]
 
 
 def _counted(problem: Problem) -> NDArray[np.int64]:

@@ -67,6 +67,13 @@ class ExplicitMemory(Collocation):
         return sum(memory.count for memory in self.memories.values())
 
     @property
+    def further_nonzeros(self) -> tuple[int, int]:
+        """Entries that Jacobian and Hessian have for it, without laying them out."""
+        of_memories = [memory.nonzeros for memory in self.memories.values()]
+        jacobian, hessian = (sum(each) for each in zip(*of_memories, strict=True))
+        return jacobian, hessian
+
+    @property
     def variables(self) -> int:
         """Length of z."""
         return self.plain.variables + self.overstresses

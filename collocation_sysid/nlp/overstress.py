@@ -194,6 +194,19 @@ class Overstress:
         first = self.segment.first.x
         return (first + (each.times - each.lag) * self.segment.dofs + dofs).ravel()
 
+    @property
+    def nonzeros(self) -> tuple[int, int]:
+        """How many further entries Jacobian and Hessian have, without laying them out."""
+        per_time, (rows, width) = len(self._slopes[0]), self.shape
+        by_x, by_m, mixed = (
+            sum(each.stop - each.start for each in lags)
+            for lags in (self._stress_lags, self._force_lags, self._state_lags)
+        )
+        by_q = self.segment.nq * self.count
+        recursion = (2 * rows - 1) * width
+        jacobian = by_q + recursion + by_x * per_time + by_m * len(self._moved)
+        return jacobian, by_q + mixed * per_time
+
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Rows and columns of the further entries of ∂g/∂z, in the order of their values."""
         segment, nq = self.segment, self.segment.nq
