@@ -443,6 +443,11 @@ def _solve_section(findings: Findings) -> RenderableType:
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
     }
+    if findings.overstresses:
+        rows["memory"] = (
+            f"{findings.overstresses:,} more variables and constraints for interior-point, the "
+            "overstress of every point, in these nonzeros"
+        )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         rows[cost.method] = f"about {_duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"

@@ -1,4 +1,4 @@
-"""Bodies that tendons and pressures drive: a box with a cavity, and an eighth of a hollow sphere."""
+"""Bodies that tendons and pressures drive: a box with a cavity, an eighth of a hollow sphere."""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -61,7 +63,7 @@ def test_second_derivatives_equal_those_of_a_computer_algebra(rng, states):
     points = np.array([rng.permutation(NODES)[:4] for _ in range(4)])
     weights, faces = rng.random((4, 4)), np.array([rng.permutation(NODES)[:3] for _ in range(5)])
     ends = [ca.mtimes(x[:, p.tolist()], w) for p, w in zip(points, weights, strict=True)]
-    length = sum(ca.norm_2(b - a) for a, b in zip(ends, ends[1:], strict=False))
+    length = sum(ca.norm_2(b - a) for a, b in pairwise(ends))
     volume = sum(ca.det(x[:, face.tolist()]) / 6 for face in faces)
     for energy, mine in ((length, Length(points, weights, NODES)), (volume, Volume(faces, NODES))):
         hessian = ca.Function("h", [x], [ca.hessian(energy, ca.vec(x))[0]])
@@ -74,7 +76,8 @@ def test_second_derivatives_equal_those_of_a_computer_algebra(rng, states):
 def test_a_cavity_encloses_its_volume_and_its_forces_balance(element, rng):
     body = Body(box_with_cavity(), density_kg_m3=1e3, element=element)
     volume = Pressure(Named("wall"), 1e3).on(body).measure
-    assert volume is not None and not volume.rim.size
+    assert volume is not None
+    assert not volume.rim.size
     assert volume.value(body.nodes_m.reshape(1, -1))[0] == pytest.approx(1e-6, rel=1e-12)
     bent = body.nodes_m + 1e-3 * rng.standard_normal(body.nodes_m.shape)
     force = volume.gradient(bent.reshape(1, -1)).reshape(-1, 3)
@@ -176,7 +179,8 @@ def test_faces_of_a_box_and_a_ball_are_those_with_all_their_corners_in_it():
     body = Body(box_with_cavity(), density_kg_m3=1e3)
     for selection in (Ball((0.015,) * 3, 0.009), Box((0.009,) * 3, (0.021,) * 3)):
         volume = Pressure(selection, 1e3).on(body).measure
-        assert volume is not None and len(volume.faces) == 12
+        assert volume is not None
+        assert len(volume.faces) == 12
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from problems_small import (
     times,
     with_papers_damping,
 )
-from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
+from wrenches_small import sensing, with_wrenches, wristed_cube
 
 from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.methods.horizon import Horizon
@@ -29,7 +29,6 @@ from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.sensor import low_pass
-from collocation_sysid.nlp.simulation import simulate
 
 EVERYTHING = Nuisance(
     gravity_rad=0.03,
@@ -92,7 +91,7 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     pull = mass[:, None] * (second - experiment.gravity_m_s2)
     expected = np.cross(arm, pull).sum(axis=1)
     np.testing.assert_array_equal(grid, np.arange(1, len(x) - 1))
-    # The internal forces act in the middle of the intervals, where they have no torque of their own.
+    # The internal forces act in the middle of intervals, where they have no torque of their own.
     assert relative_error(found[:, 3:], expected) < 1e-2
 
 

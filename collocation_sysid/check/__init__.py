@@ -15,6 +15,7 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import started
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import with_explicit_memory
 from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
@@ -62,6 +63,13 @@ class Findings:
         Distance of the markers from their measurements in the simulation at the guess.
     recordings : tuple of Recording, one for each experiment
     motions : tuple of Motion, one for each fitted experiment
+    variables, constraints : int
+        Of the program, without memory.
+    overstresses : int
+        As many of either are there beside them, of bodies with memory, for interior point and
+        others that see the whole program.
+    jacobian_nonzeros, hessian_nonzeros : int
+        With these.
     method : str
         The chosen one; `memory_mb` is what it takes, if it is among the `costs`.
     costs : tuple of Cost, one for each method of which they are known
@@ -84,6 +92,7 @@ class Findings:
     motions: tuple[Motion, ...]
     variables: int
     constraints: int
+    overstresses: int
     jacobian_nonzeros: int
     hessian_nonzeros: int
     method: str
@@ -124,6 +133,7 @@ def check_problem(problem: Problem) -> Findings:
     z, start_notes = initial_variables(collocation)
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
+    whole = with_explicit_memory(collocation)
     jacobian, hessian = nonzeros(problem)
     method = _name(problem.method)
     found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
@@ -167,6 +177,7 @@ def check_problem(problem: Problem) -> Findings:
         motions=motions,
         variables=collocation.variables,
         constraints=collocation.constraints,
+        overstresses=whole.constraints - collocation.constraints,
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
         method=method,

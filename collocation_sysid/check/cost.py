@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
+from ..fem.memory import branches_of
 from ..methods.reduced_space import memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
@@ -53,23 +54,26 @@ def costs(
     collocation : Collocation
     z : (variables,) the start
     nonzeros : int
-        Of the Jacobian and the Hessian together.
+        Of the Jacobian and the Hessian that interior point gets, together.
     factorisation : {"auto", "band", "sparse"}
     """
-    width = max(len(segment.free_dofs) for segment in collocation.segments)
-    reduced = Cost(
-        "reduced-space", memory_mb(collocation), _sweeps_s(collocation, z, factorisation)
-    )
-    if collocation.remembers:  # other methods refuse it
-        return (reduced,)
+    width = max(unknowns_of_a_timestep(collocation))
     return (
-        reduced,
+        Cost("reduced-space", memory_mb(collocation), _sweeps_s(collocation, z, factorisation)),
         Cost(
             "interior-point",
             interior_point_mb(nonzeros),
             ITERATIONS * SECONDS * nonzeros * width**POWER,
         ),
     )
+
+
+def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
+    """What interior point has of each experiment, the overstress of its memory included."""
+    return [
+        len(segment.free_dofs) + sum(b.own.stop - b.own.start for b in branches_of(segment.body))
+        for segment in collocation.segments
+    ]
 
 
 def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:

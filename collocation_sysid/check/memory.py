@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..methods.interior_point import InteriorPoint
 from ..methods.reduced_space import ReducedSpace, memory_mb
 from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import ExplicitMemory, with_explicit_memory
 from ..problem import Problem
 from .derivatives import SAMPLES, first_samples, shortened
 
@@ -84,6 +85,8 @@ def _limits_mb() -> Iterator[float]:
 
 def nonzeros(problem: Problem) -> tuple[int, int]:
     """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many."""
+    whole = with_explicit_memory(problem.collocation())
+    further = whole.further_nonzeros if isinstance(whole, ExplicitMemory) else (0, 0)
     short = shortened(problem, SAMPLES)
     total = few = _counted(short)
     for k, experiment in enumerate(problem.experiments):
@@ -92,7 +95,7 @@ def nonzeros(problem: Problem) -> tuple[int, int]:
             parts[k] = first_samples(experiment, SAMPLES + 1)
             more = _counted(replace(problem, experiments=parts)) - few
             total = total + max(0, len(experiment.t_s) - SAMPLES) * more
-    return int(total[0]), int(total[1])
+    return int(total[0]) + further[0], int(total[1]) + further[1]
 
 
 def _counted(problem: Problem) -> NDArray[np.int64]:

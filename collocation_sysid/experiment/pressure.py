@@ -1,4 +1,4 @@
-"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V that faces of a body enclose."""
+"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V that faces enclose."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Volume:
 
     @cached_property
     def _terms(self) -> tuple[Index, Index, Index, Array]:
-        """Rows and columns (lower triangle) of H, the dof that each is linear in, and by how much."""
+        """Rows and columns (lower triangle) of H, the dof each is linear in, and by how much."""
         form = _form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         found = []

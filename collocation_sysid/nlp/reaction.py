@@ -103,7 +103,7 @@ def reactions(dynamics: Dynamics, force: Array, x: Array, dofs: Index) -> Array:
 
 
 def reaction_slopes(dynamics: Dynamics, slopes: Array, moved: Array, dofs: Index) -> Array:
-    """dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
+    """DR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
     mass = dynamics.mass_kg[:, dofs, None] / dynamics.step_s**2
     inertia = mass * dynamics.combine(dynamics.tables.s, moved)
     return inertia - dynamics.combine(dynamics.tables.w, slopes)

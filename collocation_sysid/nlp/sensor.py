@@ -1,4 +1,4 @@
-"""What the sensor of a grasp reads: the wrench that the grasp gives the body, seen by an instrument.
+"""What the sensor of a grasp reads: the wrench that it gives the body, by an instrument.
 
 On the grid, in the frame of the sensor with axes Q_k and the point o_k,
 
