@@ -8,6 +8,7 @@
 
 from importlib.metadata import version
 
+from . import starting as _starting  # noqa: F401  (before all that takes time to import)
 from .errors import InputError, SimulationError
 from .experiment import (
     Experiment,

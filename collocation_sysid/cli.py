@@ -20,6 +20,7 @@ from rich.text import Text
 
 from .errors import InputError, SimulationError
 from .folders import require_possible, run_name
+from .starting import heed_interrupts
 
 if TYPE_CHECKING:
     from .problem import Problem
@@ -591,12 +592,14 @@ def _root(
 
 
 def _show(content: RenderableType) -> None:
-    """Print on stdout; a terminal wraps long lines itself, and files keep them whole."""
-    Console(highlight=False).print(content, soft_wrap=True)
+    """Print on stdout: on a terminal wrapped between words, in files with lines kept whole."""
+    console = Console(highlight=False)
+    console.print(content, soft_wrap=not console.is_terminal)
 
 
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
+    heed_interrupts()
     try:
         app(prog_name="collocation-sysid")
     except InputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from .arrays import Array
 from .errors import InputError
+from .files import damage_refused, read_json
 from .methods.solution import Solution
 from .methods.start import marched
 from .nlp.collocation import Collocation
@@ -47,11 +47,9 @@ class Earlier:
         InputError
             If it is not one, or damaged.
         """
-        file = Path(folder) / RESULT_FILE
-        if not file.is_file():
-            raise InputError(f"has no {RESULT_FILE}; expected the folder of an earlier run", folder)
-        try:
-            result = json.loads(file.read_text(encoding="utf-8"))
+        folder = Path(folder)
+        result = read_json(folder / RESULT_FILE, "the folder of an earlier run")
+        with damage_refused(folder, RESULT_FILE, "solve that problem again"):
             found = {**result["derived"], **result["parameters"]}
             values = {name: float(each["value"]) for name, each in found.items()}
             nuisance = {
@@ -63,10 +61,8 @@ class Earlier:
                 experiment: {name: _point(each["position_m"]) for name, each in named.items()}
                 for experiment, named in result.get("places", {}).items()
             }
-        except (ValueError, LookupError, TypeError, AttributeError) as error:
-            what = f"is damaged ({type(error).__name__}: {error}); solve that problem again"
-            raise InputError(what, file) from error
-        return cls(Path(folder), values, nuisance, places_m)
+            _refuse_infinite(values | nuisance)
+        return cls(folder, values, nuisance, places_m)
 
     @classmethod
     def of(cls, solution: Solution) -> Earlier:
@@ -143,6 +139,12 @@ class Earlier:
 
 def _point(position_m: Sequence[float]) -> Array:
     point = np.array(position_m, dtype=float)
-    if point.shape != (3,):
-        raise ValueError(f"a place of shape {point.shape}")
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"a place {position_m}")
     return point
+
+
+def _refuse_infinite(values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        if not np.isfinite(value):
+            raise ValueError(f"{name} is {value}")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .arrays import Array
+from .check.memory import require_memory
 from .check.motion import Motion
 from .earlier import Earlier
 from .errors import InputError, SimulationError, hint_at
@@ -261,8 +262,9 @@ def solve(
     earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start
     problem = problem if earlier is None else earlier.started(problem)
     try:
-        whole = getattr(solver, "needs_whole_start", False)
-        collocation, scan = started(problem.collocation(), whole)
+        whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
+        require_memory(problem, collocation, solver)
+        collocation, scan = started(collocation, whole)
         collocation, variables = placed_at_guess(collocation), None
         if earlier is not None and not scan:
             collocation = earlier.placed(collocation)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +19,7 @@ from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
 from .nlp.collocation import Part
 from .nlp.parameters import Parameter
+from .output.remedies import remedies_for
 from .problem import Problem
 from .rollout import Rollout
 from .run import Run
@@ -134,6 +135,7 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     parts: list[RenderableType] = [Text(solution.message, style=style)]
     parts.append(Text(f"Verdict: {trust.verdict}", style=f"bold {style}"))
     parts += [Text(f"  {reason}", style=style) for reason in trust.reasons]
+    parts += _how_to(trust.reasons)
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
@@ -143,6 +145,12 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     parts += _residuals(finished)
     parts.append(Text(f"written to {folder}"))
     return Group(*parts)
+
+
+def _how_to(concerns: Sequence[str]) -> list[Text]:
+    """The pages that say how to cure what gives concern."""
+    pages = dict.fromkeys(f"docs/howto/{each.page}.md" for each in remedies_for(concerns))
+    return [Text(f"what to do: {', '.join(pages)}", style="dim")] if pages else []
 
 
 def plain_text(shown: RenderableType) -> str:
@@ -364,6 +372,7 @@ def check_table(findings: Findings) -> RenderableType:
         Text(""),
         *_sentences("note", findings.notes, "default"),
         *_sentences("warning", findings.warnings, "yellow"),
+        *_how_to(findings.warnings),
         _check_verdict(findings),
     )
 
@@ -461,6 +470,11 @@ def _solve_section(findings: Findings) -> RenderableType:
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
     }
+    if findings.overstresses:
+        rows["memory"] = (
+            f"{findings.overstresses:,} more variables and constraints for interior-point, the "
+            "overstress of every point, in these nonzeros"
+        )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         rows[cost.method] = f"about {_duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"

@@ -9,7 +9,6 @@ from memories_small import ONE, TWO, guesses, recorded, remembering, truth
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.continuation import Continuation
-from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
 from collocation_sysid.nlp.collocation import Collocation, Part
@@ -155,10 +154,8 @@ def test_other_methods_find_the_same(method):
         assert solution.parameters[name] == pytest.approx(value, rel=1e-5), name
 
 
-def test_methods_that_need_the_whole_matrix_say_which_do_not():
+def test_second_derivatives_along_the_motion_are_refused():
     collocation = Collocation([recorded("hung-cube", 5)], guesses(ONE))
-    with pytest.raises(InputError, match=r"interior-point.*memory.*reduced-space, shooting"):
-        InteriorPoint()(collocation)
     with pytest.raises(InputError, match="'gauss-newton'"):
         ReducedSpace(hessian="exact")(collocation)
 

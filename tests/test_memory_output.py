@@ -10,11 +10,13 @@ from memories_small import ONE, guesses, recorded, remembering
 from problem_files import replace_text, run_command, settings
 from problems_small import measured_with, with_markers
 
+from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.explicit_memory import ExplicitMemory, with_explicit_memory
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -91,6 +93,9 @@ def test_a_problem_file_describes_a_memory(tiny):
     assert given["prony_1.tau_s"].guess is None
 
 
+GUESSED = "parameters.prony_1.tau_s.guess=0.1"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
@@ -108,11 +113,29 @@ def test_a_slip_in_the_memory_is_one_message(tiny, old: str, new: str, expected:
         Problem.read(tiny / "problem.toml")
 
 
-def test_the_command_line_says_which_methods_take_a_memory(tiny):
+def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     MEMORY(tiny)
-    refused = run_command("solve", tiny / "problem.toml", "--out", tiny / "run")
-    assert refused.code == 2
-    assert "method 'interior-point' cannot solve for materials with memory" in refused.err
-    checked = run_command("check", tiny / "problem.toml", *settings("solver.method=reduced-space"))
-    assert "interior-point" not in checked.out
+    problem = Problem.read(tiny / "problem.toml", [GUESSED])
+    findings = check_problem(problem)
+    program = with_explicit_memory(problem.collocation())
+    assert isinstance(program, ExplicitMemory)
+    assert findings.overstresses == program.overstresses
+    assert findings.variables + findings.overstresses == program.variables
+    assert findings.constraints + findings.overstresses == program.constraints
+    assert findings.jacobian_nonzeros == len(program.jacobian_structure[1])
+    assert findings.hessian_nonzeros == len(program.hessian_structure[1])
+    assert findings.derivatives_agree
+    assert findings.hessian_error > 0
+    assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
+    monkeypatch.setattr("collocation_sysid.check.derivatives.LAID_OUT", 0)
+    checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
+    assert f"{findings.overstresses:,} more variables and constraints" in checked.out
     assert "τ prony_1" in checked.out
+
+
+def test_a_problem_with_memory_is_solved_from_the_command_line(tiny):
+    MEMORY(tiny)
+    path, method = tiny / "problem.toml", "solver.method=interior-point"
+    solved = run_command("solve", path, *settings(GUESSED, method), "--out", tiny / "run")
+    assert solved.code == 0, solved.err
+    assert "instantaneous" in solved.out

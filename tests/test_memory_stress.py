@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -205,8 +206,8 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
     theta, x = constants_of(body), strained(body, states=3)
     v = rng.standard_normal(x.shape)
     stiffening = np.outer([0.1, 0.3, 0.3], np.arange(1.0, 1.0 + len(body.parts)))
-    shape = (3, body.stresses.width)
-    carried = Carried(30.0 * rng.standard_normal(shape), stiffening, np.zeros((3, len(theta))))
+    overstress = 30.0 * rng.standard_normal((3, body.stresses.width))
+    carried = replace(Carried.nothing(body, 3), overstress=overstress, stiffening=stiffening)
     at = body.linearise(x, v, theta, carried=carried)
     np.testing.assert_allclose(
         at.force, body.force(x, v, theta, carried=carried), rtol=1e-11, atol=1e-12

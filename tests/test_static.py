@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 from problems_small import EDGE_M, GUESS, IDEAL, TRUTH, as_theta, box, nodes_where, vertex_markers
 from scipy.optimize import brentq
 
-from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.rest import rest_state

@@ -8,9 +8,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..arrays import Array
 from ..experiment.turning import turning_warnings
 from ..methods.method import Method
@@ -18,17 +15,19 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import started
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import with_explicit_memory
 from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
 from ..statistics.cause import Cause
 from ..statistics.stillness import stillness_notes
 from .cost import Cost, cost_notes, cost_warnings, costs
-from .derivatives import SAMPLES, derivative_errors, first_samples, shortened
+from .derivatives import SAMPLES, derivative_errors, shortened
 from .description import description_causes
 from .elements import ElementShape
 from .hold import Hold, hold_warnings, holds_of
 from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
+from .memory import nonzeros
 from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
 from .shape import BodyFinding, body_finding
 
@@ -64,6 +63,13 @@ class Findings:
         Distance of the markers from their measurements in the simulation at the guess.
     recordings : tuple of Recording, one for each experiment
     motions : tuple of Motion, one for each fitted experiment
+    variables, constraints : int
+        Of the program, without memory.
+    overstresses : int
+        As many of either are there beside them, of bodies with memory, for interior point and
+        others that see the whole program.
+    jacobian_nonzeros, hessian_nonzeros : int
+        With these.
     method : str
         The chosen one; `memory_mb` is what it takes, if it is among the `costs`.
     costs : tuple of Cost, one for each method of which they are known
@@ -86,6 +92,7 @@ class Findings:
     motions: tuple[Motion, ...]
     variables: int
     constraints: int
+    overstresses: int
     jacobian_nonzeros: int
     hessian_nonzeros: int
     method: str
@@ -126,7 +133,8 @@ def check_problem(problem: Problem) -> Findings:
     z, start_notes = initial_variables(collocation)
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
-    jacobian, hessian = _nonzeros(problem)
+    whole = with_explicit_memory(collocation)
+    jacobian, hessian = nonzeros(problem)
     method = _name(problem.method)
     found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
     chosen = next((cost for cost in found_costs if cost.method == method), None)
@@ -169,6 +177,7 @@ def check_problem(problem: Problem) -> Findings:
         motions=motions,
         variables=collocation.variables,
         constraints=collocation.constraints,
+        overstresses=whole.constraints - collocation.constraints,
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
         method=method,
@@ -222,22 +231,3 @@ def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[R
         at_samples = part.x[part.segment.observation.grid_rows]
         simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
-
-
-def _nonzeros(problem: Problem) -> tuple[int, int]:
-    """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many."""
-    short = shortened(problem, SAMPLES)
-    total = few = _counted(short)
-    for k, experiment in enumerate(problem.experiments):
-        if not experiment.validation:
-            parts = list(short.experiments)
-            parts[k] = first_samples(experiment, SAMPLES + 1)
-            more = _counted(replace(problem, experiments=parts)) - few
-            total = total + max(0, len(experiment.t_s) - SAMPLES) * more
-    return int(total[0]), int(total[1])
-
-
-def _counted(problem: Problem) -> NDArray[np.int64]:
-    collocation = problem.collocation()
-    structures = (collocation.jacobian_structure, collocation.hessian_structure)
-    return np.array([len(indices) for _, indices in structures])

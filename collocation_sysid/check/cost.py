@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,10 +10,12 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
+from ..fem.memory import branches_of
 from ..methods.reduced_space import memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.tangent import BlockSolver
+from .memory import interior_point_mb, machine_memory_mb
 
 # Rows timed, and sweeps that the reduced space mostly takes.
 ROWS, SWEEPS = 12, 10
@@ -22,7 +23,6 @@ ROWS, SWEEPS = 12, 10
 # iteration grows with the nonzeros and with the unknowns of a timestep to this power.
 ITERATIONS = 10
 SECONDS, POWER = 4.5e-10, 1.4
-BYTES = 280.0
 # A method is recommended to those who would wait this long, if it takes this share of the time.
 LONG_S, MUCH_QUICKER = 60.0, 0.1
 
@@ -54,23 +54,26 @@ def costs(
     collocation : Collocation
     z : (variables,) the start
     nonzeros : int
-        Of the Jacobian and the Hessian together.
+        Of the Jacobian and the Hessian that interior point gets, together.
     factorisation : {"auto", "band", "sparse"}
     """
-    width = max(len(segment.free_dofs) for segment in collocation.segments)
-    reduced = Cost(
-        "reduced-space", memory_mb(collocation), _sweeps_s(collocation, z, factorisation)
-    )
-    if collocation.remembers:  # other methods refuse it
-        return (reduced,)
+    width = max(unknowns_of_a_timestep(collocation))
     return (
-        reduced,
+        Cost("reduced-space", memory_mb(collocation), _sweeps_s(collocation, z, factorisation)),
         Cost(
             "interior-point",
-            BYTES * nonzeros / 1e6,
+            interior_point_mb(nonzeros),
             ITERATIONS * SECONDS * nonzeros * width**POWER,
         ),
     )
+
+
+def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
+    """What interior point has of each experiment, the overstress of its memory included."""
+    return [
+        len(segment.free_dofs) + sum(b.own.stop - b.own.start for b in branches_of(segment.body))
+        for segment in collocation.segments
+    ]
 
 
 def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
@@ -88,7 +91,7 @@ def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
 
 def cost_warnings(chosen: Cost, others: Sequence[Cost]) -> list[str]:
     """Whether the chosen method will run out of memory."""
-    available = _machine_memory_mb()
+    available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
         return []
     fitting = [cost for cost in others if cost.memory_mb < available]
@@ -112,10 +115,3 @@ def _sweeps_s(collocation: Collocation, z: Array, factorisation: Choice) -> floa
             return None
         total += len(part.x) / rows * (time.perf_counter() - began)
     return SWEEPS * total
-
-
-def _machine_memory_mb() -> float | None:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
-    except (AttributeError, OSError, ValueError):  # not on every system
-        return None

@@ -15,7 +15,7 @@ memory brings from the past, see `memory`, is given beside x and v; without it, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,7 +29,7 @@ from .damping import Damping
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
 from .materials import Energy, Material
-from .memory import Carried, Prony, point_places
+from .memory import Carried, Prony, point_places, width
 from .mesh import TetMesh
 from .model import Model, Theta
 from .nodes import Nodes
@@ -62,7 +62,7 @@ class Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """Second derivatives of φ = wᵀ f(x, v; θ) at T states; ∂²φ/∂v² is zero.
+    """Second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states; ∂²φ/∂v² is zero.
 
     Attributes
     ----------
@@ -337,14 +337,19 @@ class Body(Model):
 
     def _spread_stiffening(self, by_theta: Array, carried: Carried | None) -> None:
         """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""
-        for part, start in zip(self.parts, self.starts, strict=False):
-            first = start + part.of_law
-            columns = slice(first, first + 2 * len(part.prony))
-            if part.prony and carried is None:
+        for first, columns in self._memory_columns:
+            if carried is None:
                 by_theta[..., columns] = 0.0
-            elif part.prony and carried is not None:
+            else:
                 slopes = carried.slopes[:, None, columns]
                 by_theta[..., columns] = by_theta[..., first, None] * slopes
+
+    @cached_property
+    def _memory_columns(self) -> list[tuple[int, slice]]:
+        """The first and all of the places in θ of each part's branches."""
+        firsts = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
+        counts = [2 * len(part.prony) for part in self.parts]
+        return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
 
     @property
     def linearisation_width(self) -> int:
@@ -360,10 +365,21 @@ class Body(Model):
         theta: Theta,
         out: Array | None = None,
         dof_mass: Array | None = None,
+        carried: Carried | None = None,
+        stress_weights: Array | None = None,
     ) -> Curvature:
-        """Second derivatives of wᵀ f at T states, see `Curvature`; `weights` like `positions`."""
+        """Second derivatives of wᵀ f + σ·S at T states, see `Curvature` and `force`.
+
+        `weights` are like `positions`, and σ of what points with memory carry. H counts as given.
+        """
         x, v, w = self._states(positions, velocities, weights)
-        rows = self._evaluate("curvature", [x, v, w], theta, out)
+        if self.remembers:
+            carried = carried or Carried.nothing(self, len(x))
+            own = np.zeros_like(carried.overstress) if stress_weights is None else stress_weights
+            both = replace(carried, overstress=np.hstack([carried.overstress, own]))
+            rows = self._evaluate("curvature", [x, v, w], theta, out, both)
+        else:
+            rows = self._evaluate("curvature", [x, v, w], theta, out)
         size, entries, k = self.pattern.size, self.pattern.entries, len(self.constants)
         xx, xv, x_theta, v_theta, theta_theta, by_theta, skew = np.split(
             rows, np.cumsum([entries, entries, k * size, k * size, k * k, k]), axis=1
@@ -374,6 +390,13 @@ class Body(Model):
             v_theta[:, :, column] = -share * moving * w
             by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
         theta_theta = theta_theta.reshape(len(x), k, k)
+        for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
+            self._spread_stiffening(values, carried)
+        if carried is not None:
+            for first, columns in self._memory_columns:
+                bends = carried.bends[:, columns, columns]
+                theta_theta[:, columns, columns] += by_theta[:, first, None, None] * bends
+        self._spread_stiffening(by_theta[:, None], carried)
         return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew)
 
     @property
@@ -512,4 +535,6 @@ class Body(Model):
             [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
         )
         own = point_places(self, number) if memory else None
+        if own is not None and name == "curvature":
+            own = np.concatenate([own, own + width(self)], axis=-1)
         return Batch(kernel, cells, geometry, destinations, self._width(name), own)

@@ -8,7 +8,7 @@ v        3·nodes       node velocities [m/s]
 w        3·nodes       weights on the node forces (Lagrange multipliers)
 geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume [m³]
 theta    k             constants of the material, then of the damping law, then s
-carried  6             H
+carried  6             H; for second derivatives 12, H and the weights σ of S
 ======== ============= ==============================================================
 
 and outputs that are summed over points and elements. Matrices are given by the lower triangles of
@@ -18,7 +18,9 @@ All of them are derivatives of two scalars: an energy Θ(x, v) = Σ_q V_q (ψ + 
 potential of a damping law that has one, and half the power that one with a stress dissipates,
 D(x, v) = ½ Σ_q V_q P_v:Ḟ. The internal force is −∂Θ/∂x − ∂D/∂v. For Rayleigh's law that is
 −∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N. With memory, see `memory`,
-the point has the energy V_q ((1 + s) ψ + ½ H : FᵀF), and the damping law that of ψ.
+the point has the energy V_q ((1 + s) ψ + ½ H : FᵀF), and the damping law that of ψ. Second
+derivatives are then of σ·S besides, S being the second Piola–Kirchhoff stress of ψ by its entries
+xx, yy, zz, xy, xz, yz.
 """
 
 from __future__ import annotations
@@ -113,7 +115,7 @@ def _potential(point: Point, law: Law) -> ca.SX:
 def carried_energy(point: Point) -> ca.SX:
     """½ V H : FᵀF, whose slope by F is V F H."""
     F = point.felt
-    return point.volume * ca.trace(symmetric(point.carried) @ F.T @ F) / 2
+    return point.volume * ca.trace(symmetric(point.carried[:6]) @ F.T @ F) / 2
 
 
 def symmetric(six: ca.SX) -> ca.SX:
@@ -122,7 +124,25 @@ def symmetric(six: ca.SX) -> ca.SX:
     return ca.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def _stress(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
+UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def six_of(matrix: ca.SX) -> ca.SX:
+    """Those entries of a symmetric matrix."""
+    return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
+
+
+def first_piola(point: Point, law: Law) -> ca.SX:
+    """P (9,) = ∂ψ/∂F."""
+    return ca.gradient(law.psi(point.felt, point.theta), point.gradients["x"])
+
+
+def second_piola(point: Point, law: Law) -> ca.SX:
+    """S (6,) = F⁻¹ P."""
+    return six_of(ca.inv_minor(point.felt) @ ca.reshape(first_piola(point, law), 3, 3))
+
+
+def _damping(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
     """V P_v of one point, and its slope by F."""
     found = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.theta)
     return None if found is None else (point.volume * found[0], point.volume * found[1])
@@ -138,7 +158,7 @@ def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
     point = Point.of(element, law.constants, "x", "v", carried=law.carried)
     force = (Term(-_potential(point, law), ("x",)),)
-    if found := _stress(point, law):
+    if found := _damping(point, law):
         stress = -found[0]
         force += (Term(ca.dot(stress, point.felt_rate) / 2, ("v",), known=stress),)
     return kernel_of("force", point, {"force": force})
@@ -154,7 +174,7 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
         "by_velocity": (Term(potential, ("x", "v")),),
         "by_theta": (Term(potential, ("x", "theta")),),
     }
-    if found := _stress(point, law):
+    if found := _damping(point, law):
         stress, slope = -found[0], -found[1]
         # Half the power lost, which is quadratic in the rate: its slope by that is the stress.
         lost = ca.dot(stress, point.felt_rate) / 2
@@ -169,14 +189,16 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
 
 
 def curvature_kernel(element: Element, law: Law) -> PointKernel:
-    """Second derivatives of φ = wᵀ f(x, v; θ), and ∂φ/∂θ, which the chain rule needs.
+    """Second derivatives of φ = wᵀ f(x, v; θ) + σ·S, and ∂φ/∂θ, which the chain rule needs.
 
     ∂²φ/∂v² vanishes. ∂²φ/∂x∂v is symmetric where the force follows from a potential (Rayleigh:
     −γ_r D_wK).
     """
-    point = Point.of(element, law.constants, "x", "v", "w", carried=law.carried)
+    point = Point.of(element, law.constants, "x", "v", "w", carried=2 * law.carried)
     power = -point.along_w(_potential(point, law))
-    if found := _stress(point, law):
+    if law.memory:
+        power += ca.dot(point.carried[6:], second_piola(point, law))
+    if found := _damping(point, law):
         power -= ca.dot(found[0], point.felt_weight)
     mixed = Term(power, ("x", "v"), "symmetric" if found else "whole")
     outputs: Outputs = {

@@ -87,21 +87,20 @@ class Carried:
     overstress : (T, width) H [Pa]
     stiffening : (T, parts) s of each part
     slopes : (T, k) derivative of its part's s by each of θ
+    bends : (T, k, k) second derivatives; those by constants of different parts are zero
     """
 
     overstress: Array
     stiffening: Array
     slopes: Array
+    bends: Array
 
     @classmethod
     def nothing(cls, body: Body, states: int) -> Carried:
         """Of a body that has relaxed."""
-        sizes = (width(body), len(body.parts), len(body.constants))
-        return cls(*(np.zeros((states, size)) for size in sizes))
-
-    def __getitem__(self, rows: slice) -> Carried:
-        """Of some of the states."""
-        return Carried(self.overstress[rows], self.stiffening[rows], self.slopes[rows])
+        count = len(body.constants)
+        sizes = (width(body),), (len(body.parts),), (count,), (count, count)
+        return cls(*(np.zeros((states, *size)) for size in sizes))
 
     def runs(self, part: int) -> Iterator[tuple[slice, float]]:
         """Rows that follow one another with the same s of a part, and that."""
@@ -122,26 +121,30 @@ class Branch:
         Number of its part.
     points : slice
         Of what the body carries.
+    own : slice
+        Of what all branches carry, one after the other.
     share, tau : int
         Places of g and τ in θ.
     """
 
     part: int
     points: slice
+    own: slice
     share: int
     tau: int
 
 
 def branches_of(body: Body) -> list[Branch]:
     """All branches of a body."""
-    found = []
-    starts = _starts(body)
+    found: list[Branch] = []
+    starts, own = _starts(body), 0
     for number, part in enumerate(body.parts):
         first = body.starts[number] + part.of_law
         points = slice(starts[number], starts[number + 1])
-        found += [
-            Branch(number, points, first + 2 * k, first + 2 * k + 1) for k in range(len(part.prony))
-        ]
+        for k in range(len(part.prony)):
+            here = slice(own, own + points.stop - points.start)
+            found.append(Branch(number, points, here, first + 2 * k, first + 2 * k + 1))
+            own = here.stop
     return found
 
 
@@ -171,25 +174,44 @@ class Fading:
     ----------
     e, c : (N,)
     e_by, c_by : (2, N) by g, by τ
+    e_bent, c_bent : (2, 2, N)
     """
 
     e: Array
     c: Array
     e_by: Array
     c_by: Array
+    e_bent: Array
+    c_bent: Array
 
     @classmethod
     def over(cls, share: float, tau_s: float, spacing_s: Array) -> Fading:
         """Over intervals (N,) [s] in which S changes evenly."""
         ratio = spacing_s / tau_s
         e, lost = np.exp(-ratio), -np.expm1(-ratio) / ratio
-        by_tau = share * (lost - e) / tau_s
-        none = np.zeros_like(e)
-        return cls(e, share * lost, np.stack([none, e * ratio / tau_s]), np.stack([lost, by_tau]))
+        none, by_tau = np.zeros_like(e), (lost - e) / tau_s
+        e_bent, c_bent = e * ratio * (ratio - 2) / tau_s**2, -share * e * ratio / tau_s**2
+        return cls(
+            e,
+            share * lost,
+            np.stack([none, e * ratio / tau_s]),
+            np.stack([lost, share * by_tau]),
+            np.array([[none, none], [none, e_bent]]),
+            np.array([[none, by_tau], [by_tau, c_bent]]),
+        )
 
     @classmethod
     def after(cls, share: float, tau_s: float, held_s: float) -> Fading:
         """Of stress that came at once and was held for a time: Q = c S."""
-        e = np.exp(-np.array([held_s]) / tau_s)
-        by_tau = e * (held_s / tau_s**2 if np.isfinite(held_s) else 0.0)
-        return cls(e, share * e, np.stack([0 * e, by_tau]), np.stack([e, share * by_tau]))
+        # Of what was held forever nothing is left, and e · ratio is no number.
+        ratio = np.array([min(held_s / tau_s, 1e3)])
+        e = np.exp(-ratio)
+        none, by_tau, bent = 0 * e, e * ratio / tau_s, e * ratio * (ratio - 2) / tau_s**2
+        return cls(
+            e,
+            share * e,
+            np.stack([none, by_tau]),
+            np.stack([e, share * by_tau]),
+            np.array([[none, none], [none, bent]]),
+            np.array([[none, by_tau], [by_tau, share * bent]]),
+        )

@@ -16,6 +16,7 @@ from ..errors import InputError
 from .mesh_checks import (
     MeshQuality,
     checked_arrays,
+    checked_faces,
     checked_points,
     checked_tetrahedra,
     cleaned,
@@ -48,6 +49,8 @@ class TetMesh:
         Values per node, such as the 0/1 masks that a `Named` selection looks up.
     cell_arrays : mapping of name to (E, ...) array, optional
         The same per element.
+    face_sets : mapping of name to (k, 3) integer array, optional
+        Corners of triangles, such as those of a cavity's wall.
 
     Attributes
     ----------
@@ -69,6 +72,7 @@ class TetMesh:
     tetrahedra: np.ndarray
     point_arrays: dict[str, np.ndarray]
     cell_arrays: dict[str, np.ndarray]
+    face_sets: dict[str, np.ndarray]
     file_index: np.ndarray
     file_node_count: int
     notes: tuple[str, ...]
@@ -79,17 +83,22 @@ class TetMesh:
         tetrahedra: ArrayLike,
         point_arrays: Mapping[str, ArrayLike] | None = None,
         cell_arrays: Mapping[str, ArrayLike] | None = None,
+        face_sets: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         given = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(given))
         arrays = checked_arrays(point_arrays or {}, len(given), "point", "nodes")
         of_cells = checked_arrays(cell_arrays or {}, len(elements), "cell", "elements")
         points, elements, used, notes = cleaned(given, elements)
+        kept = np.full(len(given), -1)
+        kept[used] = np.arange(len(used))
+        faces = {name: kept[checked_faces(f, len(given))] for name, f in (face_sets or {}).items()}
         self._set(
             points_m=_read_only(points),
             tetrahedra=_read_only(elements),
             point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
             cell_arrays={name: _read_only(values) for name, values in of_cells.items()},
+            face_sets={name: _read_only(corners) for name, corners in faces.items()},
             file_index=_read_only(used),
             file_node_count=len(given),
             notes=notes,
@@ -111,7 +120,8 @@ class TetMesh:
 
         Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`; cell
         arrays, cell sets and physical groups of the tetrahedra become `cell_arrays`. The nodes of
-        sets and groups, also of those of triangles, lines or points, become `point_arrays` too.
+        sets and groups, also of those of triangles, lines or points, become `point_arrays` too,
+        and their triangles `face_sets`.
 
         Parameters
         ----------
@@ -125,9 +135,9 @@ class TetMesh:
             If the file cannot be read, holds no tetrahedra, their sides are curved by more than
             5 % of their length, or its mesh is refused.
         """
-        points_m, tetrahedra, of_points, of_cells, notes = read_tetrahedra(path, length_unit)
+        *arrays, notes = read_tetrahedra(path, length_unit)
         try:
-            mesh = cls(points_m, tetrahedra, of_points, of_cells)
+            mesh = cls(*arrays)
         except InputError as error:
             raise error.located(path) from None
         mesh._set(notes=(*notes, *mesh.notes))

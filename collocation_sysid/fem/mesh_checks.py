@@ -44,6 +44,17 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
     return array.astype(np.int64)
 
 
+def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
+    """Return an int64 copy of (k, 3) node numbers, all of them below `node_count`."""
+    array = np.array(faces)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
+        raise InputError(
+            f"a face set must be a (k, 3) array of node numbers, not {array.dtype} {array.shape}"
+        )
+    refuse_unknown_nodes(array, node_count)
+    return array.astype(np.int64)
+
+
 def refuse_unknown_nodes(cells: np.ndarray, node_count: int) -> None:
     """Refuse cells (E, k) with nodes that are not there."""
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))

@@ -18,6 +18,7 @@ from .quadratic import straightened
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 
 _TETRAHEDRA = ("tetra", "tetra10")
+_TRIANGLES = ("triangle", "triangle6")
 _SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 
 
@@ -29,9 +30,12 @@ def length_in_metres(length_unit: str) -> float:
     return METRES_PER_UNIT[length_unit]
 
 
+Arrays = dict[str, np.ndarray]
+
+
 def read_tetrahedra(
     path: str | Path, length_unit: str = "m"
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
     """Read the tetrahedra of a file, quadratic ones by their corners; other cells are left out.
 
     Returns
@@ -44,6 +48,9 @@ def read_tetrahedra(
         physical groups, whatever the dimension of their cells.
     cell_arrays : dict of name to (E, ...) array
         The same of the tetrahedra.
+    face_sets : dict of name to (k, 3) array
+        Triangles of the file, by their cell sets and physical groups, and the cell data that are 1
+        on them and 0 on others.
     notes : tuple of str
         Which cells were left out and which sides straightened, if any.
 
@@ -74,6 +81,7 @@ def read_tetrahedra(
         np.concatenate([block.data[:, :4] for block in blocks]),
         {**nodes, **_point_sets(data), **data.point_data},
         _of_tetrahedra(data, {**groups, **data.cell_data}),
+        _triangle_sets(data, {**groups, **data.cell_data}),
         notes,
     )
 
@@ -217,6 +225,19 @@ def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray
         if whole.dtype != bool or whole.any():
             kept[name] = whole
     return kept
+
+
+def _triangle_sets(data: Any, arrays: Mapping[str, Any]) -> Arrays:
+    """Corners of the triangles on which arrays given block by block are 1."""
+    blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
+    found = {}
+    for name, per_block in arrays.items():
+        masks = [np.asarray(per_block[k]) for k in blocks]
+        if masks and all(m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks):
+            chosen = [data.cells[k].data[m == 1, :3] for k, m in zip(blocks, masks, strict=True)]
+            if any(map(len, chosen)):
+                found[name] = np.concatenate(chosen)
+    return found
 
 
 def _fan(polygons: np.ndarray) -> np.ndarray:

@@ -49,6 +49,16 @@ class Mesh(Protocol):
         """Values per cell, by name."""
         ...
 
+    @property
+    def face_sets(self) -> Mapping[str, np.ndarray]:
+        """Triangles (k, 3), by name."""
+        ...
+
+    @cached_property
+    def surface(self) -> np.ndarray:
+        """(F, 3) boundary triangles."""
+        ...
+
     @cached_property
     def centres_m(self) -> np.ndarray:
         """(E, 3) of the cells."""
@@ -103,3 +113,12 @@ class Nodes:
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Extend a choice of mesh nodes to mid nodes: chosen when both ends of the edge are."""
         return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
+
+    def on_faces(self, triangles: Index) -> Index:
+        """Nodes (F, 3) or (F, 6) of triangles of corners: then those on the edges ab, bc, ca."""
+        if not len(self.ends):
+            return triangles
+        count = len(self.mesh.points_m)
+        pairs = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2)
+        edge = np.searchsorted(self.ends @ [count, 1], pairs @ [count, 1])
+        return np.hstack([triangles, count + edge])

@@ -38,8 +38,14 @@ class SymmetricPattern:
         row = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
         column = np.tile(dofs, dofs.shape[1]).ravel()
         lower = row >= column
-        codes = np.unique(column[lower] * (3 * nodes) + row[lower])
-        return cls(3 * nodes, codes % (3 * nodes), codes // (3 * nodes))
+        return cls.of_entries(row[lower], column[lower], nodes)
+
+    @classmethod
+    def of_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
+        """The pattern with these entries, rows >= columns, and the diagonal."""
+        size = 3 * nodes
+        codes = np.unique(np.append(columns * size + rows, np.arange(size) * (size + 1)))
+        return cls(size, codes % size, codes // size)
 
     @property
     def entries(self) -> int:

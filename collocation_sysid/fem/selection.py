@@ -1,6 +1,7 @@
-"""Selections: which nodes are grasped, loaded or observed, and which cells make up a region.
+"""Selections: which nodes are grasped, loaded or observed, which cells make up a region, and on
+which faces of the boundary a pressure acts.
 
-A cell is in a box or a ball when its centre is.
+A cell is in a box or a ball when its centre is, a face when its corners are.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, hint_at
+from .nodes import Nodes
 
 if TYPE_CHECKING:
-    from .nodes import Mesh, Nodes
+    from .nodes import Mesh
 
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
 ROUND_OFF = 1e-9
@@ -52,6 +54,10 @@ class Box:
         """Return the selected cells, sorted."""
         return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
 
+    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+        """Return the selected rows of `mesh.surface`, sorted."""
+        return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
+
     def _holds(self, points_m: np.ndarray) -> np.ndarray:
         slack = _round_off_m(points_m)
         above = points_m >= np.subtract(self.low_m, slack)
@@ -85,6 +91,10 @@ class Ball:
     def resolve_cells(self, mesh: Mesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
+
+    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+        """Return the selected rows of `mesh.surface`, sorted."""
+        return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
 
     def _distance_m(self, points_m: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points_m - np.array(self.center_m), axis=1)
@@ -144,6 +154,12 @@ class Indices:
         chosen = np.isin(np.arange(count), self.indices)
         return _chosen_cells(chosen, mesh, "an empty list of indices")
 
+    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+        """Return the rows of `mesh.surface` whose corners are all among the nodes."""
+        nodes = self.resolve(Nodes.corners(mesh))
+        chosen = np.isin(np.arange(len(mesh.points_m)), nodes)
+        return _chosen_faces(chosen, mesh, "the list of indices")
+
 
 @dataclass(frozen=True)
 class Named:
@@ -167,14 +183,42 @@ class Named:
         what = f'cell array "{self.name}"'
         return _chosen_cells(self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what), mesh, what)
 
-    def _mask(self, arrays: Mapping[str, np.ndarray], count: int, what: str) -> np.ndarray:
+    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+        """Return the selected rows of `mesh.surface`, sorted.
+
+        They are the triangles of a face set, or those whose corners are all in a point array.
+        """
+        if self.name not in mesh.face_sets:
+            mask = self._mask(
+                mesh.point_arrays,
+                len(mesh.points_m),
+                f'point array "{self.name}"',
+                "group of faces",
+            )
+            return _chosen_faces(mask, mesh, f'point array "{self.name}"')
+        wanted = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
+        there = {
+            tuple(face): row for row, face in enumerate(np.sort(mesh.surface, axis=1).tolist())
+        }
+        rows = [there.get(tuple(face), -1) for face in wanted.tolist()]
+        if inner := rows.count(-1):
+            raise InputError(
+                f'{inner} of the {len(rows)} faces of "{self.name}" are not on the boundary of the '
+                "body; a pressure acts on faces that have the material on one side only"
+            )
+        return np.sort(np.array(rows, dtype=np.int64))
+
+    def _mask(
+        self, arrays: Mapping[str, np.ndarray], count: int, what: str, lacking: str = ""
+    ) -> np.ndarray:
         kind = what.split(" ", 1)[0]
         if self.name not in arrays:
             names = ", ".join(f'"{name}"' for name in arrays if not name.startswith("gmsh:"))
             available = f"it has {names}" if names else "it has none"
             hint = hint_at(self.name, arrays)
             raise InputError(
-                f'the mesh has no {kind} array or group "{self.name}"; {available}{hint}'
+                f'the mesh has no {lacking or f"{kind} array or group"} "{self.name}"; '
+                f"{available}{hint}"
             )
         values = arrays[self.name]
         if values.size != count:
@@ -197,6 +241,16 @@ def _chosen_cells(mask: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:
     if not mask.any():
         raise InputError(
             f"{what} selects none of the {len(mask)} cells, by their centres; the body spans "
+            f"{_span(mesh.bounds_m)}"
+        )
+    return np.flatnonzero(mask).astype(np.int64)
+
+
+def _chosen_faces(chosen_nodes: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:
+    mask = chosen_nodes[mesh.surface].all(axis=1)
+    if not mask.any():
+        raise InputError(
+            f"{what} holds no face of the boundary with all its corners; the body spans "
             f"{_span(mesh.bounds_m)}"
         )
     return np.flatnonzero(mask).astype(np.int64)

@@ -11,15 +11,17 @@ S, H and E by their entries xx, yy, zz, xy, xz, yz.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from .batched import Batch, Evaluator
 from .elements import Element
-from .expressions import Law, carried_energy
+from .expressions import Law, carried_energy, first_piola, second_piola, six_of
 from .kernel import PointKernel
 from .memory import point_places, width
 from .pattern import dofs_of
@@ -27,22 +29,6 @@ from .point import Pieces, Point
 
 if TYPE_CHECKING:
     from .body import Body
-
-UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-def _first_piola(point: Point, law: Law) -> ca.SX:
-    """P (9,) = ∂ψ/∂F."""
-    return ca.gradient(law.psi(point.felt, point.theta), point.gradients["x"])
-
-
-def _six(matrix: ca.SX) -> ca.SX:
-    return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
-
-
-def _stress(point: Point, law: Law) -> ca.SX:
-    """S (6,) = F⁻¹ P."""
-    return _six(ca.inv_minor(point.felt) @ ca.reshape(_first_piola(point, law), 3, 3))
 
 
 def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
@@ -53,30 +39,30 @@ def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
 def stress_kernel(element: Element, law: Law) -> PointKernel:
     """S."""
     point = Point.of(element, law.constants, "x")
-    return _kernel("stress", point, {"stress": ("none", _stress(point, law))})
+    return _kernel("stress", point, {"stress": ("none", second_piola(point, law))})
 
 
 def stress_by_theta_kernel(element: Element, law: Law) -> PointKernel:
     """∂S/∂θ by the material's constants, column after column."""
     point = Point.of(element, law.constants, "x")
-    by_theta = ca.jacobian(_stress(point, law), point.theta)[:, : len(law.material.constants)]
+    by_theta = ca.jacobian(second_piola(point, law), point.theta)[:, : len(law.material.constants)]
     return _kernel("stress_by_theta", point, {"stress_by_theta": ("none", ca.vec(by_theta))})
 
 
 def stress_along_kernel(element: Element, law: Law) -> PointKernel:
     """∂S/∂x v: dS = F⁻¹ (dP − dF S)."""
     point = Point.of(element, law.constants, "x", "v")
-    F, first, rate = point.gradients["x"], _first_piola(point, law), point.gradients["v"]
+    F, first, rate = point.gradients["x"], first_piola(point, law), point.gradients["v"]
     inverse = ca.inv_minor(point.felt)
     stress = inverse @ ca.reshape(first, 3, 3)
     change = ca.reshape(ca.jtimes(first, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
-    return _kernel("stress_along", point, {"stress_along": ("none", _six(inverse @ change))})
+    return _kernel("stress_along", point, {"stress_along": ("none", six_of(inverse @ change))})
 
 
 def pulled_kernel(element: Element, law: Law) -> PointKernel:
     """(∂S/∂x)ᵀ σ of what the points carry."""
     point = Point.of(element, law.constants, "x", carried=6)
-    slope = ca.gradient(ca.dot(point.carried, _stress(point, law)), point.gradients["x"])
+    slope = ca.gradient(ca.dot(point.carried, second_piola(point, law)), point.gradients["x"])
     return _kernel("pulled", point, {"pulled": ("nodes", slope)})
 
 
@@ -92,10 +78,27 @@ def against_kernel(element: Element, law: Law) -> PointKernel:
     point = Point.of(element, law.constants, "x", "v", carried=6)
     power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
     by_carried = ca.gradient(power, point.carried)
-    bare = Point(
-        point.nodes, point.fields, point.geometry, point.theta, point.gradients, (), ca.SX(0, 1)
-    )
-    return _kernel("against", bare, {"against": ("none", by_carried)})
+    return _kernel("against", _bare(point), {"against": ("none", by_carried)})
+
+
+def stress_slope_kernel(element: Element, law: Law) -> PointKernel:
+    """(∂S/∂x)ᵀ, column after column."""
+    point = Point.of(element, law.constants, "x")
+    slope = ca.jacobian(second_piola(point, law), point.gradients["x"]).T
+    return _kernel("stress_slope", point, {"stress_slope": ("nodes", slope)})
+
+
+def force_slope_kernel(element: Element, law: Law) -> PointKernel:
+    """∂f_H/∂H, column after column."""
+    point = Point.of(element, law.constants, "x", carried=6)
+    force = -ca.gradient(carried_energy(point), point.gradients["x"])
+    by_carried = ca.jacobian(force, point.carried)
+    return _kernel("force_slope", _bare(point), {"force_slope": ("nodes", by_carried)})
+
+
+def _bare(point: Point) -> Point:
+    """The same, for what H has gone from."""
+    return replace(point, stretches=(), carried=ca.SX(0, 1))
 
 
 KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {
@@ -105,7 +108,23 @@ KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {
     "pulled": pulled_kernel,
     "carried_force": carried_force_kernel,
     "against": against_kernel,
+    "stress_slope": stress_slope_kernel,
+    "force_slope": force_slope_kernel,
 }
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeEntries:
+    """Which number of a row of slopes is the derivative of, or by, what.
+
+    Attributes
+    ----------
+    points : (K,) place in what the points carry
+    dofs : (K,) degree of freedom
+    """
+
+    points: Index
+    dofs: Index
 
 
 class Stresses:
@@ -153,6 +172,34 @@ class Stresses:
     def against(self, x: Array, direction: Array, theta: Array) -> Array:
         """(∂f_H/∂H)ᵀ direction, (T, width)."""
         return self._of_points("against", [x, direction], theta)
+
+    @cached_property
+    def slope_entries(self) -> SlopeEntries:
+        """Those of `stress_slopes` and `force_slopes`."""
+        points, dofs = [], []
+        for number, part in enumerate(self.body.parts):
+            if part.prony:
+                own = point_places(self.body, number)
+                of_cells = dofs_of(self.body.cells[part.cells])
+                shape = (*own.shape, of_cells.shape[1])
+                points.append(np.broadcast_to(own[..., None], shape).ravel())
+                dofs.append(np.broadcast_to(of_cells[:, None, None], shape).ravel())
+        return SlopeEntries(np.concatenate(points), np.concatenate(dofs))
+
+    def stress_slopes(self, x: Array, theta: Array) -> Array:
+        """∂S/∂x, (T, K)."""
+        return self._slopes("stress_slope", x, theta)
+
+    def force_slopes(self, x: Array, theta: Array) -> Array:
+        """∂f_H/∂H, (T, K); it is linear in x."""
+        return self._slopes("force_slope", x, theta)
+
+    def _slopes(self, name: str, x: Array, theta: Array) -> Array:
+        out = np.zeros((len(x), len(self.slope_entries.points)))
+        for number, part in enumerate(self.body.parts):
+            if part.prony:
+                self._run(name, number, [x], theta, out, add=True)
+        return out
 
     def _of_points(
         self, name: str, fields: list[Array], theta: Array, out: Array | None = None
@@ -205,7 +252,12 @@ class Stresses:
         cells = np.repeat(body.cells[part.cells], points, axis=0)
         geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)
         own = places.reshape(len(cells), 1, 6)
-        if "nodes" in kernel.contractions.values():
+        if name.endswith("_slope"):
+            # 3n for each of what the points carry, part after part.
+            per_number, length = dofs_of(cells).shape[1], len(self.slope_entries.points)
+            numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
+            destinations = per_number * places[0, 0, 0] + numbers
+        elif "nodes" in kernel.contractions.values():
             destinations, length = dofs_of(cells), body.pattern.size
         elif name == "stress_by_theta":
             columns = places.size * np.arange(len(part.material.constants))

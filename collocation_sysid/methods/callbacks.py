@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import carried_over
 from .recorder import Recorder
 
 HessianValues = Callable[[Array, float, Array, Array], None]
@@ -225,9 +226,11 @@ def _ints(values: NDArray[np.int64]) -> list[int]:
 class Monitor(ca.Callback):
     """Follows the iterates: history, best point, and the wish to stop."""
 
-    def __init__(self, recorder: Recorder, errors: list[BaseException]) -> None:
+    def __init__(
+        self, recorder: Recorder, program: Collocation, errors: list[BaseException]
+    ) -> None:
         ca.Callback.__init__(self)
-        self.recorder, self.errors = recorder, errors
+        self.recorder, self.program, self.errors = recorder, program, errors
         self.stop = False
         self.best: tuple[Array, Array] | None = None
         self.seconds = 0.0
@@ -241,13 +244,13 @@ class Monitor(ca.Callback):
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        collocation = self.recorder.collocation
+        program = self.program
         sizes = {
-            "x": collocation.variables,
+            "x": program.variables,
             "f": 1,
-            "g": collocation.constraints,
-            "lam_x": collocation.variables,
-            "lam_g": collocation.constraints,
+            "g": program.constraints,
+            "lam_x": program.variables,
+            "lam_g": program.constraints,
         }
         return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
 
@@ -266,5 +269,6 @@ class Monitor(ca.Callback):
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
         if merit < self._best_merit:
             self._best_merit, self.best = merit, (z, multipliers)
-        recorder = self.recorder
-        recorder.line(len(recorder.history), z, float(value[0]) / recorder.collocation.loss_scale)
+        recorder, loss = self.recorder, float(value[0]) / self.program.loss_scale
+        at = carried_over(z, self.program, recorder.collocation)
+        recorder.line(len(recorder.history), at, loss)

@@ -85,7 +85,10 @@ class CasadiSolver(Options):
         """
         recorder = Recorder(self.name, collocation, watch, self.max_time_s)
         plugin = self.name.removeprefix(PREFIX)
-        hessian = _curvature(collocation, self.hessian)
+
+        def hessian(program: Collocation) -> HessianValues:
+            return _curvature(program, self.hessian)
+
         found = nlpsol.solve(recorder, start, plugin, hessian, self._settings, self.statuses)
         status = _judged(found.status, collocation, found.z, found.multipliers)
         return recorder.solution(

@@ -136,7 +136,7 @@ class _Climb:
 
         def follow(line: Iteration) -> None:
             number, time_s = line.number + before, line.time_s + elapsed_s
-            recorder.add(replace(line, number=number, time_s=time_s))
+            recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
         found = self.method(part, follow, start)
         self._learn(found, share)

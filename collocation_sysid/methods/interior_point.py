@@ -110,7 +110,10 @@ class InteriorPoint(Options):
             If IPOPT does not know an option.
         """
         recorder = Recorder(self.name, collocation, watch)
-        hessian = _DampedHessian(collocation, self)
+
+        def hessian(program: Collocation) -> _DampedHessian:
+            return _DampedHessian(program, self)
+
         found = nlpsol.solve(recorder, start, "ipopt", hessian, self._settings, IPOPT_STATUS)
         if found.said == "Invalid_Option":
             recorder.notes.append(

@@ -4,6 +4,7 @@
 
 with loss and rows in the scaling of the NLP and y = 0 for a penalty. Grasped nodes are variables
 too, tied by rows of their own; variables whose bounds are equal, such as a given start, are not.
+So is what bodies with memory carry, see `explicit_memory`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import scipy.sparse as sp
 
 from ..arrays import Array, Index
 from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import carried_over, with_explicit_memory
 from ..nlp.stopwatch import Stopwatch
 
 
@@ -24,13 +26,13 @@ class Unconstrained:
     Parameters
     ----------
     collocation : Collocation
-        As given, in either layout; variables are the same in both.
+        As given, with either kind of grasps.
     stopwatch : Stopwatch, optional
 
     Attributes
     ----------
     nlp : Collocation
-        With explicit grasps.
+        With explicit grasps, and explicit memory.
     lower, upper : (variables,) bounds
     free : (variables,) bool, what is not given
     bounded : (k,) positions of the free variables p that may have bounds: q and φ
@@ -41,7 +43,8 @@ class Unconstrained:
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
             explicit = collocation.explicit_grasps
-            self.nlp = collocation if explicit else replace(collocation, explicit_grasps=True)
+            grasped = collocation if explicit else replace(collocation, explicit_grasps=True)
+            self.nlp = with_explicit_memory(grasped)
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraints, self.nlp.variables)
             self._entries = np.zeros(len(indices))
@@ -87,20 +90,29 @@ class Unconstrained:
 
     # Answering for the collocation given ------------------------------------------------------
 
-    def grasped(self, z: Array) -> Array:
-        """The point with all held nodes exactly where their grasps are."""
+    def began(self, z: Array) -> Array:
+        """Variables from those of the given collocation."""
+        return carried_over(z, self.given, self.nlp)
+
+    def answer(self, z: Array) -> Array:
+        """Variables of the given collocation, all held nodes exactly where their grasps are."""
         moved = [part.segment.grasped(part.x, part.phi) for part in self.nlp.parts(z)]
         there = self.nlp.pack(self.nlp.parameters_of(z), moved)
         there[~self.free] = z[~self.free]
-        return there if self.is_upright(there) else z
+        return carried_over(there if self.is_upright(there) else z, self.nlp, self.given)
 
     def multipliers(self, explicit: Array) -> Array:
         """Multipliers of the given collocation's rows from those of all rows."""
-        if self.nlp is self.given:
-            return explicit
         pairs = zip(self.given.segments, self.nlp.segments, strict=True)
-        rows = ((given, explicit[s.rows].reshape(-1, s.dofs)) for given, s in pairs)
-        return np.concatenate([each[:, given.row_dofs].ravel() for given, each in rows])
+        rows = ((given, s, explicit[s.rows]) for given, s in pairs)
+        return np.concatenate(
+            [
+                each
+                if given.rows_per_time == s.rows_per_time
+                else each.reshape(-1, s.dofs)[:, given.row_dofs].ravel()
+                for given, s, each in rows
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,8 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
+from ..nlp.collocation import Collocation
+from ..nlp.explicit_memory import carried_over, with_explicit_memory
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .recorder import Recorder
 from .solution import Status
@@ -56,11 +58,13 @@ def solve(
     recorder: Recorder,
     start: Array | None,
     plugin: str,
-    hessian: HessianValues,
+    hessian: Callable[[Collocation], HessianValues],
     settings: Settings,
     statuses: Mapping[str, Status],
 ) -> Outcome:
     """Solve the recorder's collocation; Ctrl-C ends it after the iteration.
+
+    The solver gets the program with the memory of bodies as variables, see `explicit_memory`.
 
     Parameters
     ----------
@@ -68,7 +72,7 @@ def solve(
     start : (variables,) ndarray, optional
     plugin : str
     hessian : callable
-        Writes second derivatives, see `NlpFunctions`.
+        Of that program, what writes second derivatives, see `NlpFunctions`.
     settings : callable
         The plugin's settings, given the functions.
     statuses : mapping
@@ -83,11 +87,13 @@ def solve(
     errors: list[BaseException] = []
     with watch.building():
         start = recorder.start(start)
-        functions = NlpFunctions(collocation, hessian, errors)
-        monitor = Monitor(recorder, errors)
+        program = with_explicit_memory(collocation)
+        functions = NlpFunctions(program, hessian(program), errors)
+        monitor = Monitor(recorder, program, errors)
         given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
         solver = _nlpsol(plugin, functions, given)
-    z, multipliers, said, count = _run(solver, collocation.bounds(), start, monitor)
+    began = carried_over(start, collocation, program)
+    z, multipliers, said, count = _run(solver, program.bounds(), began, monitor)
     if errors:
         raise errors[0]
     watch.evaluations = functions.seconds
@@ -98,10 +104,11 @@ def solve(
     if monitor.stop or (recorder.late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
-        z, multipliers = monitor.best or (start, np.zeros(collocation.constraints))
+        z, multipliers = monitor.best or (began, np.zeros(program.constraints))
     # A solver that never began leaves its count as memory had it.
     iterations = 0 if status is Status.REFUSED else count or max(0, len(recorder.history) - 1)
-    return Outcome(status, said, z, multipliers, iterations, functions.calls)
+    answer = carried_over(z, program, collocation), multipliers[: collocation.constraints]
+    return Outcome(status, said, *answer, iterations, functions.calls)
 
 
 def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
@@ -138,18 +145,25 @@ def _run(
 
 @contextmanager
 def _interruptible(monitor: Monitor) -> Iterator[None]:
-    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program."""
+    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program.
+
+    So does SIGTERM where it is heeded as Ctrl-C is.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.getsignal(signal.SIGINT)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if handlers[signal.SIGTERM] is not signal.default_int_handler:
+        del handlers[signal.SIGTERM]
 
-    def request(_number: int, _frame: object) -> None:
+    def request(number: int, _frame: object) -> None:
         monitor.stop = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(number, signal.default_int_handler)
 
-    signal.signal(signal.SIGINT, request)
+    for number in handlers:
+        signal.signal(number, request)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, previous in handlers.items():
+            signal.signal(number, previous)

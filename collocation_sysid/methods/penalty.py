@@ -252,7 +252,8 @@ class _Climb:
         self.options, self.recorder = options, recorder
         self.problem = Unconstrained(recorder.collocation, recorder.stopwatch)
         nlp = self.problem.nlp
-        self.z = np.clip(recorder.start(start), self.problem.lower, self.problem.upper)
+        began = self.problem.began(recorder.start(start))
+        self.z = np.clip(began, self.problem.lower, self.problem.upper)
         if not self.problem.is_upright(self.z):
             raise InputError("elements are inverted at the start; start from another point")
         no_weights = np.zeros(nlp.constraints)
@@ -286,7 +287,7 @@ class _Climb:
         return self.recorder.solution(
             status,
             f"{why} At ρ = {merit.rho:.3g} {self._slack()} is left.",
-            self._answer(),
+            self.problem.answer(self.z),
             self.problem.multipliers(estimate),
             self.iterations,
             self.problem.evaluations,
@@ -325,16 +326,12 @@ class _Climb:
         return replace(stage, gradient=self.gradient, reached=reached, slack=self._slack())
 
     def _record(self) -> None:
-        nlp, z = self.problem.nlp, self._answer()
+        nlp, z = self.problem.given, self.problem.answer(self.z)
         self.recorder.line(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
-
-    def _answer(self) -> Array:
-        """The last iterate with held nodes where their grasps are."""
-        return self.problem.grasped(self.z)
 
     def _slack(self) -> Slack:
         """How far the answer is from satisfying the equations of motion."""
-        nlp, z = self.problem.nlp, self._answer()
+        nlp, z = self.problem.given, self.problem.answer(self.z)
         newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.violations_n(z))
         rows = self.problem.constraint_values(self.z)
         scaled = float(np.abs(rows).max(initial=0.0))

@@ -8,16 +8,13 @@ from collections.abc import Callable
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError, SimulationError
+from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
 from .method import Watch
 from .multipliers import constraint_multipliers
 from .solution import Iteration, Solution, Status, Timing
 from .start import initial_variables
-
-# Methods that need no matrix of ∂g/∂z, in which the memory of a body would fill whole columns.
-WITH_MEMORY = ("reduced-space", "shooting", "continuation")
 
 
 class Ended(Exception):
@@ -40,11 +37,6 @@ class Recorder:
         Called with every line of the history.
     max_time_s : float
 
-    Raises
-    ------
-    InputError
-        For a body with memory, if the method cannot have one.
-
     Attributes
     ----------
     history : list of Iteration
@@ -59,11 +51,6 @@ class Recorder:
         watch: Watch | None = None,
         max_time_s: float = np.inf,
     ) -> None:
-        if collocation.remembers and method not in WITH_MEMORY:
-            raise InputError(
-                f"method '{method}' cannot solve for materials with memory (prony); expected "
-                f"{', '.join(WITH_MEMORY)}"
-            )
         self.began = time.perf_counter()
         self.method, self.collocation, self.watch = method, collocation, watch
         self.max_time_s = max_time_s

@@ -302,4 +302,5 @@ class Search:
         rms_m = float(np.sqrt(distances.mean())) if len(distances) else 0.0
         values = self.collocation.values(p)
         time_s = self.recorder.elapsed_s
-        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s))
+        share = sum(map(len, x)) / sum(s.grid_rows for s in self.collocation.segments)
+        self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s, share))

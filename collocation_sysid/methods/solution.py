@@ -65,7 +65,11 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Iteration:
-    """One line of the history; the parameters by the user's names."""
+    """One line of the history; the parameters by the user's names.
+
+    The loss is that of the first `share` of the timesteps where a method takes them one part after
+    the other: it rises where the next part comes in.
+    """
 
     number: int
     loss: float
@@ -73,6 +77,7 @@ class Iteration:
     violation_n: float
     parameters: dict[str, float]
     time_s: float
+    share: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -71,17 +71,28 @@ class Part:
     q : (nq,) shared parameters
     phi : (k,) its nuisance parameters
     x : (N, 3n) positions [m], or its first rows
+    brought : (N, …) or None
+        What the evaluations bring from the past, where it is given; see `Dynamics`.
     """
 
     segment: Segment
     q: Array
     phi: Array
     x: Array
+    brought: Array | None = None
 
     @cached_property
     def setting(self) -> Setting:
         """The physical parameters."""
-        return self.segment.setting(self.q, self.phi)
+        found = self.segment.setting(self.q, self.phi)
+        if self.brought is None:
+            return found
+        return replace(found, dynamics=replace(found.dynamics, brought=self.brought))
+
+    @cached_property
+    def sensing(self) -> Sensing:
+        """Its sensors."""
+        return Sensing(self.segment, self.setting, self.phi)
 
     @cached_property
     def sensing(self) -> Sensing:
@@ -350,11 +361,15 @@ class Collocation:
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
+        return self.linearised(self.parts(z), out)
+
+    def linearised(self, parts: Sequence[Part], out: Array | None = None) -> tuple[Array, Array]:
+        """The same where the experiments are, at the memory as it is."""
         values = np.empty(len(self.jacobian_structure[1])) if out is None else out
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
         rows, by_phi = np.empty(self.constraints), []
         used = columns.size
-        for part in self.parts(z):
+        for part in parts:
             segment = part.segment
             here = values[used : used + segment.jacobian.nnz]
             found, by_p = segment.constraints_and_jacobian(part.x, part.setting, here)
@@ -426,22 +441,44 @@ class Collocation:
         self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
     ) -> Array:
         """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
+        return self.curved(self.parts(z), loss_weight, multipliers, out)
+
+    def curved(
+        self,
+        parts: Sequence[Part],
+        loss_weight: float,
+        multipliers: Array,
+        out: Array | None = None,
+        memory_weights: Mapping[int, Sequence[Array]] | None = None,
+    ) -> Array:
+        """The same where the experiments are, at the memory as it is.
+
+        With weights of the memory's equations, by the number of the experiment, see `Segment`.
+        """
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
         used = self.nq * (self.nq + 1) // 2
         phi = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
         by_q = np.zeros((self.nq, self.nq))
         weight = loss_weight * self.loss_scale
-        for part in self.parts(z):
+        for number, part in enumerate(parts):
             segment = part.segment
             of_x = segment.hessian_layout.x_entries
             of_phi = segment.hessian_layout.entries - of_x
             here = np.empty(of_x + of_phi) if of_phi else values[used : used + of_x]
             of_rows = multipliers[segment.rows]
-            by_q += segment.hessian_values(part.x, part.phi, part.setting, of_rows, weight, here)
+            by_q += segment.hessian_values(
+                part.x,
+                part.phi,
+                part.setting,
+                of_rows,
+                weight,
+                here,
+                (memory_weights or {}).get(number, ()),
+            )
             if of_phi:
                 values[used : used + of_x], values[phi : phi + of_phi] = here[:of_x], here[of_x:]
             used, phi = used + of_x, phi + of_phi
-        _, slopes = self.parameters.prior(z[: self.nq])
+        _, slopes = self.parameters.prior(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
         order = np.lexsort((rows, columns))

@@ -14,7 +14,7 @@ from ..fem.body import Body, Linearisation
 from ..fem.memory import Carried
 from ..fem.pattern import SymmetricPattern
 from .forces import Forces, per_dof
-from .memory import History
+from .memory import History, Recursion, recursions_of
 from .schemes import QUASI_STATIC, Scheme, as_scheme
 
 
@@ -65,6 +65,9 @@ class Dynamics:
         How long the body has been in its start shape; infinite where its memory has relaxed.
     static : bool
         Whether each row is an equilibrium of its own.
+    brought : (N, all branches) or None
+        What the evaluations bring from the past, m_{k−1} of each branch in turn, where it is given
+        instead of following from x.
     """
 
     body: Body
@@ -77,6 +80,7 @@ class Dynamics:
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
     static: bool = False
+    brought: Array | None = None
 
     @classmethod
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
@@ -149,6 +153,13 @@ class Dynamics:
         return xi[self.first_row :], nu[self.first_row :]
 
     @property
+    def state_weights(self) -> Array:
+        """(N, reach + 1) p, and that of a given start: only its stress is evaluated there."""
+        weights = self.tables.p.copy()
+        weights[: self.first_row, 0] = 1.0
+        return weights
+
+    @property
     def until_next_s(self) -> Array:
         """(N,) time from each evaluation to the next."""
         if self.static:
@@ -160,10 +171,13 @@ class Dynamics:
         """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing."""
         if not self.body.remembers:
             return None
-        xi = self.combine(self.tables.p[: len(x)], x)
-        xi[: self.first_row] = x[: self.first_row]
+        xi = self.combine(self.state_weights[: len(x)], x)
         intervals = self.until_next_s[: len(x)]
-        return History.of(self.body, xi, theta, intervals, self.loaded_since_s)
+        return History.of(self.body, xi, theta, intervals, self.loaded_since_s, self.brought)
+
+    def recursions(self, theta: Array) -> list[Recursion]:
+        """How each branch of the memory fades over all evaluations."""
+        return recursions_of(self.body, theta, self.until_next_s, self.loaded_since_s)
 
     def carried(self, history: History | None, rows: slice | None = None) -> Carried | None:
         """What rows `first_row`…, or some, bring from the past."""

@@ -111,10 +111,18 @@ class Forces:
         return self.body.linearisation_width
 
     def curvature(
-        self, xi: Array, nu: Array, weights: Array, theta: Array, out: Array | None = None
+        self,
+        xi: Array,
+        nu: Array,
+        weights: Array,
+        theta: Array,
+        out: Array | None = None,
+        carried: Carried | None = None,
+        stress_weights: Array | None = None,
     ) -> Curvature:
-        """Second derivatives of weightsᵀ F; `out` is (T, `curvature_width`)."""
-        return self.body.curvature(xi, nu, weights, theta, out, self.mass_kg)
+        """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
+        mass = self.mass_kg
+        return self.body.curvature(xi, nu, weights, theta, out, mass, carried, stress_weights)
 
     @property
     def curvature_width(self) -> int:

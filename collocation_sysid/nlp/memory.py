@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array
-from ..fem.body import Body
+from ..fem.body import Body, Curvature
 from ..fem.memory import Branch, Carried, Fading, branches_of
 
 # Stress slopes of so many evaluations are kept at a time.
@@ -39,6 +39,7 @@ class Recursion:
     branch : Branch
     c, d, a : (N,)
     c_by, d_by, a_by : (2, N)
+    c_bent, d_bent, a_bent : (2, 2, N)
     """
 
     branch: Branch
@@ -48,6 +49,9 @@ class Recursion:
     c_by: Array
     d_by: Array
     a_by: Array
+    c_bent: Array
+    d_bent: Array
+    a_bent: Array
 
     @classmethod
     def of(cls, branch: Branch, theta: Array, until_next_s: Array, loaded_s: float) -> Recursion:
@@ -55,10 +59,26 @@ class Recursion:
         share, tau_s = float(theta[branch.share]), float(theta[branch.tau])
         begun = Fading.after(share, tau_s, loaded_s)
         on = Fading.over(share, tau_s, until_next_s)
-        c = np.concatenate([begun.c, on.c[:-1]])
-        c_by = np.concatenate([begun.c_by, on.c_by[:, :-1]], axis=1)
+        c, c_by, c_bent = (
+            np.concatenate([first, later[..., :-1]], axis=-1)
+            for first, later in (
+                (begun.c, on.c),
+                (begun.c_by, on.c_by),
+                (begun.c_bent, on.c_bent),
+            )
+        )
         a_by = on.e_by * c + on.e * c_by - on.c_by
-        return cls(branch, c, on.e, on.e * c - on.c, c_by, on.e_by, a_by)
+        mixed = on.e_by[:, None] * c_by
+        a_bent = on.e_bent * c + mixed + mixed.swapaxes(0, 1) + on.e * c_bent - on.c_bent
+        a = on.e * c - on.c
+        return cls(branch, c, on.e, a, c_by, on.e_by, a_by, c_bent, on.e_bent, a_bent)
+
+
+def recursions_of(
+    body: Body, theta: Array, until_next_s: Array, loaded_s: float
+) -> list[Recursion]:
+    """Those of all branches of a body."""
+    return [Recursion.of(b, theta, until_next_s, loaded_s) for b in branches_of(body)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +104,23 @@ class History:
 
     @classmethod
     def of(
-        cls, body: Body, xi: Array, theta: Array, until_next_s: Array, loaded_s: float
+        cls,
+        body: Body,
+        xi: Array,
+        theta: Array,
+        until_next_s: Array,
+        loaded_s: float,
+        given: Array | None = None,
     ) -> History:
-        """Of the states xi (N, 3n), the first of which is the start."""
+        """Of the states xi (N, 3n), the first of which is the start.
+
+        What they bring follows from that, or is `given`, (N, …) of all branches.
+        """
         stress = body.stresses.stress(xi, theta)
-        recursions = [Recursion.of(b, theta, until_next_s, loaded_s) for b in branches_of(body)]
+        recursions = recursions_of(body, theta, until_next_s, loaded_s)
+        if given is not None:
+            brought = [given[:, r.branch.own] for r in recursions]
+            return cls(body, theta, xi, stress, tuple(recursions), tuple(brought))
         brought = []
         for r in recursions:
             own = stress[:, r.branch.points]
@@ -106,6 +138,8 @@ class History:
             found.stiffening[:, r.branch.part] += r.c[rows]
             found.slopes[:, r.branch.share] = r.c_by[0, rows]
             found.slopes[:, r.branch.tau] = r.c_by[1, rows]
+            own = slice(r.branch.share, r.branch.tau + 1)
+            found.bends[:, own, own] = np.moveaxis(r.c_bent[..., rows], 2, 0)
         return found
 
     @property
@@ -139,10 +173,9 @@ class History:
         """
         stresses, by_q = self.body.stresses, np.zeros(theta_q.shape[1])
         mus = self.weights(stresses.against(self.xi, force_weights, self.theta))
-        of_stress = np.zeros_like(self.stress)
+        of_stress = self.stress_weights(mus)
         for r, m, mu in zip(self.recursions, self.brought, mus, strict=True):
             own = self.stress[:, r.branch.points]
-            of_stress[:, r.branch.points] += r.a[:, None] * mu
             along = r.d_by @ np.sum(mu * m, axis=1) + r.a_by @ np.sum(mu * own, axis=1)
             by_q += along @ theta_q[[r.branch.share, r.branch.tau]]
         for start in range(0, len(self.xi), CHUNK):
@@ -150,6 +183,50 @@ class History:
             slopes = stresses.stress_by(self.xi[rows], self.theta, theta_q)
             by_q += np.einsum("tqp,tp->q", slopes, of_stress[rows])
         return stresses.pulled(self.xi, of_stress, self.theta), by_q
+
+    # Where what they bring is given -------------------------------------------------------------
+
+    @property
+    def gaps(self) -> Array:
+        """(N − 1, …) of all branches, m_k − d_k m_{k−1} − a_k S_k: zero where m follows."""
+        found = [
+            m[1:] - r.d[:-1, None] * m[:-1] - r.a[:-1, None] * self.stress[:-1, r.branch.points]
+            for r, m in zip(self.recursions, self.brought, strict=True)
+        ]
+        return np.hstack(found)
+
+    def stress_weights(self, mus: Sequence[Array]) -> Array:
+        """σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k."""
+        found = np.zeros_like(self.stress)
+        for r, mu in zip(self.recursions, mus, strict=True):
+            found[:, r.branch.points] += r.a[:, None] * mu
+        return found
+
+    def add_curvature(self, curvature: Curvature, mus: Sequence[Array]) -> None:
+        """Add the derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) by g and τ, and those by another.
+
+        In place, to the N states of a `Curvature` that has those of Σ σ_k S_k.
+        """
+        stresses, elastic = self.body.stresses, self.body.elastic_places
+        units = np.eye(len(self.theta))[:, elastic]
+        for r, m, mu in zip(self.recursions, self.brought, mus, strict=True):
+            own, points = slice(r.branch.share, r.branch.tau + 1), r.branch.points
+            of_m = np.sum(mu * m, axis=1)
+            of_stress = np.sum(mu * self.stress[:, points], axis=1)
+            curvature.theta[:, own] += (r.d_by * of_m + r.a_by * of_stress).T
+            bent = r.d_bent * of_m + r.a_bent * of_stress
+            curvature.theta_theta[:, own, own] += np.moveaxis(bent, 2, 0)
+            for place, a_by in zip((r.branch.share, r.branch.tau), r.a_by, strict=True):
+                weights = np.zeros_like(self.stress)
+                weights[:, points] = a_by[:, None] * mu
+                pulled = stresses.pulled(self.xi, weights, self.theta)
+                curvature.position_theta[:, :, place] += pulled
+            for start in range(0, len(self.xi), CHUNK):
+                rows = slice(start, start + CHUNK)
+                slopes = stresses.stress_by(self.xi[rows], self.theta, units)[:, :, points]
+                by = np.einsum("tqp,tp,bt->tbq", slopes, mu[rows], r.a_by[:, rows])
+                curvature.theta_theta[rows, own, elastic] += by
+                curvature.theta_theta[rows, elastic, own] += by.swapaxes(1, 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
-from ..fem.body import Body
+from ..fem.body import Body, Curvature
 from ..fem.pattern import SymmetricPattern
 from .block_band import Block, BlockBand, Term
 from .charts import Chart
@@ -469,7 +469,7 @@ class Segment:
         rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
-    def _force_weights(self, multipliers: Array) -> Array:
+    def force_weights(self, multipliers: Array) -> Array:
         """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
         dynamics = self.dynamics
         row_weights = np.zeros((self.grid_rows, self.dofs))
@@ -481,7 +481,7 @@ class Segment:
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
         """Derivatives of multipliers · c through the memory, by scaled x (N, 3n) and by q."""
-        by_x, by_q = self.pulled_through_memory(x, setting, self._force_weights(multipliers))
+        by_x, by_q = self.pulled_through_memory(x, setting, self.force_weights(multipliers))
         return self.length_m * by_x, by_q
 
     def pulled_through_memory(
@@ -493,9 +493,7 @@ class Segment:
         if history is None:
             return np.zeros_like(x), np.zeros(self.nq)
         by_xi, by_q = history.pulled(weights, setting.theta_q)
-        by_x = dynamics.combine_transposed(dynamics.tables.p, by_xi)
-        by_x[: dynamics.first_row] += by_xi[: dynamics.first_row]
-        return by_x, by_q
+        return dynamics.combine_transposed(dynamics.state_weights, by_xi), by_q
 
     @cached_property
     def linearisation_rows(self) -> Array:
@@ -539,26 +537,25 @@ class Segment:
 
     def _curvature_terms(self, distance: int) -> Iterator[Term]:
         """Terms of ∂²φ/∂x_{t−distance}∂x_t, from evaluations k = t + i."""
-        t = self.dynamics.tables
-        first = self.dynamics.first_row
+        p, q = self.dynamics.state_weights, self.dynamics.tables.q
         scale = self.length_m**2
         step = self.dynamics.step_s
         for i in range(self.dynamics.reach + 1 - distance):
             other = i + distance
-            xx = scale * t.p[:, i] * t.p[:, other]
-            xv = scale * (t.p[:, i] * t.q[:, other] + t.q[:, i] * t.p[:, other]) / step
+            xx = scale * p[:, i] * p[:, other]
+            xv = scale * (p[:, i] * q[:, other] + q[:, i] * p[:, other]) / step
             if xx.any() or xv.any():
-                yield Term(i - first, _ahead(xx, i), _ahead(xv, i))
+                yield Term(i, _ahead(xx, i), _ahead(xv, i))
 
     def _skew_terms(self, distance: int) -> Iterator[Term]:
         """The same of the skew part of ∂²φ/∂x∂v."""
-        t, first = self.dynamics.tables, self.dynamics.first_row
+        t = self.dynamics.tables
         scale = self.length_m**2 / self.dynamics.step_s
         for i in range(self.dynamics.reach + 1 - distance):
             other = i + distance
             skew = scale * (t.p[:, other] * t.q[:, i] - t.q[:, other] * t.p[:, i])
             if skew.any():
-                yield Term(i - first, _ahead(skew, i), np.zeros(len(skew)))
+                yield Term(i, _ahead(skew, i), np.zeros(len(skew)))
 
     def hessian_values(
         self,
@@ -568,12 +565,15 @@ class Segment:
         multipliers: Array,
         loss_weight: float,
         values: Array,
-    ) -> tuple[Array, Array]:
+        memory_weights: Sequence[Array] = (),
+    ) -> Array:
         """Write the columns of x, then of φ, of ∇²(loss_weight · L + multipliers · c).
 
         Parameters
         ----------
         values : (hessian_layout.entries,) out
+        memory_weights : μ (N, …) of each branch
+            Where the memory is given, Σ μ_k (d_k m_{k−1} + a_k S_k) is added; see `memory`.
 
         Returns
         -------
@@ -582,9 +582,8 @@ class Segment:
         dynamics, band = setting.dynamics, self.hessian
         first = dynamics.first_row
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
-        weights = self._force_weights(multipliers)[first:]
-        forces, states = dynamics.evaluated, dynamics.evaluation_states(x)
-        curvature = forces.curvature(*states, weights, setting.theta, self._curvature_rows)
+        weights = self.force_weights(multipliers)
+        curvature = self._curvature(x, setting, weights, memory_weights)
         layout = self.hessian_layout
         of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)
         band.fill(
@@ -593,18 +592,17 @@ class Segment:
         skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
-        mixed = np.zeros((2, self.grid_rows, self.dofs, self.nq))
-        mixed[0, first:] = curvature.position_theta @ setting.theta_q
-        mixed[1, first:] = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
-        by_theta = dynamics.combine_transposed(dynamics.tables.p, mixed[0])
-        by_theta += dynamics.combine_transposed(dynamics.tables.q, mixed[1])
+        by_xi = curvature.position_theta @ setting.theta_q
+        by_nu = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
+        by_theta = dynamics.combine_transposed(dynamics.state_weights, by_xi)
+        by_theta += dynamics.combine_transposed(dynamics.tables.q, by_nu)
         of_band[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
         if layout.band is not None:
             values[: layout.x_entries] = 0
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
-        pull = (weights * forces.mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
+        pull = (weights * dynamics.forces.mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
         by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
@@ -623,9 +621,25 @@ class Segment:
         by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
         return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
 
+    def _curvature(
+        self, x: Array, setting: Setting, weights: Array, memory_weights: Sequence[Array]
+    ) -> Curvature:
+        """That of the forces and the memory at all N evaluations, a given start included."""
+        dynamics = setting.dynamics
+        xi = dynamics.combine(dynamics.state_weights, x)
+        nu = dynamics.combine(dynamics.tables.q, x) / dynamics.step_s
+        history = dynamics.history(x, setting.theta) if memory_weights else None
+        past = history and history.carried(slice(None))
+        sigma = history and history.stress_weights(memory_weights)
+        rows, theta = self._curvature_rows, setting.theta
+        curvature = dynamics.forces.curvature(xi, nu, weights, theta, rows, past, sigma)
+        if history:
+            history.add_curvature(curvature, memory_weights)
+        return curvature
+
     @cached_property
     def _curvature_rows(self) -> Array:
-        return np.zeros((self.constraint_times, self.dynamics.forces.curvature_width))
+        return np.zeros((self.grid_rows, self.dynamics.forces.curvature_width))
 
     @cached_property
     def hessian_layout(self) -> HessianLayout:

@@ -158,7 +158,7 @@ class Sensing:
         at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
         slopes = setting.force_slopes(at.by_theta, dynamics.evaluated.mass_kg)
         by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
-        rows = HeldRows(segment.pattern, dofs)
+        rows = HeldRows(dynamics.pattern, dofs)
         state, rate = np.zeros_like(x), np.zeros_like(x)
         for k, weight in enumerate(whole[first:, dofs]):
             if weight.any():

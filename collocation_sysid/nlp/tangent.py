@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from .factorisation import NONE, Choice, Factor, Factoriser, Room
+from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
 from .reaction import HeldForces, HeldRows
@@ -34,11 +34,12 @@ from .row import Row, weighted
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
-from .unsymmetric import signs_by_column, signs_by_row
+from .unsymmetric import both_triangles, in_both_triangles, signs_by_column, signs_by_row
 
 # Element results and factors of this size at most are kept at a time.
 CHUNK_BYTES = 128e6
-# So many banded LUs at most, each chunk's in the memory of the one before.
+# So many narrow factors at most, each chunk's in the memory of the one before: fetching it anew
+# costs as much as half a factorisation.
 ROOMS = 16
 
 
@@ -129,8 +130,8 @@ class BlockSolver:
         place = np.full(self.pattern.size, -1)
         place[self.free] = np.arange(len(self.free))
         kept = (place[full_rows] >= 0) & (place[full_columns] >= 0)
-        self._source = source[kept]
-        self._signs = signs_by_row(self.pattern)[kept]
+        signs = signs_by_row(self.pattern)[kept]
+        self._source = source[kept], in_both_triangles(self.pattern, source[kept], signs)
         # Sorted by column; the matrices are symmetric, so that serves for rows as well.
         held = np.full(self.pattern.size, -1)
         held[segment.grasping.dofs] = np.arange(len(segment.grasping.dofs))
@@ -140,15 +141,15 @@ class BlockSolver:
         self._held = sp.csr_array((numbers, (places[0][beside], places[1][beside])), shape=shape)
         # Its data are their own numbers, in the order that compressing them gave.
         order = np.asarray(self._held.data, dtype=np.int64) - 1
-        self._held_source = source[beside][order]
-        self._held_signs = signs_by_column(self.pattern)[beside][order]
+        origin, signs = source[beside][order], signs_by_column(self.pattern)[beside][order]
+        self._held_source = origin, in_both_triangles(self.pattern, origin, signs)
         self._held = self._held.astype(float)
         self.sensed = segment.sensed_dofs
         self.sensed_rows = HeldRows(self.pattern, self.sensed)
         counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
         indptr = np.concatenate([[0], np.cumsum(counts)])
         self._matrix = sp.csr_array(
-            (np.zeros(len(self._source)), place[full_rows[kept]], indptr),
+            (np.zeros(kept.sum()), place[full_rows[kept]], indptr),
             shape=(len(self.free), len(self.free)),
         )
 
@@ -300,17 +301,13 @@ class BlockSolver:
     @property
     def chunk(self) -> int:
         """Timesteps that are evaluated and factorised at a time."""
-        most = ROOMS if self._needs_rooms else self.dynamics.rows
+        most = ROOMS if self.factoriser.skyline else self.dynamics.rows
         return max(1, min(self.dynamics.rows, most, int(CHUNK_BYTES / self._step_bytes)))
 
     @property
     def chunk_bytes(self) -> int:
         """Memory that takes."""
         return self.chunk * self._step_bytes
-
-    @property
-    def _needs_rooms(self) -> bool:
-        return self.body.unsymmetric and self.factoriser.banded
 
     @property
     def _step_bytes(self) -> int:
@@ -320,16 +317,12 @@ class BlockSolver:
 
     def apply(self, lower: Array, columns: Array, skew: Array = NONE) -> Array:
         """Product of a matrix, given by lower triangles of its two parts, on the free dofs."""
-        self._matrix.data = lower[self._source]
-        if skew.size:
-            self._matrix.data += self._signs * skew[self._source]
+        self._matrix.data = _entries(lower, skew, self._source)
         return self._matrix @ columns
 
     def apply_held(self, lower: Array, columns: Array, skew: Array = NONE) -> Array:
         """Product (free, …) of its columns of grasped dofs, with `columns` (g, …)."""
-        self._held.data = lower[self._held_source]
-        if skew.size:
-            self._held.data += self._held_signs * skew[self._held_source]
+        self._held.data = _entries(lower, skew, self._held_source)
         return self._held @ columns
 
     def _steps(
@@ -344,7 +337,7 @@ class BlockSolver:
         dynamics, theta = self.dynamics, setting.theta
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
-        rooms = [self.factoriser.room() for _ in range(self.chunk if self._needs_rooms else 0)]
+        rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
         for start in reversed(starts) if backward else starts:
             stop = min(start + self.chunk, dynamics.rows)
             here = slice(start - dynamics.first_row, stop - dynamics.first_row)
@@ -367,7 +360,7 @@ class BlockSolver:
                 )
 
     def _factorise(
-        self, at: Linearisation, rows: slice, rooms: Sequence[Room] = ()
+        self, at: Linearisation, rows: slice, rooms: Sequence[Array | None] = ()
     ) -> list[Factor]:
         pattern, taken = self.pattern, self.dynamics.taken[rows]
 
@@ -393,6 +386,13 @@ class BlockSolver:
                 f"motion cannot be solved: {error}",
                 float(self.dynamics.t_s[rows.start]),
             ) from error
+
+
+def _entries(lower: Array, skew: Array, sources: tuple[Index, Index]) -> Array:
+    """Entries of a matrix from the lower triangle, or from both of one with a skew part."""
+    if not skew.size:
+        return np.take(lower, sources[0])
+    return np.take(both_triangles(lower, skew), sources[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,16 @@ def skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
     return np.take(skew, pattern.full[2], axis=-1) * signs_by_column(pattern)
 
 
+def both_triangles(lower: Array, skew: Array) -> Array:
+    """(2m,) entries of the lower triangle of symmetric and skew parts, then of the upper one."""
+    return np.concatenate([lower + skew, lower - skew])
+
+
+def in_both_triangles(pattern: SymmetricPattern, source: Index, signs: Array) -> Index:
+    """Where in `both_triangles` entries are that are at `source` in a lower triangle."""
+    return source + np.where(signs < 0, pattern.entries, 0)
+
+
 def whole(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
     """The matrix (3n, 3n) of symmetric part `lower` (m,) and skew part `skew`, (m,) or (0,)."""
     matrix = pattern.matrix(lower)

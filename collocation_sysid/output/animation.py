@@ -174,7 +174,7 @@ class Film:
             corner = (k * width + 4, FOOT_MM)
             view = View.fitting(camera, everything, (width - 8, height), corner)
             title = axes.text(corner[0], total - 3, "", va="top", fontsize=TEXT_PT, zorder=6)
-            body = Drawn(axes, view, replay.surface, replay.surface_parts)
+            body = Drawn(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
             self.panels.append((name, positions, markers, body, title))
         self._surround(axes, camera, view.mm_per_m, total)
         self.clock = axes.text(WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT)

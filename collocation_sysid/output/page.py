@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from .pictures.camera import Camera
 from .replay import Replay
 
 # More samples than this are thinned, to keep the page a few megabytes.
 MOST_FRAMES = 300
+# The colours end at the strain below which this share is: single corners are strained most.
+STRAINED = 0.995
 
 
 def write_page(replay: Replay, file: str | Path) -> Path:
@@ -42,23 +46,62 @@ def write_page(replay: Replay, file: str | Path) -> Path:
 
 def _content(replay: Replay) -> dict[str, Any]:
     kept = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MOST_FRAMES))
-    outer, faces = np.unique(replay.surface, return_inverse=True)
+    outer, nodes = np.unique(replay.surface_nodes, return_inverse=True)
+    nodes = nodes.reshape(len(replay.surface), -1)
     named = {"fitted": replay.positions_m, "rolled out": replay.rolled_out_positions_m}
     shapes = {name: x[kept][:, outer] for name, x in named.items() if x is not None}
     first = next(iter(shapes.values()))
-    low, high = first.min(axis=(0, 1)), first.max(axis=(0, 1))
+    low, high = np.nanmin(first, axis=(0, 1)), np.nanmax(first, axis=(0, 1))
+    stretched = {
+        name: surface_strain(replay, x[kept]) for name, x in named.items() if x is not None
+    }
+    largest = float(np.nanquantile(np.abs(next(iter(stretched.values()))), STRAINED)) or 1e-6
+    there = first[np.isfinite(first).all(axis=(1, 2))]
     return {
         "t_s": replay.t_s[kept].tolist(),
         "nodes": len(outer),
         "markers": replay.measured_m.shape[1],
-        "faces": _packed(faces, "<i4"),
+        "faces": _packed(nodes[:, :3], "<i4"),
+        "sides": _packed(nodes[:, 3:], "<i4"),
+        "strains": {name: _packed(_bytes(x / largest), "u1") for name, x in stretched.items()},
+        "largest": largest,
+        "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
         "held": _packed(replay.held[kept][:, outer], "u1"),
         "measured": _packed(replay.measured_m[kept], "<f4"),
         "shapes": {name: _packed(x, "<f4") for name, x in shapes.items()},
-        "axes": Camera.facing(first, replay.up).axes.tolist(),
+        "axes": Camera.facing(there, replay.up).axes.tolist(),
         "centre": ((low + high) / 2).tolist(),
         "size": float(np.linalg.norm(high - low)),
+        "body": float(np.ptp(replay.undeformed_m, axis=0).max()),
     }
+
+
+def surface_strain(replay: Replay, positions_m: Array) -> Array:
+    """Largest principal stretch less one (T, F) of the elements below the surface.
+
+    By their corners: of quadratic elements the mean.
+    """
+    cells = cells_of_faces(replay.tetrahedra, replay.surface)
+    corners = replay.tetrahedra[cells]
+    undeformed, moved = replay.undeformed_m[corners], positions_m[:, corners]
+    edges, moved = undeformed[:, 1:] - undeformed[:, :1], moved[:, :, 1:] - moved[:, :, :1]
+    gradient = np.linalg.solve(edges, moved)  # Fᵀ of each
+    there = np.isfinite(gradient).all(axis=(2, 3))
+    gradient[~there] = np.eye(3)
+    stretch = np.linalg.svd(gradient, compute_uv=False)[..., 0]
+    return np.where(there, stretch - 1.0, np.nan)
+
+
+def cells_of_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.int64]:
+    """The tetrahedron (F,) that each boundary triangle is a side of."""
+    sides = np.sort(tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
+    known = {tuple(side): k // 4 for k, side in enumerate(sides.reshape(-1, 3).tolist())}
+    return np.array([known[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
+
+
+def _bytes(shares: Array) -> Array:
+    """Shares of the largest as whole numbers to 255."""
+    return np.rint(255 * np.clip(np.nan_to_num(shares), 0.0, 1.0))
 
 
 def _packed(array: NDArray[Any], kind: str) -> str:

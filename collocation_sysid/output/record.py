@@ -217,6 +217,7 @@ def result(finished: Run) -> dict[str, Any]:
                 "violation_n": line.violation_n,
                 "parameters": line.parameters,
                 "time_s": line.time_s,
+                "share": line.share,
             }
             for line in solution.history
         ],

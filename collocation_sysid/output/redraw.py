@@ -7,7 +7,7 @@ from typing import Any
 
 from ..methods.solution import Iteration
 from .pictures import Confidence, album, save_pictures
-from .replay import damaged, read_run
+from .replay import read_run, reading_run
 
 
 def redraw(run: str | Path, folder: str | Path) -> list[Path]:
@@ -20,15 +20,13 @@ def redraw(run: str | Path, folder: str | Path) -> list[Path]:
     """
     run, folder = Path(run), Path(folder)
     result, replays = read_run(run)
-    try:
+    with reading_run(run):
         history = [_iteration(line) for line in result["history"]]
         free = [name for name, item in result["parameters"].items() if not item["fixed"]]
         confidence = Confidence.from_result(result)
         pictures = album(replays, history, free, confidence, scan=result.get("scan"))
-    except (ValueError, LookupError, TypeError) as error:
-        raise damaged(run, error) from error
-    folder.mkdir(parents=True, exist_ok=True)
-    return save_pictures(folder, pictures)
+        folder.mkdir(parents=True, exist_ok=True)
+        return save_pictures(folder, pictures)
 
 
 def _iteration(line: dict[str, Any]) -> Iteration:
@@ -39,4 +37,5 @@ def _iteration(line: dict[str, Any]) -> Iteration:
         line["violation_n"],
         line["parameters"],
         line["time_s"],
+        line.get("share", 1.0),
     )

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ..earlier import RESULT_FILE, Earlier
 from ..errors import InputError
+from ..files import read_json
 from ..problem import Problem
 from ..refine import refinement_of
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import Refinement
-from ..statistics.trust import STEP_MOVES, numerical_concerns
+from ..statistics.trust import STEP_MOVES, Verdict, numerical_concerns
 from .record import REFINEMENT_FILE, as_json
+from .replay import reading_run
 
 
 def refine_run(
@@ -40,21 +41,23 @@ def refine_run(
     """
     file = Path(folder) / RESULT_FILE
     answer = Earlier.read(folder)
-    result = json.loads(file.read_text(encoding="utf-8"))
-    problem_file = result["provenance"]["problem_file"]
-    if problem_file is None:
-        raise InputError("the run is of no problem file; use collocation_sysid.refine", file)
-    if not result["converged"]:
-        raise InputError("the run did not converge: there is no answer to refine", file)
-    copy, home = Path(folder) / "problem.toml", Path(problem_file).parent
-    problem = Problem.read(copy, allow_code=allow_code, folder=home)
-    groups = [result[key] for key in ("parameters", "derived")]
-    estimates = {name: _estimate(each) for group in groups for name, each in group.items()}
+    result = read_json(file, "a run folder")
+    with reading_run(file.parent):
+        problem_file = result["provenance"]["problem_file"]
+        if problem_file is None:
+            raise InputError("the run is of no problem file; use collocation_sysid.refine", file)
+        if not result["converged"]:
+            raise InputError("the run did not converge: there is no answer to refine", file)
+        home = Path(problem_file).parent
+        groups = [result[key] for key in ("parameters", "derived")]
+        estimates = {name: _estimate(each) for group in groups for name, each in group.items()}
+        before = _trust(result["trust"])
+    problem = Problem.read(file.parent / "problem.toml", allow_code=allow_code, folder=home)
     found = refinement_of(problem, answer, estimates, levels, say)
     for group in groups:
         for name in set(group) & set(found.errors):
             group[name]["numerical_error"] = asdict(found.errors[name])
-    result["trust"] = _judged(result["trust"], estimates, found)
+    result["trust"] = _judged(before, estimates, found)
     (file.parent / REFINEMENT_FILE).write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
     file.write_text(as_json(result) + "\n", encoding="utf-8")
     return found, result
@@ -69,6 +72,13 @@ def _estimate(found: dict[str, Any]) -> Estimate:
         found["at_bound"],
         found["reason"],
     )
+
+
+def _trust(found: dict[str, Any]) -> dict[str, Any]:
+    verdict, reasons = found["verdict"], [str(reason) for reason in found["reasons"]]
+    if verdict not in get_args(Verdict):
+        raise ValueError(f"a verdict {verdict!r}")
+    return {"verdict": verdict, "reasons": reasons}
 
 
 def _judged(

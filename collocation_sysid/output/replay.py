@@ -6,13 +6,12 @@ arrays of a run folder.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +19,35 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
+from ..fem.quadratic import EDGES
+from ..files import damage_refused, read_json
 
 RESULT_FILE = "result.json"
 ARRAYS_FILE = "trajectory.npz"
 # Of the body, and so the same for all experiments of a run.
 SHARED = ("undeformed_m", "tetrahedra", "surface", "surface_parts")
+# Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes.
+LAYOUT = {
+    "undeformed_m": ("f", "n3"),
+    "tetrahedra": ("iu", "E4"),
+    "surface": ("iu", "F3"),
+    "surface_parts": ("iu", "F"),
+    "surface_nodes": ("iu", "Fs"),
+    "t_s": ("f", "T"),
+    "held": ("b", "Tn"),
+    "up": ("f", "3"),
+    "marker_places_m": ("f", "M3"),
+    "given_places_m": ("f", "M3"),
+    "measured_m": ("f", "TM3"),
+    "positions_m": ("f", "Tn3"),
+    "markers_m": ("f", "TM3"),
+    "rolled_out_positions_m": ("f", "Tn3"),
+    "rolled_out_m": ("f", "TM3"),
+    "natural_hz": ("f", "k"),
+}
+# Arrays that may hold NaN or infinity, and the largest length, time or frequency of any.
+GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
+LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +62,7 @@ class Replay:
     tetrahedra : (E, 4) corners of the elements
     surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
     surface_parts : (F,) number of the part of the body that each belongs to
+    surface_nodes : (F, 3) or (F, 6) nodes of each triangle, those on its sides besides its corners
     part_names : (P,) str, "" for what no region claims
     held : (T, n) bool, which nodes are grasped along some axis
     up : (3,) unit vector against gravity; z where there is none
@@ -60,6 +84,7 @@ class Replay:
     tetrahedra: NDArray[np.integer]
     surface: NDArray[np.integer]
     surface_parts: NDArray[np.integer]
+    surface_nodes: NDArray[np.integer]
     part_names: Sequence[str]
     held: NDArray[np.bool_]
     up: Array
@@ -98,6 +123,7 @@ class Replay:
             body.mesh.tetrahedra,
             body.mesh.surface,
             body.part_of_cells[body.mesh.surface_cells],
+            nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
             experiment.grasped(experiment.t_s)[0].any(axis=2),
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
@@ -138,6 +164,7 @@ class Replay:
             "tetrahedra": self.tetrahedra.astype(np.int32),
             "surface": self.surface.astype(np.int32),
             "surface_parts": self.surface_parts.astype(np.int32),
+            "surface_nodes": self.surface_nodes.astype(np.int32),
             "part_names": np.array(self.part_names),
         }
         return shared | {prefix + key: value for key, value in own.items() if value is not None}
@@ -161,13 +188,53 @@ class Replay:
             "natural_hz",
         )
         found: dict[str, Any] = {key: arrays[key] for key in SHARED}
+        found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
         keys = (f"{prefix}wrench_{k}" for k in count(1))
         found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
+        _require_shapes(found)
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
         parts = [str(part) for part in arrays["part_names"]]
+        numbers = found["surface_parts"]
+        if len(names) != len(found["marker_places_m"]):
+            raise ValueError(f"{len(names)} marker_names")
+        if numbers.min() < 0 or numbers.max() >= len(parts):
+            raise ValueError("surface_parts names parts that are not there")
         return cls(name=name, marker_names=names, part_names=parts, **found)
+
+
+def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Corners of each face (F, 3), and of quadratic cells (F, 10) the nodes on its sides too."""
+    if cells.shape[1] != 10:
+        return faces
+    ends = cells[:, np.array(EDGES)]  # (F, 6, 2)
+    on_face = (ends[..., None] == faces[:, None, None]).any(axis=3).all(axis=2)
+    return np.hstack([faces, cells[:, 4:][on_face].reshape(len(faces), 3)])
+
+
+def _require_shapes(arrays: Mapping[str, Any]) -> None:
+    """Refuse arrays whose sizes do not go together, or that hold what pictures cannot show."""
+    sizes: dict[str, int] = {}
+    for key, (kinds, letters) in LAYOUT.items():
+        if (array := arrays.get(key)) is None:
+            continue
+        wanted = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
+        here = array.shape
+        if array.dtype.kind not in kinds or array.ndim != len(letters) or 0 in here[:-1]:
+            raise ValueError(f"{key} is {array.dtype} of shape {here}")
+        if any(size not in (None, found) for size, found in zip(wanted, here, strict=True)):
+            raise ValueError(f"{key} has shape {here}, which does not go with the others")
+        sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
+        if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
+            raise ValueError(f"{key} holds numbers that are not finite")
+        if kinds == "f" and np.nanmax(np.abs(array), initial=0.0) > LARGEST:
+            raise ValueError(f"{key} holds numbers above {LARGEST:g}")
+    for key in ("tetrahedra", "surface", "surface_nodes"):
+        if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
+            raise ValueError(f"{key} names nodes that are not there")
+    if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(np.linalg.norm(arrays["up"]), 1.0):
+        raise ValueError("t_s does not increase, or up is no direction")
 
 
 def _single(array: Array | None) -> NDArray[np.float32] | None:
@@ -183,24 +250,33 @@ def read_run(folder: str | Path) -> tuple[dict[str, Any], list[Replay]]:
         If it is not a run folder, or one that is damaged.
     """
     run = Path(folder)
-    try:
-        result = json.loads((run / RESULT_FILE).read_text(encoding="utf-8"))
-        with np.load(run / ARRAYS_FILE) as stored:
-            arrays = dict(stored)
+    result = read_json(run / RESULT_FILE, "a run folder")
+    with reading_run(run):
+        arrays = read_arrays(run)
         return result, [Replay.from_arrays(name, arrays) for name in _experiments(result)]
-    except (FileNotFoundError, NotADirectoryError) as error:
-        name = Path(str(error.filename)).name
-        raise InputError(f"this is not a run folder: it has no {name}", run) from error
-    except (OSError, EOFError, BadZipFile, ValueError, LookupError, TypeError) as error:
-        raise damaged(run, error) from error
 
 
-def damaged(run: Path, error: Exception) -> InputError:
-    """The refusal of a run whose files do not hold what they should."""
-    reason = f"{type(error).__name__}: {error}"
-    return InputError(
-        f"{RESULT_FILE} or {ARRAYS_FILE} is damaged ({reason}); solve the problem again", run
-    )
+def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a run folder.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    file = run / ARRAYS_FILE
+    if not file.is_file():
+        raise InputError(f"this is not a run folder: it has no {ARRAYS_FILE}", run)
+    try:
+        with np.load(file) as stored:
+            return dict(stored)
+    except OSError as error:  # what NumPy says of a file that is none of its own
+        raise ValueError(error) from error
+
+
+def reading_run(run: Path) -> AbstractContextManager[None]:
+    """Within this, whatever the files of a run make go wrong is a refusal of the run."""
+    return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", "solve the problem again")
 
 
 def _experiments(result: Mapping[str, Any]) -> list[str]:

@@ -6,6 +6,7 @@ The fields are those of the run's frames for ParaView.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from contextlib import AbstractContextManager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import damage_refused
 from .animation import chosen
 from .page import write_page
 from .pictures.camera import Camera
@@ -69,7 +71,8 @@ def view(
     _, replays = read_run(run)
     replay = chosen(replays, experiment, run)
     frames = frame_files(Path(run), replay.name)
-    scene = _Scene(frames, field, replay, off_screen=screenshot is not None)
+    with _reading_frames(Path(run)):
+        scene = _Scene(frames, field, replay, off_screen=screenshot is not None)
     if screenshot is None:
         scene.plotter.show()
     else:
@@ -94,8 +97,16 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
             "have frames; use --html to look at others",
             run,
         )
-    sets = ElementTree.parse(listing).getroot().iter("DataSet")
-    return [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
+    with _reading_frames(run):
+        sets = ElementTree.parse(listing).getroot().iter("DataSet")
+        found = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
+        if not found or not all(file.is_file() for _, file in found):
+            raise ValueError("it names no frames, or frames that are gone")
+        return found
+
+
+def _reading_frames(run: Path) -> AbstractContextManager[None]:
+    return damage_refused(run, f"{FRAMES_FILE} or one of its frames", "solve the problem again")
 
 
 class _Scene:

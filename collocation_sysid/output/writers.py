@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import base64
+import glob
 import os
+import platform
+import re
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -205,7 +208,8 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
     target = Path(path).resolve()
     require_replaceable(target, overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
-    mark = secrets.token_hex(4)
+    _remove_stale(target)
+    mark = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
     temporary = target.with_name(f".{target.name}.{mark}.partial")
     temporary.mkdir()
     try:
@@ -217,9 +221,35 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
         require_replaceable(target, overwrite)
         _put_in_place(temporary, target, target.with_name(f".{target.name}.{mark}.old"))
     except (InputError, OSError) as error:
+        kept = target.with_name(f"{target.name}-{mark}")
+        with suppress(OSError):
+            temporary = temporary.rename(kept)
         raise InputError(
             f"the finished run cannot be put there ({error}); it is kept in {temporary}", target
         ) from error
+
+
+def _remove_stale(target: Path) -> None:
+    """Remove what a process of this machine that was killed left beside the run's place.
+
+    Windows tells nothing of other processes by their numbers; there it stays.
+    """
+    if os.name != "posix":
+        return
+    for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        found = re.fullmatch(rf"{re.escape(platform.node())}-(\d+)-\w+", folder.name.split(".")[-2])
+        if found and not _runs(int(found[1])):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        return True
+    return True
 
 
 def require_replaceable(target: Path, overwrite: bool = True) -> None:

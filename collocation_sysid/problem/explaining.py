@@ -64,7 +64,7 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
     in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
     if kind == "missing" and not in_array:
         return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
-    found = f"found {_short(_value_at(key, content))}"
+    found = f"found {short(_value_at(key, content))}"
     if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
         return f"{found}; expected {expected}"
     if kind in ("model_type", "model_attributes_type") and model is not None:
@@ -154,8 +154,12 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """A value as text of 60 characters at most."""
     if isinstance(value, bool):
         return str(value).lower()
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # beyond Python's limits of digits and of depth
+        return f"a {type(value).__name__} too large to show"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -12,9 +12,12 @@ import tomli_w
 from pydantic import ValidationError
 
 from ..errors import InputError
+from ..files import require_regular
 from .explaining import explain
 from .schema import ProblemFile
 
+# Levels of tables and lists that a problem file may have: it needs seven.
+DEEPEST = 20
 # What the TOML parser says where people see something simpler.
 _PLAINER = {
     "Cannot overwrite a value": "this key is given twice",
@@ -43,10 +46,7 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
     """
     path = Path(path)
     text = _read_text(path)
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise _bad_syntax(str(error), text, path) from error
+    content = parse_toml(text, path)
     for override in overrides:
         _apply(content, override)
     if overrides:
@@ -57,7 +57,43 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
         raise explain(error, content, path) from error
 
 
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """The content of a TOML text.
+
+    Raises
+    ------
+    InputError
+        Where it is none, with the line where there is one.
+    """
+    try:
+        content = tomllib.loads(text)
+        if _depth(content) > DEEPEST:
+            raise RecursionError
+        return content
+    except tomllib.TOMLDecodeError as error:
+        raise _bad_syntax(str(error), text, path) from error
+    except (RecursionError, ValueError) as error:  # Python's limits of depth and of digits
+        raise InputError(_beyond_limits(error), path) from error
+
+
+def _depth(content: Any) -> int:
+    """How many levels of tables and lists there are, as far as it matters."""
+    level, depth = [content], 0
+    while level and depth <= DEEPEST:
+        tables = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [each for table in tables for each in table if isinstance(each, (dict, list))]
+        depth += 1
+    return depth
+
+
+def _beyond_limits(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "nests tables or lists too deeply; expected a few levels"
+    return "holds a whole number of too many digits; expected a number that can be"
+
+
 def _read_text(path: Path) -> str:
+    require_regular(path)
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -87,6 +123,8 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, value = override.partition("=")
     parts = key.strip().split(".")
+    if len(parts) > DEEPEST:
+        raise InputError(f"found a key of {len(parts)} parts; expected a few", "--set")
     if not equals or not all(parts):
         raise InputError(
             f"found {override!r}, expected key=value such as parameters.mu_pa.guess=200", "--set"
@@ -155,3 +193,5 @@ def _value(text: str, key: str) -> Any:
                 "--set",
             ) from None
         return text.strip()
+    except (RecursionError, ValueError) as error:
+        raise InputError(_beyond_limits(error), "--set", key.strip()) from error

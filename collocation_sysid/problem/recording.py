@@ -33,6 +33,7 @@ from ..experiment import (
 from ..experiment.wrench_files import within
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
+from ..files import require_regular
 from ..methods.scan import usual_constants
 from ..nlp.parameters import Parameters
 from ..statistics.description import doubts
@@ -78,6 +79,7 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
         If there is none.
     """
     file = folder / name
+    require_regular(file, key)
     if not file.is_file():
         found = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"

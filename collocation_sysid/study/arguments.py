@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
+from ..files import require_regular
 from ..methods import METHODS
 from ..methods.described import require_method
+from ..problem.explaining import short
+from ..problem.reading import parse_toml
 
+MOST_RUNS = 10_000
 RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 
@@ -75,10 +79,9 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
     path = Path(item)
+    require_regular(path, "--truth")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not valid TOML: {error}", path, "--truth") from error
+        content = parse_toml(path.read_text(encoding="utf-8-sig"), path)
     except FileNotFoundError:
         raise InputError(
             "there is no such file; expected a TOML file of true values, or name=value such as "
@@ -88,16 +91,21 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", path, "--truth") from error
-    return path, content.get("parameters", content)
+    table = content.get("parameters", content)
+    if not isinstance(table, Mapping):
+        raise InputError("parameters is no table; expected true values by name", path, "--truth")
+    return path, table
 
 
 def _positive(name: str, value: Any, source: Path | None) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not 0 < number < np.inf:
-        raise InputError(f"found {name} = {value}; expected a positive number", source, "--truth")
+        raise InputError(
+            f"found {name} = {short(value)}; expected a positive number", source, "--truth"
+        )
     return number
 
 
@@ -131,7 +139,21 @@ def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
         over[key] = tuple(_range(key, values) if _is_range(values) else _items(values))
     if not over:
         raise InputError("missing; expected at least one key to sweep over", None, "--over")
+    require_few(math.prod(map(len, over.values())), "--over", "runs")
     return over
+
+
+def require_few(count: int, option: str, what: str) -> None:
+    """Refuse a study of more runs than anyone means.
+
+    Raises
+    ------
+    InputError
+        Naming the option and both numbers.
+    """
+    if count > MOST_RUNS:
+        found = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
+        raise InputError(f"asks for {found} {what}; expected at most {MOST_RUNS:,}", None, option)
 
 
 def _is_range(values: str) -> bool:
@@ -144,7 +166,7 @@ def _range(key: str, text: str) -> Iterable[str]:
         low, high = float(first), float(middle[0])
         number = int(count)
         spacing = middle[1] if len(middle) == 2 else "linear"
-        if len(middle) > 2 or number < 1:
+        if len(middle) > 2 or number < 1 or not np.isfinite([low, high, high - low]).all():
             raise ValueError
     except (ValueError, IndexError):
         raise InputError(
@@ -152,6 +174,7 @@ def _range(key: str, text: str) -> Iterable[str]:
             None,
             "--over",
         ) from None
+    require_few(number, "--over", f"values of {key}")
     if spacing not in ("log", "lin", "linear"):
         raise InputError(
             f"found the spacing {spacing!r} for {key}; expected log or linear, {RANGE}",

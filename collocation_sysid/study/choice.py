@@ -206,7 +206,7 @@ def _sureness(chosen: Row, rival: Row) -> str:
 
 
 def model_notes(rows: Sequence[Row]) -> list[str]:
-    """The advice, and how to read the table."""
+    """How to read the table, and what failed."""
     names = rows[0]["predictions"]
     kept = "each recording in turn" if len(names) > 1 else "the last third of the recording"
     counted = rows[0]["independent"]
@@ -215,7 +215,6 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
     if counted is not None and evidence is not None:
         worth = f" The {evidence['measurements']} measurements are worth {counted:.0f} independent."
     return [
-        advice(rows),
         f"Held out is {kept}; ± is the standard error of the ratio to the best.{worth}",
         *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
         *(

@@ -101,6 +101,8 @@ def duration(time_s: float) -> str:
 def study_tables(report: Report, folder: Path) -> RenderableType:
     """The tables of a study within 80 columns, and what went wrong."""
     parts: list[RenderableType] = []
+    if report.kind == "models":  # what no line of the tables says
+        parts += [*map(Text, report.headline), Text("")]
     for view in report.views:
         parts += [Text(view.title, style="bold"), _table(view), Text("")]
     parts += [Text(note) for note in report.notes]

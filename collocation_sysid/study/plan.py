@@ -20,6 +20,7 @@ from ..errors import InputError
 from ..problem import Problem
 from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile
+from .arguments import require_few
 from .prediction import recordings
 from .variants import Variant
 
@@ -187,6 +188,7 @@ def _path_of(problem: Problem) -> Path:
 def _refuse_options(starts: int, spread: float, seed: int) -> None:
     if starts < 1:
         raise InputError(f"found {starts}; expected 1 or more", None, "--starts")
+    require_few(starts, "--starts", "starts")
     if not 1 <= spread < np.inf:
         raise InputError(f"found {spread:g}; expected a factor of 1 or more", None, "--spread")
     if seed < 0:
@@ -253,6 +255,8 @@ def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
     found = {}
     for text in _texts(content):
         try:
+            if not (folder / text).is_file():
+                continue
             data = (folder / text).read_bytes()
         except (OSError, ValueError):  # a text that is no file's name
             continue

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from ..fem.constants import unit_of
@@ -95,6 +95,9 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
     for axes in panels:
         log_axis(axes)
         axes.set_xscale("log", nonpositive="mask")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_locator(NullLocator())
     _legend(panels[0], 3, 1.1)
     return figure
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from math import exp
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,31 @@ from .plots import comparison_plots, sweep_plots
 from .store import Record, RunStore, write_whole
 from .table import Row, Yardstick, method_rows, run_row
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 RESOLUTION_DPI = 150
 SHOWN_FAILURES = 8
+# Heads of the tables where there is room, on pages.
+WORDS = {
+    "": "to use",
+    "success": "successes",
+    "95 %": "95 % interval of the rate",
+    "violation N": "dynamics violated by [N]",
+    "relative": "of the largest force",
+    "markers mm": "markers, RMS [mm]",
+    "roll-out mm": "roll-out, RMS [mm]",
+    "tip mm": "tip, at most [mm]",
+    "iter.": "iterations",
+    "evals": "evaluations",
+    "build s": "set-up [s]",
+    "evaluate s": "evaluations [s]",
+    "solve s": "linear algebra [s]",
+    "total s": "in all [s]",
+    "free": "parameters estimated",
+    "fit mm": "markers, RMS [mm]",
+    "held out mm": "held out, RMS [mm]",
+    "times best": "held out, times the best",
+}
+UNITS = ("Pa", "s", "1/s", "kg/m³")
 MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answer."
 
 
@@ -68,6 +90,21 @@ class Report:
         if self.kind == "models":
             return model_views(self.rows)
         return sweep_views(self.rows, list(self.planned[0].swept))
+
+    @property
+    def headline(self) -> list[str]:
+        """What the study says, in a sentence or a few."""
+        if self.kind == "models":
+            return [advice(self.rows)]
+        if self.kind == "compare":
+            return [_method_sentence(row) for row in method_rows(self.rows)]
+        return sweep_sentences(self.rows)
+
+    @property
+    def tables(self) -> list[View]:
+        """The same with heads in words, and a comparison's runs: for pages, where there is room."""
+        views = [replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.views]
+        return [*views, run_view(self.rows)] if self.kind == "compare" else views
 
     @property
     def failures(self) -> list[str]:
@@ -134,6 +171,10 @@ def report_json(report: Report) -> dict[str, Any]:
         "title": report.title,
         "problem": first.problem,
         "runs": rows,
+        "headline": report.headline,
+        "notes": report.notes,
+        "tables": [asdict(view) for view in report.tables],
+        "failures": report.failures,
     }
     if report.kind == "compare":
         content |= {
@@ -142,7 +183,7 @@ def report_json(report: Report) -> dict[str, Any]:
             "methods": method_rows(rows),
         }
     elif report.kind == "models":
-        content |= {"advice": advice(rows), "notes": model_notes(rows)}
+        content["advice"] = advice(rows)
     else:
         content["swept"] = list(first.swept)
     return content
@@ -160,7 +201,7 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 def as_markdown(report: Report) -> str:
     """The views and the failures for a paper's appendix or an issue."""
-    parts = [f"# {report.title}", *report.notes]
+    parts = [f"# {report.title}", *report.headline, *report.notes]
     for view in report.views:
         numbers = len(view.heads) - view.names
         lines = [view.heads, ("---",) * view.names + ("---:",) * numbers, *view.rows]
@@ -170,6 +211,13 @@ def as_markdown(report: Report) -> str:
         listed = "\n".join(f"- {failure}" for failure in report.failures)
         parts.append(f"## Runs without an answer\n\n{listed}")
     return "\n\n".join(parts) + "\n"
+
+
+def _in_words(head: str) -> str:
+    if head.startswith("Δ") and head.endswith(" %"):
+        return f"error of {head[1:-2]} [%]"
+    symbol, space, unit = head.partition(" ")
+    return WORDS.get(head, f"{symbol} [{unit}]" if space and unit in UNITS else head)
 
 
 def _escaped(text: str) -> str:
@@ -214,6 +262,51 @@ def comparison_views(summaries: Sequence[Row]) -> list[View]:
         _view("Quality", {"method": _text("method")}, quality, summaries),
         _view("Cost", {"method": _text("method")}, cost, summaries),
     ]
+
+
+def run_view(rows: Sequence[Row]) -> View:
+    """Every run of a comparison."""
+    names = {"start": _text("start"), "method": _text("method")}
+    cells: dict[str, Cell] = {
+        "ended": _text("status"),
+        "success": lambda row: "yes" if row["success"] else "no",
+    }
+    for name in (column for column in rows[0] if column.startswith("error_")):
+        cells[f"Δ{symbol_of(name.removeprefix('error_'))} %"] = _number(name, 100)
+    cells |= {
+        "markers mm": _number("rms_m", 1e3),
+        "roll-out mm": _number("rollout_rms_m", 1e3),
+        "iterations": _number("iterations", 1, ".4g"),
+        "total s": _number("total_s"),
+    }
+    ordered = sorted(rows, key=lambda row: row["start"])
+    view = _view("Runs", names, cells, ordered)
+    return replace(view, heads=tuple(map(_in_words, view.heads)))
+
+
+def _method_sentence(row: Row) -> str:
+    """How often, how well and how fast a method found the answer."""
+    low, high = 100 * row["success_low"], 100 * row["success_high"]
+    said = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
+    said += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
+    if row["total_s"] is None:
+        return f"{said}, and gave no answer."
+    misfit = f"with the markers {1e3 * row['rms_m']:.2g} mm off"
+    return f"{said}, {misfit} and in {row['total_s']:.2g} s at the median."
+
+
+def sweep_sentences(rows: Sequence[Row]) -> list[str]:
+    """How many runs converged, and how far each estimate moves over them."""
+    found = [row for row in rows if row["converged"]]
+    said = [f"{len(found)} of {len(rows)} runs converged."]
+    for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
+        values = [row[f"value_{name}"] for row in found]
+        errors = [e for row in found if (e := row[f"std_error_{name}"]) is not None]
+        if len(values) > 1:
+            spread = f"; the standard errors are {max(errors):.2g} at most" if errors else ""
+            low, high = f"{min(values):.4g}", f"{max(values):.4g} {unit_of(name)}".strip()
+            said.append(f"{symbol_of(name)} is {low} to {high} over them{spread}.")
+    return said
 
 
 def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:

@@ -21,6 +21,7 @@ from ..problem.reading import read_problem_file
 
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
+MOST_BRANCHES = 20
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,11 @@ def parse_branches(text: str) -> tuple[int, ...]:
         For anything but whole numbers from 0 on.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
-    if not items or not all(item.isdecimal() for item in items):
-        raise InputError(f"found {text!r}; expected whole numbers such as 0,1,2", None, "--prony")
-    return tuple(dict.fromkeys(map(int, items)))
+    counts = [int(item) for item in items if item.isdecimal() and len(item) < 3]
+    if not items or len(counts) < len(items) or max(counts) > MOST_BRANCHES:
+        expected = f"whole numbers up to {MOST_BRANCHES}, such as 0,1,2"
+        raise InputError(f"found {text!r}; expected {expected}", None, "--prony")
+    return tuple(dict.fromkeys(counts))
 
 
 def variants(

@@ -14,6 +14,12 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError
+from ...files import require_regular
+
+# Nothing measured is larger, and products of two such numbers are still numbers.
+LARGEST = 1e100
+# Letters of a cell that a message quotes.
+LONGEST = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +52,7 @@ def read_bytes(path: str | Path) -> bytes:
     InputError
         If it cannot be read.
     """
+    require_regular(path)
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -134,10 +141,11 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
                 value = float(cell) if cell else math.nan
             except ValueError:
                 value = math.inf
-            if math.isinf(value) or (math.isnan(value) and not blank_allowed):
+            if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
                 or_blank = " or a blank cell" if blank_allowed else ""
+                found = cell if len(cell) <= LONGEST else f"{cell[:LONGEST]}…"
                 raise InputError(
-                    f"column {grid.columns[column]} holds '{cell}'; expected a number{or_blank}",
+                    f"column {grid.columns[column]} holds '{found}'; expected a number{or_blank}",
                     grid.path,
                     f"line {row.line}",
                 )

@@ -8,11 +8,16 @@ the argument forces either.
 from __future__ import annotations
 
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from .batch import Batch, Evaluator, VectorCodeError
 from .choice import EVALUATORS, EvaluatorChoice, choose_evaluator, make_evaluator
 from .combine import Combiner, Plan, combine_natively, combine_with_numpy
 from .threads import available_threads, in_slices
+
+if TYPE_CHECKING:
+    from ...arrays import Index
+    from .skyline import Skyline
 
 __all__ = [
     "EVALUATORS",
@@ -25,6 +30,7 @@ __all__ = [
     "in_slices",
     "make_combiner",
     "make_evaluator",
+    "make_skyline",
 ]
 
 
@@ -36,3 +42,15 @@ def make_combiner(plan: Plan) -> Combiner:
         except RuntimeError:  # what llvmlite raises where it cannot compile
             pass
     return combine_with_numpy(plan)
+
+
+def make_skyline(size: int, rows: Index, columns: Index, source: Index) -> Skyline | None:
+    """The compiled factorisation of a skyline, where llvmlite can."""
+    if not find_spec("llvmlite"):
+        return None
+    from .skyline import Skyline
+
+    try:
+        return Skyline(size, rows, columns, source)
+    except RuntimeError:
+        return None

@@ -75,6 +75,7 @@ def _of_body(replay: Replay) -> dict[str, Figure]:
             replay.surface_parts,
             replay.part_names,
             replay.given_places_m,
+            replay.surface_nodes,
         ),
         "elements": elements_picture(replay.undeformed_m, replay.tetrahedra),
     }
@@ -93,8 +94,9 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
         pictures[f"wrench_{replay.name}{which}"] = wrench_picture(sensed)
     if replay.shapes_m is not None and np.isfinite(replay.shapes_m).all(axis=(1, 2)).any():
         pictures[f"shapes_{replay.name}"] = shapes(
-            t_s, replay.shapes_m, replay.surface, replay.held, measured, replay.up
-        )
+            t_s, replay.shapes_m, replay.surface, replay.held, measured, replay.up,
+            surface_nodes=replay.surface_nodes,
+        )  # fmt: skip
     return pictures
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,6 +20,7 @@ from ..style import (
     COLUMN_MM,
     CYCLE,
     LINE_PT,
+    SMALL_PT,
     TEXT_PT,
     VERMILION,
     dress,
@@ -26,6 +29,8 @@ from ..style import (
     log_axis,
     mathematical,
 )
+
+_RUNG = "#808080"
 
 
 def convergence(
@@ -43,7 +48,7 @@ def convergence(
     truth : mapping, optional
         Parameters are drawn relative to these; by default to their final values.
     """
-    figure = framed_figure(COLUMN_MM, 130, 14, 2, 9.5, 2)
+    figure = framed_figure(COLUMN_MM, 132, 14, 2, 9.5, 4)
     heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
     grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
     panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
@@ -53,10 +58,14 @@ def convergence(
         ("loss", [i.loss for i in history], BLUE),
         ("violation [N]", [i.violation_n for i in history], VERMILION),
     )
+    rungs = _rungs(history)
     for axes, (label, values, colour) in zip(panels, curves, strict=False):
-        axes.plot(numbers, _positive(values), "o-", ms=2.5, lw=LINE_PT, color=colour)
+        for part in rungs:
+            style: dict[str, Any] = {"ms": 2.5, "lw": LINE_PT, "color": colour}
+            axes.plot(numbers[part], _positive(values[part]), "o-", **style)
         dress(axes, "", "", label)
         log_axis(axes)
+    _mark_rungs(panels[:3], history, rungs)
     drawn = list(history[0].parameters) if names is None and history else list(names or ())
     _draw_parameters(panels[3], history, drawn, truth)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
@@ -65,6 +74,29 @@ def convergence(
         axes.yaxis.set_label_coords(-0.145, 0.5)
         axes.tick_params(labelbottom=axes is panels[3])
     return figure
+
+
+def _rungs(history: Sequence[Iteration]) -> list[slice]:
+    """Stretches of the history over which the same share of the timesteps was fitted."""
+    shares = [iteration.share for iteration in history]
+    starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
+    return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []
+
+
+def _mark_rungs(
+    panels: Sequence[Axes], history: Sequence[Iteration], rungs: Sequence[slice]
+) -> None:
+    """Say where the fit takes in more of the recordings: loss and error rise there."""
+    if len(rungs) < 2:
+        return
+    for part in rungs:
+        first = history[part.start]
+        if part.start:
+            between = (history[part.start - 1].number + first.number) / 2
+            for axes in panels:
+                axes.axvline(between, color=_RUNG, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
+    shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in rungs)
+    panels[0].set_title(f"fitted: {shares} % of the timesteps in turn", fontsize=SMALL_PT)
 
 
 def _draw_parameters(

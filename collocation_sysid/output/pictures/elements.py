@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...fem.mesh_checks import signed_volumes
-from ..style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, dress, framed_figure
+from ..style import BLUE, COLUMN_MM, VERMILION, dress, framed_figure
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 BINS = 24
@@ -39,14 +39,9 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     right.hist(quality, BINS, range=(0.0, 1.0), color=BLUE)
     worst = float(quality.min())
     right.axvline(worst, color=VERMILION, lw=1.0)
-    text = {"textcoords": "offset points", "fontsize": SMALL_PT, "color": VERMILION}
-    aside = (3, "left") if worst < 0.5 else (-3, "right")
-    right.annotate(
-        f"worst {worst:.2f}", (worst, 0.97), xycoords=("data", "axes fraction"),
-        xytext=(aside[0], 0), ha=aside[1], va="top", **text,
-    )  # fmt: skip
     dress(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
-    dress(right, "", "quality, 1 = regular")
+    dress(right, f"worst {worst:.2f}", "quality, 1 = regular")
+    right.title.set_color(VERMILION)
     for axes in (left, right):
         axes.grid(False, axis="x")
         axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))

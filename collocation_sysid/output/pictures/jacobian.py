@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,10 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from ...arrays import Array
+from ...check.derivatives import first_samples
 from ...nlp.collocation import Collocation
 from ..style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
 
 SHOWN_STEPS = 6
+# Beyond those shown: rows of the last ones reach two steps ahead.
+SPARE_SAMPLES = 4
 # Picture elements across a panel, and decades of magnitude told apart.
 RASTER = 400
 DECADES = 6
@@ -34,6 +38,8 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
         Its first experiment is shown.
     z : (variables,)
     """
+    total = collocation.segments[0].grid_rows
+    collocation, z = _first_steps(collocation, z)
     segment, nq = collocation.segments[0], collocation.nq
     first, steps = segment.dynamics.first_row, min(SHOWN_STEPS, segment.grid_rows)
     height, width = segment.rows_per_time, segment.dofs
@@ -58,7 +64,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     )
     left.set_ylim(rows, 0)
     _tick_blocks(left, "y", "c", range(first, steps), height)
-    dress(middle, f"{steps} of {segment.grid_rows} timesteps", "node positions")
+    dress(middle, f"{steps} of {total} timesteps", "node positions")
     _tick_blocks(middle, "x", "x", range(steps), width)
     _tick_blocks(middle, "y", "c", range(first, steps), height)
     middle.tick_params(labelleft=False, left=False)
@@ -73,6 +79,16 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     bar.ax.tick_params(which="both", labelsize=SMALL_PT, width=0.6)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     return figure
+
+
+def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
+    """The first experiment's first timesteps alone: the whole Jacobian may be gigabytes."""
+    part = collocation.parts(z)[0]
+    count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
+    few = first_samples(part.segment.experiment, count)
+    short = replace(collocation, experiments=[few], charts={})
+    p = np.concatenate([part.q, part.phi])
+    return short, short.pack(p, [part.x[: short.segments[0].grid_rows]])
 
 
 def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:

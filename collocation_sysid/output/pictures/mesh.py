@@ -50,6 +50,7 @@ def mesh_picture(
     parts: NDArray[np.integer] | None = None,
     part_names: Sequence[str] = (),
     given_m: Array | None = None,
+    surface_nodes: NDArray[np.integer] | None = None,
 ) -> Figure:
     """Draw the undeformed body from the front and from behind, with its markers' names.
 
@@ -66,6 +67,8 @@ def mesh_picture(
     given_m : (M, 3), optional
         The places that were given for the markers, NaN where there was none: a cross where a
         marker was found elsewhere, and a frame about a marker without.
+    surface_nodes : (F, k), optional
+        The nodes of each triangle, its corners by default.
     """
     given_m = places_m if given_m is None else given_m
     front = Camera.facing(nodes_m[None], up)
@@ -90,7 +93,7 @@ def mesh_picture(
     views, unlike = [], set[str]()
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
         view = View.fitting(camera, everything, (width, height), corner)
-        Drawn(axes, view, surface, parts).show(nodes_m, held, places_m)
+        Drawn(axes, view, surface, parts, surface_nodes).show(nodes_m, held, places_m)
         unlike |= _draw_given(axes, view, places_m, given_m)
         if named:
             dots = view.places(places_m[mine])

@@ -91,6 +91,7 @@ class Drawn:
     view : View
     surface : (F, 3)
     parts : (F,) the part of the body that each triangle belongs to; one part by default
+    nodes : (F, k) the nodes of each triangle, of which grasped ones are marked; by default corners
     """
 
     def __init__(
@@ -99,8 +100,10 @@ class Drawn:
         view: View,
         surface: Triangles,
         parts: NDArray[np.integer] | None = None,
+        nodes: NDArray[np.integer] | None = None,
     ) -> None:
         self.view, self.surface = view, surface
+        self.nodes = surface if nodes is None else nodes
         numbers = np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(SKINS)
         self.skins = np.array([to_rgb(skin) for skin in SKINS])[numbers]
         self.edged = len(surface) <= EDGED
@@ -123,7 +126,7 @@ class Drawn:
         self.skin.set_facecolor(colours)
         if not self.edged:
             self.skin.set_edgecolor(colours)
-        outer = np.unique(self.surface[faces])
+        outer = np.unique(self.nodes[faces])
         self.grasped.set_data(*self.view.places(positions_m[outer[held[outer]]]).T)
         hidden = camera.hidden(markers_m, positions_m, self.surface)
         self.rings.set_data(*self.view.places(markers_m[hidden]).T)

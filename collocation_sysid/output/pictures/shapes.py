@@ -32,6 +32,7 @@ def shapes(
     measured_m: Array,
     up: ArrayLike = (0.0, 0.0, 1.0),
     count: int = SHOWN,
+    surface_nodes: NDArray[np.integer] | None = None,
 ) -> Figure:
     """Draw the body at evenly spaced samples, side by side in one scale.
 
@@ -48,6 +49,8 @@ def shapes(
     up : (3,)
     count : int
         How many shapes.
+    surface_nodes : (F, k), optional
+        The nodes of each triangle, its corners by default.
     """
     there = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
     shown = there[np.unique(np.linspace(0, len(there) - 1, count).astype(int))]
@@ -64,7 +67,7 @@ def shapes(
     start = CORNER_MM
     for t, first, last in zip(shown, left, right, strict=True):
         view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
-        Drawn(axes, view, surface).show(positions_m[t], held[t], measured_m[t])
+        Drawn(axes, view, surface, nodes=surface_nodes).show(positions_m[t], held[t], measured_m[t])
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)

@@ -5,33 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError
-from .page import number, picture, read_json, rendered
+from ...files import damage_refused, read_json
+from .page import picture, rendered
 
-MODEL_COLUMNS = {
-    "model": "model",
-    "chosen": "to use",
-    "free": "parameters",
-    "status": "status",
-    "rms_m": "markers RMS m",
-    "delta_aic": "ΔAIC",
-    "held_out_rms_m": "held out RMS m",
-    "total_s": "time s",
-}
-# Columns that a person looks for first; the others are in runs.csv.
-METHOD_COLUMNS = {
-    "method": "method",
-    "runs": "runs",
-    "successes": "successes",
-    "success_rate": "success rate",
-    "success_low": "from",
-    "success_high": "to",
-    "rms_m": "markers RMS m",
-    "violation_n": "violation N",
-    "rollout_rms_m": "roll-out RMS m",
-    "tip_max_m": "roll-out max m",
-    "iterations": "iterations",
-    "total_s": "time s",
+SUMMARY_FILE = "summary.json"
+CAPTIONS = {
+    "convergence": "Loss and violated dynamics over the time of the solve, a line for each run.",
+    "success": "Share of successes against how far the worst guess of a start is off.",
+    "basins": "The starts: pairs of guesses over the truth, or over the best answer.",
+    "tip": "The tip as measured, and simulated with the best answer of each method.",
+    "sweep": "Estimates with their 95 % intervals against what is swept; crosses did not converge.",
 }
 
 
@@ -44,53 +27,28 @@ def comparison_page(folder: str | Path) -> str:
         If it is not such a folder, or damaged.
     """
     folder = Path(folder)
-    summary = read_json(folder / "summary.json", "a folder of compare or sweep")
-    try:
-        runs = summary["runs"]
-        methods = summary.get("methods", [])
-        swept = summary.get("swept", [])
+    summary = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
+    with damage_refused(folder, SUMMARY_FILE, "repeat the study, finished runs are kept"):
         return rendered(
             "comparison.html",
             summary=summary,
-            methods=_table(methods, METHOD_COLUMNS),
-            runs=_table(
-                runs,
-                MODEL_COLUMNS
-                if summary.get("kind") == "models"
-                else {name: name for name in _run_columns(runs, swept)},
-            ),
+            runs=len(summary["runs"]),
+            tables=[_checked(table) for table in summary["tables"]],
             pictures=[
-                {"source": picture(file), "caption": file.stem.replace("_", " ")}
+                {
+                    "source": picture(file),
+                    "caption": CAPTIONS.get(file.stem, file.stem),
+                    "wide": True,
+                }
                 for file in sorted(folder.glob("*.png"))
+                if file.is_file()
             ],
         )
-    except (KeyError, TypeError, OSError) as error:
-        raise InputError(
-            f"summary.json is damaged ({type(error).__name__}: {error}); repeat the study, "
-            "finished runs are kept",
-            folder,
-        ) from error
 
 
-def _run_columns(runs: list[dict[str, Any]], swept: list[str]) -> list[str]:
-    wanted = ["method", "start", *swept, "outcome", "status", "success", "rms_m", "iterations"]
-    there = dict.fromkeys(name for row in runs for name in row)
-    estimates = [name for name in there if name.startswith("error_") or name.endswith("_value")]
-    return [name for name in [*wanted, *estimates, "total_s"] if name in there]
-
-
-def _table(rows: list[dict[str, Any]], columns: dict[str, str]) -> dict[str, Any]:
-    """Heads and texts of the columns that any row has."""
-    there = [name for name in columns if any(name in row for row in rows)]
-    return {
-        "heads": [columns[name] for name in there],
-        "rows": [[_cell(row.get(name)) for name in there] for row in rows],
-    }
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return number(value, 4)
-    return "–" if value is None else str(value)
+def _checked(table: dict[str, Any]) -> dict[str, Any]:
+    """A table whose rows are texts and as wide as its heads."""
+    rows = [[str(cell) for cell in row] for row in table["rows"]]
+    if any(len(row) != len(table["heads"]) for row in rows):
+        raise ValueError(f"the table {table['title']!r} has rows of another length")
+    return {**table, "rows": rows, "names": int(table["names"])}

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import Environment, FunctionLoader, StrictUndefined, TemplateError
 
-from ...errors import InputError
+from ...files import require_regular
 
 
 def rendered(template: str, **values: Any) -> str:
-    """A page from a template of this folder; text is escaped."""
+    """A page from a template of this folder; text is escaped.
+
+    Raises
+    ------
+    ValueError
+        If the template cannot be filled with the values.
+    """
     environment = Environment(
         loader=FunctionLoader(_template),
         autoescape=True,
@@ -24,7 +29,10 @@ def rendered(template: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "millimetres": millimetres}
-    return environment.get_template(template).render(**values)
+    try:
+        return environment.get_template(template).render(**values)
+    except TemplateError as error:  # a value that the page needs is not there
+        raise ValueError(error) from error
 
 
 def _template(name: str) -> str:
@@ -49,24 +57,6 @@ def millimetres(metres: float | None) -> str:
 
 def picture(file: Path) -> str:
     """A PNG as an address that holds its data."""
+    require_regular(file)
     data = base64.b64encode(file.read_bytes()).decode("ascii")
     return f"data:image/png;base64,{data}"
-
-
-def read_json(file: Path, what: str) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises
-    ------
-    InputError
-        If it is not there, or is damaged.
-    """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file.name} is damaged ({error})", file.parent) from error
-    if not isinstance(content, dict):
-        raise InputError(f"{file.name} is damaged: it holds no object", file.parent)
-    return content

@@ -7,12 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
 from ...fem.constants import symbol_of, unit_of
-from .page import millimetres, number, picture, read_json, rendered
+from ...files import read_json
+from ..remedies import remedies_for, remedy_for
+from ..replay import LARGEST, RESULT_FILE, read_arrays, reading_run
+from .page import millimetres, number, picture, rendered
 
 SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
 SHOWN_UNITS |= {"N": (1.0, " N"), "N m": (1e3, " mN m"), "kg": (1e3, " g")}
+MEANINGS = {
+    "good": "nothing speaks against the answer and its error bars",
+    "check": "usable after a look at the reasons",
+    "doubtful": "something is wrong with the data, the model or the solve",
+}
+# What tells stiffness first, where there are several.
+FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
+# Pictures wider than this can be moved sideways on a phone rather than shrunk.
+WIDE_PX = 1000
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
 WORST, APART = 8, 5
 
@@ -41,12 +52,16 @@ def run_page(run: str | Path) -> str:
         If it is not a run folder, or damaged.
     """
     run = Path(run)
-    result = read_json(run / "result.json", "a run folder")
-    try:
+    result = read_json(run / RESULT_FILE, "a run folder")
+    with reading_run(run):
         return rendered(
             "run.html",
             result=result,
             trust=result["trust"],
+            meaning=MEANINGS[result["trust"]["verdict"]],
+            reasons=[(reason, remedy_for(reason)) for reason in result["trust"]["reasons"]],
+            remedies=remedies_for(result["trust"]["reasons"]),
+            numbers=_numbers(result),
             verdict=verdict(result),
             notes=_notes(result),
             parameters=_parameters(result),
@@ -56,12 +71,6 @@ def run_page(run: str | Path) -> str:
             pictures=_pictures(run),
             problem=_text(run / "problem.toml"),
         )
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise InputError(
-            f"result.json or trajectory.npz is damaged ({type(error).__name__}: {error}); "
-            "solve the problem again",
-            run,
-        ) from error
 
 
 def verdict(result: dict[str, Any]) -> list[str]:
@@ -85,6 +94,32 @@ def verdict(result: dict[str, Any]) -> list[str]:
                 f"'{name}' was predicted, not fitted: {millimetres(experiment['rms_m'])} RMS."
             )
     return said
+
+
+def _numbers(result: dict[str, Any]) -> list[dict[str, str]]:
+    """The three numbers that matter: stiffness, misfit, and how well the answer repeats it."""
+    found = {**result["parameters"], **result["derived"]}
+    name = next((key for key in FOREMOST if key in found), next(iter(found)))
+    low, high = found[name].get("ci95") or (None, None)
+    interval = "no error bar" if low is None else f"{number(low, 4)} to {number(high, 4)} (95 %)"
+    fit, rolled = result["fit"], result["rollout"]
+    return [
+        {
+            "what": symbol_of(name),
+            "value": f"{number(found[name]['value'], 4)} {unit_of(name)}".strip(),
+            "beside": interval,
+        },
+        {
+            "what": "markers, fitted",
+            "value": millimetres(fit["rms_m"]),
+            "beside": f"RMS; noise alone leaves {millimetres(fit['noise_rms_m'])}",
+        },
+        {
+            "what": "markers, re-simulated",
+            "value": millimetres(rolled["rms_m"]),
+            "beside": f"RMS; {millimetres(rolled['max_m'])} at most",
+        },
+    ]
 
 
 def _notes(result: dict[str, Any]) -> list[str]:
@@ -124,10 +159,16 @@ def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
                     "reason": "fixed" if found.get("fixed") else found.get("reason"),
                     "guess": found.get("guess"),
                     "derived": group == "derived",
-                    "numerical": found.get("numerical_error"),
+                    "numerical": _numerical(found.get("numerical_error")),
                 }
             )
     return rows
+
+
+def _numerical(found: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The numerical error, with gaps for what was not measured."""
+    keys = ("step", "step_order", "mesh", "mesh_order", "extrapolated", "ci95")
+    return None if found is None else {key: found.get(key) for key in keys}
 
 
 def _places(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
@@ -177,14 +218,15 @@ def _size(value: float | None, unit: str) -> str:
 
 def _worst_errors(run: Path) -> list[dict[str, Any]]:
     """The largest residuals, with time and marker."""
-    with np.load(run / "trajectory.npz") as stored:
-        names = [key for key in stored.files if key.rpartition("/")[2] == "residuals_m"]
-        found = []
-        for key in names:
-            prefix = key.removesuffix("residuals_m")
-            errors = np.linalg.norm(stored[key], axis=2)
-            t_s, markers = stored[f"{prefix}t_s"], stored[f"{prefix}marker_names"]
-            found += _peaks(prefix.rstrip("/"), np.nan_to_num(errors), t_s, markers)
+    arrays, found = read_arrays(run), []
+    for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
+        prefix = key.removesuffix("residuals_m")
+        t_s, markers = arrays[f"{prefix}t_s"], arrays[f"{prefix}marker_names"]
+        shape, residuals_m = (len(t_s), len(markers), 3), arrays[key]
+        if residuals_m.shape != shape or np.nanmax(np.abs(residuals_m), initial=0.0) > LARGEST:
+            raise ValueError(f"{key} does not go with its times and markers")
+        errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
+        found += _peaks(prefix.rstrip("/"), errors, t_s, markers)
     return sorted(found, key=lambda item: -item["error_m"])[:WORST]
 
 
@@ -208,7 +250,13 @@ def _peaks(
     return found
 
 
-def _pictures(run: Path) -> list[dict[str, str]]:
+def _width_px(file: Path) -> int:
+    """Width of a PNG, by its header."""
+    with file.open("rb") as stream:
+        return int.from_bytes(stream.read(20)[16:])
+
+
+def _pictures(run: Path) -> list[dict[str, Any]]:
     """Every PNG of the folder, those known here first."""
     order = list(CAPTIONS)
 
@@ -216,14 +264,16 @@ def _pictures(run: Path) -> list[dict[str, str]]:
         return next((k for k in order if file.stem.startswith(k)), "")
 
     files = sorted(
-        run.glob("*.png"), key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name)
+        (file for file in run.glob("*.png") if file.is_file()),
+        key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name),
     )
     found = []
     for file in files:
         about = file.stem.removeprefix(kind(file)).strip("_")
         caption = CAPTIONS.get(kind(file), file.stem)
         title = f"{about}: {caption}" if about and kind(file) else caption
-        found.append({"source": picture(file), "caption": title})
+        wide = _width_px(file) > WIDE_PX
+        found.append({"source": picture(file), "caption": title, "wide": wide})
     return found
 
 
