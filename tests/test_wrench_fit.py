@@ -13,9 +13,12 @@ from problems_small import GUESS, TRUTH, hung_cube, relative_errors
 from wrenches_small import SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
+from collocation_sysid.check.derivatives import derivative_errors, shortened
 from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting
+from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.problem import Problem
@@ -143,3 +146,28 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     assert "sensor late by" in said
     assert "Wrench of a grasp" in run_page(folder)
     assert any(file.name.startswith("wrench") for file in redraw(folder, tmp_path / "again"))
+
+
+def test_interior_point_finds_the_same_optimum():
+    collocation = Collocation([swung(steps=12)], GUESS)
+    reduced = ReducedSpace()(collocation)
+    found = InteriorPoint(max_iterations=300)(collocation)
+    assert found.status.converged
+    np.testing.assert_allclose(found.q, reduced.q, atol=1e-6)
+    assert any("limited-memory" in note for note in found.notes)
+
+
+def test_methods_that_need_second_derivatives_refuse_wrenches():
+    with pytest.raises(cs.InputError, match="needs second derivatives"):
+        cs.SqpMethod()(Collocation([swung(steps=12)], GUESS))
+    exact = ReducedSpace(hessian="exact")
+    with pytest.raises(cs.InputError, match="second derivatives of measured wrenches"):
+        exact(Collocation([swung(steps=12)], GUESS))
+
+
+def test_check_compares_the_slopes_of_wrenches():
+    problem = Problem([swung()], UNKNOWN)
+    short = shortened(problem, 12).collocation()
+    jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
+    assert jacobian < 1e-6
+    assert hessian < 1e-6

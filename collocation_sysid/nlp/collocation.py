@@ -94,11 +94,6 @@ class Part:
         """Its sensors."""
         return Sensing(self.segment, self.setting, self.phi)
 
-    @cached_property
-    def sensing(self) -> Sensing:
-        """Its sensors."""
-        return Sensing(self.segment, self.setting, self.phi)
-
     @property
     def loss(self) -> float:
         """Of markers and wrenches, without priors."""

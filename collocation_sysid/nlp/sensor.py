@@ -16,7 +16,7 @@ compared at its own time, however many there are in a step, so that no average h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -360,6 +360,11 @@ def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tup
             held, places = np.isin(own, grasp.dofs) * 1.0, np.searchsorted(dofs, own)
             found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places, held))
     return tuple(found)
+
+
+def without_sensors(experiment: Experiment) -> Experiment:
+    """The same experiment, its wrenches not measured."""
+    return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
 
 
 def sensed_dofs(experiment: Experiment) -> Index:

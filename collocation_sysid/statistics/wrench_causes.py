@@ -13,12 +13,11 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
-from ..experiment.experiment import Experiment
 from ..experiment.wrench import Wrench
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..nlp.collocation import Collocation, Part
-from ..nlp.sensor import Forced, Sensor
+from ..nlp.sensor import Forced, Sensor, without_sensors
 from .cause import Cause
 
 # Residuals up to so many standard deviations need no cause; what is right leaves so much less.
@@ -63,7 +62,7 @@ def _missed(part: Part) -> bool:
 
 def _from_markers(collocation: Collocation) -> list[Part]:
     """Every experiment where its markers alone have it; none where that cannot be found."""
-    blind = [_blind(segment.experiment) for segment in collocation.segments]
+    blind = [without_sensors(segment.experiment) for segment in collocation.segments]
     try:
         alone = replace(collocation, experiments=blind)
         solution = ReducedSpace(max_iterations=MOST_SWEEPS)(alone)
@@ -76,10 +75,6 @@ def _from_markers(collocation: Collocation) -> list[Part]:
         phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
         found.append(Part(segment, part.q, phi, part.x))
     return found
-
-
-def _blind(experiment: Experiment) -> Experiment:
-    return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
 
 
 def _of_sensor(part: Part, sensor: Sensor, forced: Forced) -> list[Cause]:
