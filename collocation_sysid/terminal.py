@@ -425,8 +425,9 @@ def _measurements_section(findings: Findings) -> RenderableType:
             else "none missing"
         )
         kind = ", validation" if recording.validation else ""
+        when = f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz"
         rows[f"'{recording.experiment}'"] = (
-            f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz: {recording.frames} × "
+            f"{'static' if recording.static else when}: {recording.frames} × "
             f"{len(recording.markers)} markers, {missing}; farthest from the body "
             f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm{kind}"
         )

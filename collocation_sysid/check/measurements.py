@@ -44,6 +44,7 @@ class Recording:
 
     experiment: str
     validation: bool
+    static: bool
     duration_s: float
     rate_hz: float
     frames: int
@@ -90,6 +91,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     return Recording(
         experiment.name,
         experiment.validation,
+        experiment.static,
         experiment.duration_s,
         1 / experiment.timestep_s,
         len(experiment.t_s),

@@ -86,7 +86,7 @@ def _refitted(collocation: Collocation, experiment: Experiment, until: float) ->
     if base is None:
         return []
     misfit = _misfit(given, base)
-    found = [_best_lag(alone, given, base, until)]
+    found = [] if given.static else [_best_lag(alone, given, base, until)]
     for trial in (*_slip(given, base), *_trials(given)):
         if time.monotonic() > until:
             break
