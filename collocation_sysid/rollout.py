@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .arrays import Array
+from .arrays import Array, root_mean
 from .errors import SimulationError
 from .experiment import Experiment
 from .methods.reduced_space import ReducedSpace
@@ -64,8 +64,8 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     present = distances[experiment.markers.present]
     nuisance = segment.nuisance
     return Rollout(
-        float(np.sqrt(np.mean(present**2))),
-        float(present.max()),
+        root_mean(present**2),
+        float(present.max(initial=0.0)),
         replace(trajectory, markers_m=readings),
         dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True))
         if experiment.validation

@@ -172,7 +172,9 @@ def check_problem(problem: Problem) -> Findings:
         timesteps=sum(segment.grid_rows for segment in collocation.segments),
         samples=sum(recording.samples for recording in recordings),
         missing=sum(recording.missing for recording in recordings),
-        largest_marker_distance_m=max(r.farthest.distance_m for r in recordings),
+        largest_marker_distance_m=max(
+            (r.farthest.distance_m for r in recordings if r.markers), default=0.0
+        ),
         rms_at_guess_m=collocation.rms_m(z),
         recordings=recordings,
         motions=motions,

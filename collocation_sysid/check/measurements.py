@@ -103,6 +103,8 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
 
 def recording_warnings(recording: Recording, mean_edge_m: float, diagonal_m: float) -> list[str]:
     """What is wrong with the measurements, one sentence each; the worst marker stands for all."""
+    if not recording.markers:
+        return []
     warnings = []
     name, far, lost = recording.experiment, recording.farthest, recording.least_seen
     if far.distance_m > FAR * mean_edge_m:

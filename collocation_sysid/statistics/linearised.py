@@ -72,7 +72,7 @@ class FitBlock:
         samples, markers = self.present.shape
         return (
             self.residual.reshape(samples, 3 * markers),
-            self.slope.reshape(samples, 3 * markers, -1 if self.slope.size else 0),
+            self.slope.reshape(samples, 3 * markers, self.slope.shape[-1]),
             np.repeat(self.present, 3, axis=1),
         )
 

@@ -20,7 +20,7 @@ HELD = 2.0
 def motionless(experiment: Experiment) -> bool:
     """Whether neither grasps and loads nor markers move or change, but for noise."""
     markers, t_s = experiment.markers, experiment.t_s
-    sigma_m = float(np.median(markers.sigma_m))
+    sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0
     held, positions_m = experiment.grasped(t_s)
     lasting = held.all(axis=0)
     if (held.any(axis=0) != lasting).any():
