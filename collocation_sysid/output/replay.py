@@ -72,6 +72,8 @@ class Replay:
     positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
     rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
     natural_hz : (k,) natural frequencies with the answer, ascending
+    static : bool
+        Whether every sample is an equilibrium of its own.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Replay:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
+    static: bool = False
 
     @classmethod
     def of(
@@ -128,6 +131,7 @@ class Replay:
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
             natural_hz,
+            experiment.static,
         )
 
     @property
@@ -151,6 +155,7 @@ class Replay:
             "held": self.held,
             "up": self.up,
             "natural_hz": self.natural_hz,
+            "static": np.array(True) if self.static else None,
         }
         shared: dict[str, Any] = {
             "undeformed_m": self.undeformed_m,
@@ -184,6 +189,7 @@ class Replay:
         found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
+        found["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(found)
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
         parts = [str(part) for part in arrays["part_names"]]

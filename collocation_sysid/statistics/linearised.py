@@ -32,7 +32,7 @@ class FitBlock:
     ----------
     name : str
         Of the experiment.
-    t_s : (T,) sample times, equally spaced
+    t_s : (T,) sample times, equally spaced unless static
     marker_names : (M,)
     present : (T, M) bool
     residual : (T, M, 3) (h(x) − ŷ) / σ, zero where missing
@@ -40,6 +40,8 @@ class FitBlock:
     sigma_m : (M,) standard deviations given
     misfit : (T, M, 3), optional
         Residuals as they are, where Huber's loss has shortened those in `residual`.
+    static : bool
+        Whether samples are equilibria, of which no frequency can be told.
     """
 
     name: str
@@ -50,6 +52,7 @@ class FitBlock:
     slope: Array
     sigma_m: Array
     misfit: Array | None = None
+    static: bool = False
 
     @property
     def wild(self) -> Mask:
@@ -69,7 +72,7 @@ class FitBlock:
         samples, markers = self.present.shape
         return (
             self.residual.reshape(samples, 3 * markers),
-            self.slope.reshape(samples, 3 * markers, -1 if self.slope.size else 0),
+            self.slope.reshape(samples, 3 * markers, self.slope.shape[-1]),
             np.repeat(self.present, 3, axis=1),
         )
 
@@ -178,6 +181,7 @@ def linearised_fit(
                 slope=slope,
                 sigma_m=markers.sigma_m,
                 misfit=misfit,
+                static=segment.experiment.static,
             )
         )
     prior_residual, prior_slope = collocation.prior(p)

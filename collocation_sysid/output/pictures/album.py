@@ -83,11 +83,13 @@ def _of_body(replay: Replay) -> dict[str, Figure]:
 def _of_experiment(replay: Replay) -> dict[str, Figure]:
     t_s, measured = replay.t_s, replay.measured_m
     fitted, rolled_out = _finite(replay.markers_m), _finite(replay.rolled_out_m)
-    pictures = {
-        f"tracks_{replay.name}": tracks(t_s, replay.marker_names, measured, fitted, rolled_out),
-        f"error_{replay.name}": error_over_time(t_s, measured, fitted, rolled_out),
-        f"spectrum_{replay.name}": spectrum(t_s, measured, fitted, replay.natural_hz),
-    }
+    pictures, names = dict[str, Figure](), replay.marker_names
+    if len(names):
+        pictures[f"tracks_{replay.name}"] = tracks(t_s, names, measured, fitted, rolled_out)
+        pictures[f"error_{replay.name}"] = error_over_time(t_s, measured, fitted, rolled_out)
+    if len(names) and not replay.static:
+        spectral = spectrum(t_s, measured, fitted, replay.natural_hz)
+        pictures[f"spectrum_{replay.name}"] = spectral
     if replay.shapes_m is not None and np.isfinite(replay.shapes_m).all(axis=(1, 2)).any():
         pictures[f"shapes_{replay.name}"] = shapes(
             t_s, replay.shapes_m, replay.surface, replay.held, measured, replay.up,
