@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .arrays import Array
+from .arrays import Array, root_mean
 from .errors import SimulationError
 from .experiment import Experiment
 from .methods.reduced_space import ReducedSpace
@@ -69,8 +69,8 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     present = distances[experiment.markers.present]
     nuisance, wrenches = segment.nuisance, _read(segment, phi, trajectory)
     return Rollout(
-        float(np.sqrt(np.mean(present**2))),
-        float(present.max()),
+        root_mean(present**2),
+        float(present.max(initial=0.0)),
         replace(trajectory, markers_m=readings),
         dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True))
         if experiment.validation
@@ -121,7 +121,7 @@ def step_changes(
     parts = zip(solution.collocation.segments, solution.readings_m, strict=True)
     for segment, readings in parts:
         experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)
-        if not isinstance(rollout, Rollout) or not _finer(problem, experiment.timestep_s):
+        if not isinstance(rollout, Rollout) or not _finer(problem, experiment):
             return None
         way = rollout.trajectory.markers_m - readings
         apart.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
@@ -140,8 +140,10 @@ def step_changes(
     }
 
 
-def _finer(problem: Problem, interval_s: float) -> bool:
-    """Whether roll-outs have at most half the step of the fit."""
-    options = problem.rollout
+def _finer(problem: Problem, experiment: Experiment) -> bool:
+    """Whether roll-outs have at most half the step of the fit, or there is none."""
+    options, interval_s = problem.rollout, experiment.timestep_s
+    if experiment.static:
+        return True
     step_s = options.timestep_s or interval_s / 4
     return options.integrator == "newmark" and step_s <= 0.501 * interval_s / problem.substeps

@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from .check import BodyFinding, Findings
+from .check import BodyFinding, Findings, Recording
 from .check.hold import hold_sentence
 from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
@@ -445,17 +445,11 @@ def _motion_section(findings: Findings) -> list[RenderableType]:
 def _measurements_section(findings: Findings) -> RenderableType:
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
-        far, lost = recording.farthest, recording.least_seen
-        missing = (
-            f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"
-            if recording.missing
-            else "none missing"
-        )
         kind = ", validation" if recording.validation else ""
+        when = f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz"
         rows[f"'{recording.experiment}'"] = (
-            f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz: {recording.frames} × "
-            f"{len(recording.markers)} markers, {missing}; farthest from the body "
-            f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm{kind}"
+            f"{'static' if recording.static else when}: {recording.frames} × "
+            f"{_markers_seen(recording)}{kind}"
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
@@ -463,6 +457,21 @@ def _measurements_section(findings: Findings) -> RenderableType:
         rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
     rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
     return _section("Measurements", rows)
+
+
+def _markers_seen(recording: Recording) -> str:
+    if not recording.markers:
+        return "no markers"
+    far, lost = recording.farthest, recording.least_seen
+    missing = (
+        f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"
+        if recording.missing
+        else "none missing"
+    )
+    return (
+        f"{len(recording.markers)} markers, {missing}; farthest from the body "
+        f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm"
+    )
 
 
 def _solve_section(findings: Findings) -> RenderableType:

@@ -111,7 +111,8 @@ def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
     """How each body oscillates with the answer; a solve that failed has none worth the search."""
     found = {}
     scheme = as_scheme(solution.collocation.scheme)
-    for experiment in problem.experiments if solution.status.converged else ():
+    moving = [experiment for experiment in problem.experiments if not experiment.static]
+    for experiment in moving if solution.status.converged else ():
         theta = experiment.body.theta(solution.parameters)
         try:
             found[experiment.name] = motion_of(

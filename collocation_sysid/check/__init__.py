@@ -62,7 +62,7 @@ class Findings:
     rms_at_guess_m : float
         Distance of the markers from their measurements in the simulation at the guess.
     recordings : tuple of Recording, one for each experiment
-    motions : tuple of Motion, one for each fitted experiment
+    motions : tuple of Motion, one for each fitted experiment that moves
     variables, constraints : int
         Of the program, without memory.
     overstresses : int
@@ -145,6 +145,7 @@ def check_problem(problem: Problem) -> Findings:
     motions = tuple(
         motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
         for s in collocation.segments
+        if not s.experiment.static
     )
     causes, holds = description_causes(problem), _holds(problem, bodies)
     still = stillness_notes(problem.experiments, problem.parameters)
@@ -171,7 +172,9 @@ def check_problem(problem: Problem) -> Findings:
         timesteps=sum(segment.grid_rows for segment in collocation.segments),
         samples=sum(recording.samples for recording in recordings),
         missing=sum(recording.missing for recording in recordings),
-        largest_marker_distance_m=max(r.farthest.distance_m for r in recordings),
+        largest_marker_distance_m=max(
+            (r.farthest.distance_m for r in recordings if r.markers), default=0.0
+        ),
         rms_at_guess_m=collocation.rms_m(z),
         recordings=recordings,
         motions=motions,

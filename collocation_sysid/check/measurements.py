@@ -44,6 +44,7 @@ class Recording:
 
     experiment: str
     validation: bool
+    static: bool
     duration_s: float
     rate_hz: float
     frames: int
@@ -90,6 +91,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     return Recording(
         experiment.name,
         experiment.validation,
+        experiment.static,
         experiment.duration_s,
         1 / experiment.timestep_s,
         len(experiment.t_s),
@@ -101,6 +103,8 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
 
 def recording_warnings(recording: Recording, mean_edge_m: float, diagonal_m: float) -> list[str]:
     """What is wrong with the measurements, one sentence each; the worst marker stands for all."""
+    if not recording.markers:
+        return []
     warnings = []
     name, far, lost = recording.experiment, recording.farthest, recording.least_seen
     if far.distance_m > FAR * mean_edge_m:

@@ -46,9 +46,9 @@ class Experiment:
     grasps : sequence of Grasp
         No node in two of them at a time along the same axis. Selected nodes are looked up on the
         body, and poses given as matrices are those at `t_s`.
-    markers : Markers
+    markers : Markers, optional
         Tracks at the times `t_s`, at least one sample present. Those given by their places are put
-        on the body, see `place_markers`.
+        on the body, see `place_markers`. None are needed where a wrench is measured.
     gravity_m_s2 : (3,) array
         Acceleration of gravity.
     name : str
@@ -103,7 +103,7 @@ class Experiment:
         body: Body,
         t_s: ArrayLike,
         grasps: Iterable[Grasp],
-        markers: Markers,
+        markers: Markers | None = None,
         gravity_m_s2: ArrayLike = EARTH_M_S2,
         name: str = "experiment",
         *,
@@ -125,7 +125,7 @@ class Experiment:
                 body=body,
                 t_s=times,
                 grasps=tuple(grasp.on(body, times) for grasp in grasps),
-                markers=markers,
+                markers=Markers.none(times) if markers is None else markers,
                 gravity_m_s2=read_only_floats(gravity_m_s2, (3,), "gravity_m_s2"),
                 name=name,
                 kind=kind,
@@ -141,7 +141,7 @@ class Experiment:
             )
             self._check_kind()
             self._check_time()
-            vars(self)["markers"] = markers.on(body, self._carried_back)
+            vars(self)["markers"] = self.markers.on(body, self._carried_back)
             self._check_nodes()
             self._check_start()
         except InputError as error:
@@ -297,11 +297,20 @@ class Experiment:
                 "the markers' times differ from t_s; align poses and markers to one grid first"
             )
         if self.markers.samples == 0:
-            raise InputError("no marker sample is present; check the marker file and window_s")
+            self._refuse_unmeasured()
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
             if grasp.wrench is not None:
                 within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
+
+    def _refuse_unmeasured(self) -> None:
+        if any(grasp.wrench is not None for grasp in self.grasps):
+            return
+        if not self.markers.names:
+            raise InputError(
+                "nothing is measured: there are no markers and no wrench; expected either"
+            )
+        raise InputError("no marker sample is present; check the marker file and window_s")
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)

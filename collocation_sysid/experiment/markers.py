@@ -120,6 +120,8 @@ class Markers:
         )
 
     def __repr__(self) -> str:
+        if not self.names:
+            return "no markers"
         shown = self.names if len(self.names) <= SHOWN else (*self.names[:SHOWN], "…")
         missing = int(self.missing.sum())
         gaps = f", {missing} missing" if missing else ""
@@ -162,6 +164,16 @@ class Markers:
                 f"marker '{self.names[m]}' is never seen and has no place on the body; give its "
                 "reference_m, or leave it out"
             )
+
+    @classmethod
+    def none(cls, t_s: ArrayLike) -> Markers:
+        """No markers at the times `t_s` (T,), of an experiment that measures something else."""
+        return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), 1.0)
+
+    @property
+    def first_seen(self) -> int:
+        """The first sample in which a marker is seen; the first of all where none is."""
+        return int(self.present.any(axis=1).argmax())
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:

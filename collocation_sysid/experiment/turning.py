@@ -65,12 +65,15 @@ class Turn:
 
 
 def fastest_turn(experiment: Experiment, substeps: int) -> Turn:
-    """The largest turn of an experiment's grasps within a step, `substeps` of them a sample."""
+    """The largest turn of an experiment's grasps within a step, `substeps` of them a sample.
+
+    Between the samples of a static experiment there is no step.
+    """
     step_s = experiment.timestep_s / substeps
     steps = (len(experiment.t_s) - 1) * substeps
     t_s = experiment.t_s[0] + step_s * np.arange(steps + 1)
     largest, time_s, held = 0.0, float(t_s[0]), False
-    for grasp in experiment.grasps:
+    for grasp in () if experiment.static else experiment.grasps:
         held_s = t_s[grasp.holds(t_s)]
         if len(held_s) < 2:
             continue

@@ -13,8 +13,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
-import numpy as np
-
 from ..arrays import Array
 from ..errors import InputError, hint_at
 from ..experiment.experiment import Experiment
@@ -103,9 +101,8 @@ class Continuation(Options):
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
     """The first samples of a recording, as many as wanted and needed to see a marker."""
-    seen = int(np.flatnonzero(experiment.markers.present.any(axis=1))[0])
-    stop = min(len(experiment.t_s), max(count, seen + 1, 3))
     markers = experiment.markers
+    stop = min(len(experiment.t_s), max(count, markers.first_seen + 1, 3))
     shorter = replace(markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop])
     return replace(experiment, t_s=experiment.t_s[:stop], markers=shorter)
 

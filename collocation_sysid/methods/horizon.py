@@ -136,7 +136,7 @@ class Horizon:
             for values, by in ((residual, here), *sensed):
                 residuals.append(values.ravel())
                 slopes.append(np.zeros((values.size, len(p))))
-                slopes[-1][:, segment.places] = by.reshape(values.size, -1)
+                slopes[-1][:, segment.places] = by.reshape(values.size, by.shape[-1])
         if collocation.huber is not None:
             pairs = zip(residuals, slopes, strict=True)
             reweighted = [huberised(r, s, collocation.huber) for r, s in pairs]

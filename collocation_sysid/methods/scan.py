@@ -20,7 +20,7 @@ from itertools import groupby
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
 from ..nlp.collocation import Collocation, Part
@@ -249,7 +249,7 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
         read = part.segment.observation.predicted(part.x, part.phi)
         off = (read - markers.positions_m[: len(read)]) / markers.sigma_m[:, None]
         residuals.append(off[part.segment.observation.present[: len(read)]].ravel())
-    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
+    return root_mean(np.concatenate(residuals) ** 2)
 
 
 class _Trial:
@@ -259,8 +259,7 @@ class _Trial:
         self.collocation = collocation
         self.samples, self.rows, self.whole = [], [], []
         for segment in collocation.segments:
-            t_s, markers = segment.experiment.t_s, segment.experiment.markers
-            seen = int(np.flatnonzero(markers.present.any(axis=1))[0])
+            t_s, seen = segment.experiment.t_s, segment.experiment.markers.first_seen
             self.samples.append(min(len(t_s), max(part_of(len(t_s), SHARES[0]), seen + 1)))
             self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
             self.whole.append(segment.grid_rows)

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, root_mean
 from ..experiment.experiment import Experiment
 from ..nlp.collocation import Collocation, Violation
 from ..nlp.stopwatch import Stopwatch
@@ -190,7 +190,7 @@ class Solution:
         for segment, readings in zip(self.collocation.segments, self.readings_m, strict=True):
             markers = segment.experiment.markers
             squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
-            found[segment.experiment.name] = float(np.sqrt(squares.mean()))
+            found[segment.experiment.name] = root_mean(squares)
         return found
 
     @cached_property

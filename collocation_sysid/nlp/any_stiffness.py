@@ -52,9 +52,9 @@ class Described:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Described | None:
-        """Its first samples; None where no single motion carries the body throughout."""
+        """Its first samples; None where no single motion carries the body throughout, or none."""
         grasp = carrying(experiment)
-        if grasp is None:
+        if grasp is None or experiment.static:
             return None
         t_s = experiment.t_s[:MOST_SAMPLES]
         rotations, translations = grasp.poses.at(t_s)

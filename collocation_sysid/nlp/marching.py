@@ -197,7 +197,8 @@ def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: 
 
     def solve(near: Array, share: float) -> Array:
         start, step = near.copy(), row.under(share)
-        start[solver.held] = origin + share * (held - origin)
+        # To the last digit at the end: bounds hold it there.
+        start[solver.held] = held if share == 1 else origin + share * (held - origin)
         return solver.newton(start, step.residual, step.linearise, row.dynamics.static)
 
     return followed(solve, previous, solver.options.halvings, guess)

@@ -150,8 +150,9 @@ class Observation:
 
     def _reading(self, nodes: ca.SX, phi: ca.SX, place: ca.SX) -> ca.SX:
         """The reading y of one sample."""
-        scale = self.nuisance.scales[self._phi_places[0]]
-        kinds = [self.nuisance.kinds[i] for i in self._phi_places[0]]
+        first = self._phi_places[0] if len(self._phi_places) else []
+        scale = self.nuisance.scales[first]
+        kinds = [self.nuisance.kinds[i] for i in first]
 
         def values(kind: str) -> ca.SX:
             chosen = [i for i, name in enumerate(kinds) if name == kind]
@@ -192,7 +193,7 @@ class Observation:
         around = np.moveaxis(at[self._window[:samples]], (1, 3), (0, 1))
         places = self._phi_places.T[:, None]
         here = np.broadcast_to(phi[places], (len(places), *around.shape[2:]))
-        return np.concatenate([around.reshape(-1, *around.shape[2:]), here])
+        return np.concatenate([around.reshape(3 * self._neighbours, *around.shape[2:]), here])
 
     def _read(self, x: Array, nodes: Index, weights: Array, samples: int) -> Array:
         """Σ_a weights[m, a, …] x_a of each marker, (·, M, 3, …), as far as samples are read."""
@@ -204,6 +205,9 @@ class Observation:
         """Outputs of a function of `_sample` for the first samples, (…, samples, M) each."""
         samples, count = u.shape[1:]
         data = self._data[:, :samples] if data is None else data
+        if not count:
+            sizes = [chosen.size_out(k) for k in range(chosen.n_out())]
+            return [np.zeros((*size, samples, 0)) for size in sizes]
         outputs = chosen.map(samples * count)(u.reshape(len(u), -1), data.reshape(len(data), -1))
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         shaped = []
@@ -218,7 +222,7 @@ class Observation:
     def residuals(self, x: Array, phi: Array) -> Array:
         """(T, 3M) of (y − ŷ) / σ at grid positions x (N, 3n); zero where missing."""
         (values,) = self._mapped(self._sample.value, self._inputs(x, phi, len(self.grid_rows)))
-        return np.moveaxis(values[:, 0], 0, 2).reshape(values.shape[2], -1)
+        return np.moveaxis(values[:, 0], 0, 2).reshape(values.shape[2], 3 * values.shape[3])
 
     def at_samples(self, by_p: Array, phi: Array) -> Array:
         """Derivatives of h(x) at the samples, (R, 3M, m), from those of the first rows of x."""
@@ -420,6 +424,8 @@ class Observation:
     @cached_property
     def hessian_structure(self) -> tuple[Index, Index]:
         """Rows and columns of the entries of ∂²L/∂(x, φ)², upper triangle, sorted by column."""
+        if not self.markers.names:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         ones = np.ones((len(self.grid_rows), len(self.markers.names), self._entries, self._entries))
         # Positive numbers cannot cancel, so that no entry is lost.
         found = self._hessian(self._operator(np.ones(len(self._operator_places[0]))), ones)
@@ -429,6 +435,8 @@ class Observation:
 
     def hessian(self, x: Array, phi: Array) -> Array:
         """Values of the entries of `hessian_structure`."""
+        if not self.markers.names:
+            return np.zeros(0)
         if self.nuisance.size == 0 and self.huber is None:
             return self._constant_hessian
         return self._hessian_values(x, phi)

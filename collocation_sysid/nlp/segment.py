@@ -141,6 +141,8 @@ class Segment:
     def placed(self, phi: Array, x: Array) -> tuple[Chart, Array]:
         """The chart, and φ in it, with unknown places on the body's first rows x (rows, 3n)."""
         markers, rows = self.experiment.markers, self.observation.grid_rows
+        if markers.located.all():
+            return self.chart, phi
         points_m, _ = markers.first_samples
         first = rows[markers.present.argmax(axis=0)]
         places_m = self.places_m(phi)

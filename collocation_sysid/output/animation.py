@@ -35,6 +35,8 @@ WIDTH_MM, TALLEST_MM, LOWEST_MM = 160.0, 110.0, 30.0
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
 HEAD_MM, FOOT_MM = 12.0, 12.0
 MOST_FRAMES = 3000
+# Of a static experiment, however long it took.
+STATES_A_SECOND = 8
 
 Progress = Callable[[float], None]
 
@@ -82,7 +84,10 @@ def animate(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
     film = Film(replay)
-    shown = film_samples(replay.t_s, fps, slow)
+    t_s = replay.t_s
+    if replay.static:  # which may take a second or a day
+        t_s = np.arange(len(t_s)) / STATES_A_SECOND
+    shown = film_samples(t_s, fps, slow)
     ffmpeg = _ffmpeg(file) if file.suffix.lower() == ".mp4" else None
     file.parent.mkdir(parents=True, exist_ok=True)
     dpi = PIXELS_WIDE[file.suffix.lower()] / (WIDTH_MM / 25.4)
@@ -138,7 +143,8 @@ def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
             f"frames, more than {MOST_FRAMES}; lower --fps or --slow"
         )
     wanted = np.arange(count) / (slow * fps)
-    return np.minimum(np.rint(wanted / duration * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
+    share = wanted / max(duration, np.finfo(float).tiny)
+    return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
 
 
 class Film:

@@ -133,9 +133,12 @@ def _sensed(finished: Run, experiment: Experiment) -> list[Array]:
 def _places_m(finished: Run, experiment: str) -> Array | None:
     """(M, 3) of the markers as estimated; None where that failed."""
     if experiment in finished.places:
-        return np.array([place.position_m for place in finished.places[experiment].values()])
+        found = [place.position_m for place in finished.places[experiment].values()]
+        return np.array(found).reshape(-1, 3)
     rollout = finished.rollouts[experiment]
-    return np.array([*rollout.places_m.values()]) if isinstance(rollout, Rollout) else None
+    if not isinstance(rollout, Rollout):
+        return None
+    return np.array([*rollout.places_m.values()]).reshape(-1, 3)
 
 
 def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
@@ -411,4 +414,4 @@ def _pooled_rms(finished: Run, rolled: Mapping[str, Rollout]) -> float | None:
         return None
     counts = {e.name: e.markers.samples for e in finished.problem.experiments}
     squares = sum(counts[name] * r.rms_m**2 for name, r in rolled.items())
-    return float(np.sqrt(squares / sum(counts[name] for name in rolled)))
+    return float(np.sqrt(squares / max(1, sum(counts[name] for name in rolled))))

@@ -73,6 +73,8 @@ class Replay:
     positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
     rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
     natural_hz : (k,) natural frequencies with the answer, ascending
+    static : bool
+        Whether every sample is an equilibrium of its own.
     wrenches : sequence of (S, 19)
         Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
         out, NaN where there are none.
@@ -97,6 +99,7 @@ class Replay:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
+    static: bool = False
     wrenches: Sequence[Array] = ()
 
     @classmethod
@@ -134,6 +137,7 @@ class Replay:
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
             natural_hz,
+            experiment.static,
             wrenches,
         )
 
@@ -158,6 +162,7 @@ class Replay:
             "held": self.held,
             "up": self.up,
             "natural_hz": self.natural_hz,
+            "static": np.array(True) if self.static else None,
         } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
         shared: dict[str, Any] = {
             "undeformed_m": self.undeformed_m,
@@ -191,6 +196,7 @@ class Replay:
         found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
+        found["static"] = bool(arrays.get(f"{prefix}static", False))
         keys = (f"{prefix}wrench_{k}" for k in count(1))
         found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
         _require_shapes(found)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp
@@ -88,7 +88,7 @@ def _refitted(collocation: Collocation, experiment: Experiment, until: float) ->
     if base is None:
         return []
     misfit = _misfit(given, base)
-    found = [_best_lag(alone, given, base, until)]
+    found = [] if given.static else [_best_lag(alone, given, base, until)]
     for trial in (*_slip(given, base), *_trials(given)):
         if time.monotonic() > until:
             break
@@ -277,4 +277,4 @@ def _residual(experiment: Experiment, read: Array) -> Array:
 def _misfit(experiment: Experiment, read: Array) -> float:
     """Root mean square of the residuals in standard deviations."""
     scaled = _residual(experiment, read) / experiment.markers.sigma_m[:, None]
-    return float(np.sqrt(np.nanmean(scaled**2)))
+    return root_mean(scaled[experiment.markers.present] ** 2)

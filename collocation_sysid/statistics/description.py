@@ -56,6 +56,8 @@ def doubts(experiment: Experiment, constants: Mapping[str, float]) -> tuple[Caus
     constants : mapping of name to value
         Of the body, any that keep the ratios of stiffness within it.
     """
+    if experiment.static or not experiment.markers.names:
+        return ()
     given = Described.of(experiment)
     if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
         return steps(experiment)

@@ -107,8 +107,10 @@ def _diagnose(
     total = power if power > 0 else 1.0
     mean = residual.sum(axis=0) / samples
     varying = np.where(present[:, None], residual - mean, 0.0)
-    frequency, peak = _largest_peak(varying, block.t_s)
-    early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
+    frequency, peak, early = 0.0, 0.0, np.zeros(len(residual), dtype=bool)
+    if not block.static:
+        frequency, peak = _largest_peak(varying, block.t_s)
+        early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
     found = MarkerDiagnosis(
         experiment=block.name,
         marker=block.marker_names[marker],
@@ -126,7 +128,7 @@ def _diagnose(
     )
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
-    said = _suggestion(found, pairs, block.t_s, motion, estimated)
+    said = _suggestion(found, pairs, block, motion, estimated)
     if found.wild > MOST_WILD * samples:
         said += (
             f"; {found.wild} samples are beyond Huber's threshold: exchanged labels, or "
@@ -169,8 +171,9 @@ def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
 
 
 def _suggestion(
-    found: MarkerDiagnosis, pairs: int, t_s: Array, motion: Array, estimated: tuple[bool, bool]
+    found: MarkerDiagnosis, pairs: int, block: FitBlock, motion: Array, estimated: tuple[bool, bool]
 ) -> str:
+    t_s = block.t_s
     name = f"{found.experiment}/{found.marker}"
     size = f"{1e3 * found.rms_m:.2g} mm RMS"
     if found.rms_m < ROUNDING_M:
@@ -197,6 +200,10 @@ def _suggestion(
         said = _oscillation(found, t_s, motion)
     elif persistent and found.lag1 > DOMINANT:
         said = "it wanders slowly: creep of the material, or a grasp that gives, is not modelled"
+        if block.static:
+            said = (
+                "it changes with the load: the material's law, or how the grasps hold, is another"
+            )
     else:
         said = "a mixture, little of which is white noise"
     return f"{name}: {size}; {said}"

@@ -34,7 +34,7 @@ class FitBlock:
     ----------
     name : str
         Of the experiment.
-    t_s : (T,) sample times, equally spaced
+    t_s : (T,) sample times, equally spaced unless static
     marker_names : (M,)
     present : (T, M) bool
     residual : (T, M, 3) (h(x) − ŷ) / σ, zero where missing
@@ -42,6 +42,8 @@ class FitBlock:
     sigma_m : (M,) standard deviations given
     misfit : (T, M, 3), optional
         Residuals as they are, where Huber's loss has shortened those in `residual`.
+    static : bool
+        Whether samples are equilibria, of which no frequency can be told.
     components : (T, M, 3) bool, optional
         Coordinates that are there, where not all three of a sample need be.
     of_sensor : bool
@@ -56,6 +58,7 @@ class FitBlock:
     slope: Array
     sigma_m: Array
     misfit: Array | None = None
+    static: bool = False
     components: Mask | None = None
     of_sensor: bool = False
 
@@ -84,7 +87,7 @@ class FitBlock:
         samples, markers = self.present.shape
         return (
             self.residual.reshape(samples, 3 * markers),
-            self.slope.reshape(samples, 3 * markers, -1 if self.slope.size else 0),
+            self.slope.reshape(samples, 3 * markers, self.slope.shape[-1]),
             self.seen.reshape(samples, 3 * markers),
         )
 
@@ -192,7 +195,16 @@ def _of_markers(part: Part, response: Response) -> FitBlock:
         part.x, part.phi, response.markers, segment.moving, segment.nq
     )
     name, present = segment.experiment.name, segment.observation.present
-    return FitBlock(name, markers.t_s, markers.names, present, residual, slope, markers.sigma_m)
+    return FitBlock(
+        name,
+        markers.t_s,
+        markers.names,
+        present,
+        residual,
+        slope,
+        markers.sigma_m,
+        static=segment.experiment.static,
+    )
 
 
 def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
@@ -214,6 +226,7 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
                 residual,
                 slope,
                 sensor.wrench.sigmas[[0, 3]],
+                static=part.segment.experiment.static,
                 components=seen,
                 of_sensor=True,
             )

@@ -1,4 +1,4 @@
-"""Recordings in which nothing moves: they tell a stiffness by the sag, and no damping."""
+"""Recordings in which nothing moves, or only slowly: they tell a stiffness, and no damping."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HELD = 2.0
 def motionless(experiment: Experiment) -> bool:
     """Whether neither grasps and loads nor markers move or change, but for noise."""
     markers, t_s = experiment.markers, experiment.t_s
-    sigma_m = float(np.median(markers.sigma_m))
+    sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0
     held, positions_m = experiment.grasped(t_s)
     lasting = held.all(axis=0)
     if (held.any(axis=0) != lasting).any():
@@ -45,9 +45,14 @@ def stillness_notes(experiments: Iterable[Experiment], parameters: Parameters) -
     """What no recording can tell, if nothing moves in those that are to be fitted."""
     fitted = [experiment for experiment in experiments if not experiment.validation]
     damping = [item.name for item in parameters.free if is_damping(item.name)]
-    if not fitted or not damping or not all(map(motionless, fitted)):
+    if not fitted or not damping or not all(e.static or motionless(e) for e in fitted):
         return []
     names = ", ".join(f"'{experiment.name}'" for experiment in fitted)
+    if all(experiment.static for experiment in fitted):
+        return [
+            f"{names} {'is' if len(fitted) == 1 else 'are'} static: no information on damping; fix "
+            f"{' and '.join(damping)}, or add a recording of a motion"
+        ]
     return [
         f"nothing moves in {names}: no information on damping, and of the stiffness only what the "
         f"sag tells; fix {' and '.join(damping)}, or add a recording of a motion"

@@ -48,7 +48,8 @@ def comparison_plots(
     answered = [row for row in rows if row["rms_m"] is not None]
     if answered:
         figures["convergence"] = convergence_in_time(answered, records)
-        figures["tip"] = tip_tracks(answered, records)
+        if records[answered[0]["key"]]["tip"] is not None:
+            figures["tip"] = tip_tracks(answered, records)
     done = [row for row in rows if row["status"] != "missing"]
     centre = reference(done, yardstick) if done else {}
     # A run without a guess that failed has no place among the starts.

@@ -55,11 +55,13 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
         return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
 
 
-def _tip(finished: Run) -> dict[str, Any]:
-    """Measured and re-simulated track of the marker farthest from the grasp."""
+def _tip(finished: Run) -> dict[str, Any] | None:
+    """Measured and re-simulated track of the marker farthest from the grasp, if there is one."""
     experiment = finished.solution.collocation.segments[0].experiment
     markers, nodes_m = experiment.markers, experiment.body.nodes_m
     held = held_nodes(experiment.grasps)
+    if not markers.names:
+        return None
     centre = nodes_m[held if len(held) else slice(None)].mean(axis=0)
     tip = int(np.linalg.norm(markers.observe(nodes_m) - centre, axis=1).argmax())
     measured = markers.positions_m[:, tip]

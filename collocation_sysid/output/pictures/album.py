@@ -84,11 +84,13 @@ def _of_body(replay: Replay) -> dict[str, Figure]:
 def _of_experiment(replay: Replay) -> dict[str, Figure]:
     t_s, measured = replay.t_s, replay.measured_m
     fitted, rolled_out = _finite(replay.markers_m), _finite(replay.rolled_out_m)
-    pictures = {
-        f"tracks_{replay.name}": tracks(t_s, replay.marker_names, measured, fitted, rolled_out),
-        f"error_{replay.name}": error_over_time(t_s, measured, fitted, rolled_out),
-        f"spectrum_{replay.name}": spectrum(t_s, measured, fitted, replay.natural_hz),
-    }
+    pictures, names = dict[str, Figure](), replay.marker_names
+    if len(names):
+        pictures[f"tracks_{replay.name}"] = tracks(t_s, names, measured, fitted, rolled_out)
+        pictures[f"error_{replay.name}"] = error_over_time(t_s, measured, fitted, rolled_out)
+    if len(names) and not replay.static:
+        spectral = spectrum(t_s, measured, fitted, replay.natural_hz)
+        pictures[f"spectrum_{replay.name}"] = spectral
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
         pictures[f"wrench_{replay.name}{which}"] = wrench_picture(sensed)

@@ -234,7 +234,7 @@ def _peaks(
     experiment: str, errors: np.ndarray, t_s: np.ndarray, markers: np.ndarray
 ) -> list[dict[str, Any]]:
     errors, found = errors.copy(), []
-    for _ in range(WORST):
+    for _ in range(WORST if errors.size else 0):
         t, m = np.unravel_index(int(errors.argmax()), errors.shape)
         if not errors[t, m] > 0:
             break
