@@ -171,3 +171,12 @@ def test_check_compares_the_slopes_of_wrenches():
     jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
     assert jacobian < 1e-6
     assert hessian < 1e-6
+
+
+def test_interior_point_finds_the_body_in_its_grasp_too():
+    nuisance = Nuisance.none(tare=10.0, gravity_rad=0.02, hand_eye_m=1e-3, sensor_time_s=0.001)
+    collocation = Collocation([swung(nuisance=nuisance, steps=12)], GUESS)
+    reduced = ReducedSpace()(collocation)
+    found = InteriorPoint(max_iterations=500)(collocation)
+    assert found.status.converged
+    np.testing.assert_allclose(found.q, reduced.q, atol=1e-5)
