@@ -328,7 +328,10 @@ class Segment:
         grasps = self.experiment.grasps
         if self.nuisance.moves_grasps:
             motion = self.nuisance.in_grasp(phi)
-            grasps = tuple(replace(g, poses=g.poses.after(motion)) for g in grasps)
+            grasps = tuple(
+                replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
+                for k, g in enumerate(grasps)
+            )
         gravity = self.nuisance.gravity(phi)[0]
         return replace(self.experiment, gravity_m_s2=gravity, grasps=grasps)
 
