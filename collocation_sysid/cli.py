@@ -162,6 +162,8 @@ def simulate(
     ] = "newmark",
     timestep_s: Annotated[float | None, typer.Option(help="Newmark's step.")] = None,
     noise_m: Annotated[float, typer.Option(help="Standard deviation of the noise.")] = 0.0,
+    noise_n: Annotated[float, typer.Option(help="The same of measured forces.")] = 0.0,
+    noise_nm: Annotated[float, typer.Option(help="The same of measured torques.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     frames: Annotated[bool, typer.Option(help="Also write frames for ParaView.")] = False,
     as_json: AsJson = False,
@@ -180,7 +182,16 @@ def simulate(
     require_possible(out)
     with Progress(errors, loaded, quiet=quiet) as progress:
         written = write_data(
-            loaded, out, integrator, timestep_s, noise_m, seed, frames, progress.share
+            loaded,
+            out,
+            integrator,
+            timestep_s,
+            noise_m,
+            seed,
+            frames,
+            progress.share,
+            noise_n,
+            noise_nm,
         )
     if as_json:
         typer.echo(json.dumps([str(file) for file in written]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from .arrays import Array, root_mean
 from .errors import SimulationError
 from .experiment import Experiment
 from .methods.reduced_space import ReducedSpace
-from .methods.solution import Solution
+from .methods.solution import Solution, wrench_rms
 from .nlp.parameters import Parameters
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
@@ -33,6 +33,9 @@ class Rollout:
         Nuisance parameters of an experiment for validation, fitted with the material as found.
         Of places they are the way from where these were started.
     places_m : mapping of marker to place [x, y, z], for validation likewise
+    wrenches : tuple of (S, 6)
+        What the sensors of its grasps should read, NaN where that is not known.
+    wrench_rms : RMS of force [N] and torque [N m], None where there is none
     """
 
     rms_m: float
@@ -40,6 +43,8 @@ class Rollout:
     trajectory: Trajectory
     nuisance: Mapping[str, float]
     places_m: Mapping[str, list[float]]
+    wrenches: Sequence[Array] = ()
+    wrench_rms: tuple[float | None, float | None] = (None, None)
 
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
@@ -62,7 +67,7 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     readings = segment.observation.of_samples(trajectory.positions_m, phi)
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]
-    nuisance = segment.nuisance
+    nuisance, wrenches = segment.nuisance, _read(segment, phi, trajectory)
     return Rollout(
         root_mean(present**2),
         float(present.max(initial=0.0)),
@@ -73,7 +78,16 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         dict(zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True))
         if experiment.validation
         else {},
+        wrenches,
+        wrench_rms(experiment, wrenches),
     )
+
+
+def _read(segment: Segment, phi: Array, trajectory: Trajectory) -> list[Array]:
+    """What the experiment's sensors read, with its φ, of what was simulated."""
+    grid, forced = trajectory.reactions
+    gravity = segment.nuisance.gravity(phi)[0] if len(phi) else segment.nuisance.gravity_m_s2
+    return [replace(sensor, on=grid).readings(forced, phi, gravity) for sensor in segment.sensors]
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
@@ -111,6 +125,10 @@ def step_changes(
             return None
         way = rollout.trajectory.markers_m - readings
         apart.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
+        fitted = solution.wrenches.get(experiment.name, [])
+        for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
+            way = np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
+            apart.append(way.reshape(-1, 2, 3))
     collocation = solution.collocation
     q, change = solution.q, changes_towards(fit, apart)[: collocation.nq]
     parameters = collocation.parameters

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from .errors import InputError
-from .experiment import Experiment, write_markers_csv, write_poses_csv
+from .experiment import Experiment, write_markers_csv, write_poses_csv, write_wrench_csv
 from .nlp.schemes import SCHEMES
 from .nlp.simulation import Trajectory, simulate
 from .output.writers import write_frames
@@ -24,20 +24,25 @@ def write_data(
     seed: int = 0,
     frames: bool = False,
     progress: Callable[[float], None] | None = None,
+    noise_n: float = 0.0,
+    noise_nm: float = 0.0,
 ) -> list[Path]:
-    """Simulate every experiment at the parameters' guesses and write poses and markers.
+    """Simulate every experiment at the parameters' guesses and write poses, markers and wrenches.
 
     Parameters
     ----------
     problem : Problem
     folder : str or Path
         Made where it is missing; gets ``<experiment>_markers.csv``, ``<experiment>_poses.csv``
-        (``_poses_2`` … for further grasps), and ``<experiment>/`` with frames when asked for.
+        (``_poses_2`` … for further grasps), ``<experiment>_wrench.csv`` (``_wrench_2`` …) of
+        grasps whose wrench is measured, and ``<experiment>/`` with frames when asked for.
     integrator, timestep_s
         See `simulate`.
     noise_m : float
         Standard deviation of the normal noise on every coordinate.
     seed : int
+    noise_n, noise_nm : float
+        The same of every component of the wrenches.
 
     Returns
     -------
@@ -54,7 +59,8 @@ def write_data(
     """
     place = Path(folder)
     _refuse_unguessed(problem)
-    _refuse_options(integrator, timestep_s, noise_m, seed)
+    noises = {"--noise-m": noise_m, "--noise-n": noise_n, "--noise-nm": noise_nm}
+    _refuse_options(integrator, timestep_s, noises, seed)
     _refuse_inputs(problem, place)
     rng = np.random.default_rng(seed)
     given, substeps = problem.parameters, problem.substeps
@@ -66,18 +72,26 @@ def write_data(
     written = []
     for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
         noise = noise_m * rng.normal(size=trajectory.markers_m.shape)
-        markers, *poses = files = _tables(experiment, place)
+        markers, *others = files = _tables(experiment, place)
         names, tracks = experiment.markers.names, trajectory.markers_m + noise
         write_markers_csv(markers, experiment.t_s, names, tracks)
-        for file, grasp in zip(poses, experiment.grasps, strict=True):
+        count = len(experiment.grasps)
+        for file, grasp in zip(others[:count], experiment.grasps, strict=True):
             write_poses_csv(file, grasp.poses)
+        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+        of_wrench = np.repeat([noise_n, noise_nm], 3)
+        for file, sensor, wrench in zip(others[count:], sensors, trajectory.wrenches, strict=True):
+            measured = np.where(sensor.measured, wrench, np.nan)
+            write_wrench_csv(file, sensor.t_s, measured + of_wrench * rng.normal(size=wrench.shape))
         written += files
         if frames:
             written.append(_write_frames(experiment, trajectory, place / experiment.name))
     return written
 
 
-def _refuse_options(integrator: str, timestep_s: float | None, noise_m: float, seed: int) -> None:
+def _refuse_options(
+    integrator: str, timestep_s: float | None, noises: Mapping[str, float], seed: int
+) -> None:
     known = ("newmark", *SCHEMES)
     if integrator not in known:
         raise InputError(
@@ -87,8 +101,9 @@ def _refuse_options(integrator: str, timestep_s: float | None, noise_m: float, s
         raise InputError(
             f"found {timestep_s:g}; expected a number of seconds above 0", None, "--timestep-s"
         )
-    if not 0 <= noise_m < np.inf:
-        raise InputError(f"found {noise_m:g}; expected metres, 0 or more", None, "--noise-m")
+    for (option, size), unit in zip(noises.items(), ("metres", "newtons", "N m"), strict=True):
+        if not 0 <= size < np.inf:
+            raise InputError(f"found {size:g}; expected {unit}, 0 or more", None, option)
     if seed < 0:
         raise InputError(f"found {seed}; expected a whole number, 0 or more", None, "--seed")
 
@@ -117,11 +132,12 @@ def _refuse_inputs(problem: Problem, place: Path) -> None:
 
 
 def _tables(experiment: Experiment, place: Path) -> list[Path]:
-    """The marker file, and one of poses for each grasp."""
-    suffixes = ["", *(f"_{number}" for number in range(2, len(experiment.grasps) + 1))]
-    poses = [f"{experiment.name}_poses{suffix}.csv" for suffix in suffixes]
-    names = [f"{experiment.name}_markers.csv", *poses[: len(experiment.grasps)]]
-    return [place / name for name in names]
+    """The marker file, one of poses for each grasp, and one for each sensor."""
+    sensors = sum(grasp.wrench is not None for grasp in experiment.grasps)
+    kinds = [("poses", k) for k in range(len(experiment.grasps))]
+    kinds += [("wrench", k) for k in range(sensors)]
+    names = [f"{kind}_{k + 1}" if k else kind for kind, k in kinds]
+    return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]
 
 
 def _write_frames(experiment: Experiment, trajectory: Trajectory, folder: Path) -> Path:

@@ -39,6 +39,13 @@ VECTORS = (
     ("turn", "poses turned by", "°"),
     ("shift", "poses shifted by", " mm"),
 )
+SENSORS = (
+    ("tare", "tare up to", 1.0, ""),
+    ("sensor-time", "sensor late by", 1e3, "ms"),
+    ("sensor-lag", "lag of the sensor", 1e3, "ms"),
+    ("tool-mass", "tool of", 1e3, "g"),
+    ("tool-centre", "its centre off by", 1e3, "mm"),
+)
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
@@ -243,7 +250,7 @@ def _nuisance(finished: Run) -> list[Text]:
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
         name = part.segment.experiment.name
-        said = _places(finished.places[name]) + _lengths(part) + _clock(part)
+        said = _places(finished.places[name]) + _lengths(part) + _clock(part) + _of_sensors(part)
         if said:
             lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
     return lines
@@ -300,6 +307,21 @@ def _clock(part: Part) -> list[str]:
     return said
 
 
+def _of_sensors(part: Part) -> list[str]:
+    """What was not known of the sensors, each with its prior."""
+    nuisance, said = part.segment.nuisance, []
+    for kind, what, factor, unit in SENSORS:
+        here = [k for k, own in enumerate(nuisance.kinds) if own.startswith(kind)]
+        values = [float(part.phi[k] * nuisance.scales[k]) for k in here]
+        if here:
+            worst = max(range(len(here)), key=lambda i: abs(part.phi[here[i]]))
+            prior, of = float(nuisance.scales[here[worst]]), nuisance.names[here[worst]]
+            own = unit or of.rpartition("[")[2].rstrip("]")
+            size = _short(factor * abs(values[worst]))
+            said.append(f"{what} {size} {own} (prior {_short(factor * prior)})")
+    return said
+
+
 def _short(value: float) -> str:
     """Two digits, and no powers of ten for the sizes of bodies."""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
@@ -319,6 +341,11 @@ def _verdict(finished: Run) -> list[Text]:
         f"{solution.max_violation_n:.1e} N ({solution.max_violation_relative:.1e} of the largest "
         "force)"
     ]
+    for name, (force, torque) in solution.wrench_rms.items():
+        sizes = [
+            f"{_short(value)} {unit}" for value, unit in ((force, "N"), (torque, "N m")) if value
+        ]
+        lines.append(f"wrench of '{name}': {', '.join(sizes)} RMS")
     for experiment in finished.problem.experiments:
         rollout = finished.rollouts[experiment.name]
         kind = "validation" if experiment.validation else "roll-out"

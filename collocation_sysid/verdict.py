@@ -53,6 +53,8 @@ def concerns(
     for part in solution.collocation.parts(solution.z):
         nuisance = part.segment.nuisance
         low, high = nuisance.limits(part.segment.chart.samples)
+        # A lag and a tool may well be none.
+        low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
         for k in nuisance.places("time"):
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
@@ -100,8 +102,9 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
     markers = [segment.experiment.markers for segment in solution.collocation.segments]
     samples = np.concatenate([each.present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
-    freedom = 3 * samples.sum() if uncertainty is None else uncertainty.degrees_of_freedom
-    return noise_rms_m(sigma_m, samples, 3 * float(samples.sum()) - float(freedom))
+    measured = solution.collocation.measurements
+    fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
+    return noise_rms_m(sigma_m, samples, float(fitted))
 
 
 def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:

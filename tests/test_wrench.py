@@ -9,19 +9,23 @@ import pytest
 from checks import relative_error
 from memories_small import guesses, remembering, truth
 from problems_small import (
+    EDGE_M,
     GUESS,
+    IDEAL,
     SMALL_EXPERIMENTS,
     TRUTH,
     as_theta,
     bar_in_two_hands,
     bar_let_go,
     hung_cube,
+    nodes_where,
     times,
+    vertex_markers,
     with_papers_damping,
 )
 from wrenches_small import sensing, with_wrenches, wristed_cube
 
-from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.experiment import Experiment, Grasp, Nuisance, PoseSequence
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.shooting import adjoint_gradient, simulated
 from collocation_sysid.nlp.collocation import Collocation, Part
@@ -29,6 +33,7 @@ from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.sensor import low_pass
+from collocation_sysid.nlp.simulation import simulate
 
 EVERYTHING = Nuisance(
     gravity_rad=0.03,
@@ -91,7 +96,7 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     pull = mass[:, None] * (second - experiment.gravity_m_s2)
     expected = np.cross(arm, pull).sum(axis=1)
     np.testing.assert_array_equal(grid, np.arange(1, len(x) - 1))
-    # The internal forces act in the middle of intervals, where they have no torque of their own.
+    # Internal forces act in the middle of the intervals, and have no torque there.
     assert relative_error(found[:, 3:], expected) < 1e-2
 
 
@@ -248,3 +253,32 @@ def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float):
     before = low_pass(max(0.0, lag_s - step), 0.01, 20)[0]
     change = (low_pass(lag_s + step, 0.01, 20)[0] - before) / (step + min(step, lag_s))
     np.testing.assert_allclose(slope @ signal, change @ signal, rtol=1e-3, atol=0.02)
+
+
+# Static experiments and single axes ---------------------------------------------------------------
+
+
+def pressed(**changes) -> Experiment:
+    """A cube on a plate, pressed by a platen on which it slides, at uneven times."""
+    body, t_s = hung_cube().body, np.array([0.0, 1.0, 1.5, 4.0])
+    below = Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())
+    way = np.outer([0.0, 1.0, 2.0, 5.0], [0.0, 0.0, -2e-3])
+    poses = PoseSequence(t_s, way, np.tile([0.0, 0.0, 0.0, 1.0], (4, 1)), "linear")
+    above = Grasp(nodes_where(body, 2, EDGE_M), poses, axes="z")
+    markers = vertex_markers(body, nodes_where(body, 0, 0.0), t_s)
+    experiment = Experiment(body, t_s, [below, above], markers, kind="static", nuisance=IDEAL)
+    return sensing(replace(experiment, **changes), np.array([0.0, 0.5, 1.5, 3.0, 4.0]))
+
+
+def test_a_platen_gives_what_the_plate_and_the_weight_take():
+    cube = pressed()
+    below, above = simulate(cube, TRUTH).wrenches
+    weight_n = 9.81 * cube.body.mass_kg
+    np.testing.assert_allclose((below + above)[:, 2], weight_n, atol=1e-9)
+    # It slides under the platen: nothing is given along x and y.
+    np.testing.assert_allclose(above[:, :2], 0.0, atol=1e-12)
+    assert (np.diff(above[:, 2]) < 0).all()
+
+
+def test_slopes_of_a_static_experiment():
+    assert_slopes(Collocation([noisy_wrenches(pressed(nuisance=Nuisance()))], GUESS))

@@ -8,8 +8,11 @@ import numpy as np
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
+from ..experiment.wrench import Wrench
+from ..experiment.wrench_files import FEWEST
 from ..nlp.collocation import Collocation
 from ..nlp.explicit_memory import ExplicitMemory, carried_over, with_explicit_memory
+from ..nlp.sensor import without_sensors
 from ..problem import Problem
 
 # All kinds of rows are among these samples; derivatives do not depend on how many follow.
@@ -33,17 +36,33 @@ def first_samples(experiment: Experiment, samples: int) -> Experiment:
     if not np.isfinite(tracks).any():
         tracks = np.nan_to_num(tracks)  # at least one sample has to be there
     markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
-    return replace(experiment, t_s=experiment.t_s[here], markers=markers)
+    t_s = experiment.t_s[here]
+    grasps = [replace(g, wrench=_begun(g.wrench, t_s)) for g in experiment.grasps]
+    return replace(experiment, t_s=t_s, markers=markers, grasps=grasps)
+
+
+def _begun(wrench: Wrench | None, t_s: Array) -> Wrench | None:
+    """The wrench up to the last of some times, if that leaves enough of it."""
+    if wrench is None:
+        return None
+    here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
+    if here.sum() < FEWEST or not wrench.present[here].any():
+        return None
+    return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
 
 
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Largest relative deviations of J and H along a random direction at a disturbed start."""
     rng, through_memory = np.random.default_rng(0), 0.0
+    of_sensors = 0.0
+    if any(segment.sensors for segment in collocation.segments):
+        of_sensors = _gradient_error(collocation, z, rng)
+        collocation, z = _blind(collocation, z)
     program = with_explicit_memory(collocation)
     if isinstance(program, ExplicitMemory):
         through_memory = _slopes_error(collocation, z, rng)
         if sum(program.further_nonzeros) > LAID_OUT:
-            return through_memory, 0.0
+            return max(through_memory, of_sensors), 0.0
         collocation, z = program, carried_over(z, collocation, program)
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
@@ -56,7 +75,22 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     along = collocation.jacobian(point) @ direction
     first = _deviation(collocation.constraint_values, along, point, direction)
     second = _deviation(lagrangian_gradient, hessian @ direction, point, direction)
-    return max(first, through_memory), second
+    return max(first, through_memory, of_sensors), second
+
+
+def _gradient_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:
+    """That of the objective's gradient, wrenches included."""
+    point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
+    exact = np.array([collocation.gradient(point) @ direction])
+    return _deviation(lambda at: np.array([collocation.objective(at)]), exact, point, direction)
+
+
+def _blind(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
+    """The program without wrenches, whose second derivatives nothing uses, and a point of it."""
+    p, positions = collocation.unpack(z)
+    without = [without_sensors(segment.experiment) for segment in collocation.segments]
+    blind = replace(collocation, experiments=without)
+    return blind, blind.pack(np.append(p[: blind.nq], blind.guess_p[blind.nq :]), positions)
 
 
 def _slopes_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:

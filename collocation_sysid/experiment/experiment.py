@@ -19,6 +19,7 @@ from .grasp import Grasp, held_dofs
 from .loads import Force, PointMass
 from .markers import Markers
 from .nuisance import Nuisance
+from .wrench_files import within
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -299,6 +300,8 @@ class Experiment:
             self._refuse_unmeasured()
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
+            if grasp.wrench is not None:
+                within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
 
     def _refuse_unmeasured(self) -> None:
         if any(grasp.wrench is not None for grasp in self.grasps):

@@ -48,7 +48,8 @@ class Nuisance:
         Time constant of a first-order low-pass in the sensor; from zero to three deviations.
     tool_kg, tool_m : float or None
         Mass of what is between a sensor and the body, and each coordinate of its centre about the
-        sensor's point (in the world's frame, about the middle of the grasped nodes).
+        sensor's point (in the world's frame, about the middle of the grasped nodes); it is there
+        without `tool_m`.
     """
 
     marker_offset_m: float | None = 1e-3
@@ -64,7 +65,7 @@ class Nuisance:
     sensor_time_s: float | None = 5e-3
     sensor_lag_s: float | None = None
     tool_kg: float | None = None
-    tool_m: float = 0.05
+    tool_m: float | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -75,5 +76,5 @@ class Nuisance:
     @classmethod
     def none(cls, **deviations: float | None) -> Nuisance:
         """Nothing is estimated but what is named."""
-        nothing = {field.name: None for field in fields(cls) if field.name != "tool_m"}
+        nothing: dict[str, float | None] = {field.name: None for field in fields(cls)}
         return cls(**(nothing | deviations))

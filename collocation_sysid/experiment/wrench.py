@@ -74,8 +74,8 @@ class Wrench:
         self._check()
 
     def _check(self) -> None:
-        if len(self.t_s) < 2:
-            raise InputError(f"a wrench of {len(self.t_s)} samples; expected at least 2")
+        if not len(self.t_s):
+            raise InputError("a wrench without samples; expected some")
         if fault := first_time_fault(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         if self.frame not in get_args(Frame):
@@ -119,8 +119,3 @@ class Wrench:
         """(6,) standard deviations; those of what is not measured are one."""
         torque = 1.0 if self.sigma_nm is None else self.sigma_nm
         return np.repeat([self.sigma_n, torque], 3)
-
-    @property
-    def interval_s(self) -> float:
-        """Usual time between samples."""
-        return float(np.median(np.diff(self.t_s)))

@@ -5,16 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError, hint_at
-from .clock import first_time_fault, unrounded_s
+from .clock import TIME_TOLERANCE_S, first_time_fault, unrounded_s
 from .formats.plain import read_grid
 from .formats.text import Grid, decode, listed, numbers, read_bytes
 from .wrench import COMPONENTS
 
 WRENCH_COLUMNS = tuple(f"{c}_{'n' if c.startswith('f') else 'nm'}" for c in COMPONENTS)
 
+# So many samples must lie within an experiment.
+FEWEST = 3
 # What people write, and what it says.
 _OTHER_UNITS = {
     "kg": "kilograms, which are a mass",
@@ -58,9 +61,35 @@ def read_wrench(path: str | Path) -> tuple[Array, Array]:
     named = [name for name in WRENCH_COLUMNS if name in table.columns]
     if empty := [name for name in named if _blank(values, name)]:
         raise InputError(f"column {empty[0]} is blank throughout; leave it out", path)
-    if len(t_s) < 2:
-        raise InputError(f"{len(t_s)} sample; expected at least 2", path)
-    return unrounded_s(t_s), values
+    return (unrounded_s(t_s) if len(t_s) > 2 else t_s), values
+
+
+def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_]:
+    """Return which samples at `at_s` (S,) of a file lie within an experiment's times `t_s` (T,).
+
+    Of a static experiment one is enough.
+
+    Raises
+    ------
+    InputError
+        If fewer than three do: clocks or units differ.
+    """
+    inside = (at_s >= t_s[0] - TIME_TOLERANCE_S) & (at_s <= t_s[-1] + TIME_TOLERANCE_S)
+    fewest = 1 if static else FEWEST
+    if inside.sum() >= fewest:
+        return inside
+    span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (at_s, t_s)]
+    ratio = np.ptp(at_s) / max(np.ptp(t_s), TIME_TOLERANCE_S)
+    thousand = 300 < ratio < 3000
+    hint = (
+        f"{name} seems to be in milliseconds"
+        if thousand
+        else "both need one clock, in seconds; subtract where they began"
+    )
+    raise InputError(
+        f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(inside.sum())} samples "
+        f"are in common; expected {fewest} at least. {hint}"
+    )
 
 
 def _blank(values: Array, name: str) -> bool:

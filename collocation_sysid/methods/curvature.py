@@ -30,6 +30,11 @@ def exact_curvature(
             "hessian = 'exact' has no second derivatives of materials with memory (prony); "
             "expected 'gauss-newton'"
         )
+    if any(segment.sensors for segment in collocation.segments):
+        raise InputError(
+            "hessian = 'exact' has no second derivatives of measured wrenches; expected "
+            "'gauss-newton'"
+        )
     projected = [x + tangent.step for x, tangent in zip(point.x, point.tangents, strict=True)]
     z = collocation.pack(point.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, root_mean
+from ..experiment.experiment import Experiment
 from ..nlp.collocation import Collocation, Violation
 from ..nlp.stopwatch import Stopwatch
 from .scan import Scan
@@ -162,6 +163,22 @@ class Solution:
         return [part.segment.observation.predicted(part.x, part.phi) for part in parts]
 
     @cached_property
+    def wrenches(self) -> dict[str, list[Array]]:
+        """What the sensors of each fitted experiment should read, (S, 6), NaN where not known."""
+        parts = [part for part in self.collocation.parts(self.z) if part.segment.sensors]
+        return {part.segment.experiment.name: part.sensing.readings(part.x) for part in parts}
+
+    @cached_property
+    def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:
+        """RMS of force [N] and torque [N m] of the sensors of each fitted experiment."""
+        found = {}
+        for segment in self.collocation.segments:
+            if segment.sensors:
+                readings = self.wrenches[segment.experiment.name]
+                found[segment.experiment.name] = wrench_rms(segment.experiment, readings)
+        return found
+
+    @cached_property
     def rms_m(self) -> float:
         """Root mean square distance of markers from their measurements."""
         return self.collocation.rms_m(self.z)
@@ -196,3 +213,35 @@ class Solution:
     def largest_violations(self) -> list[Violation]:
         """The worst equations of motion."""
         return self.collocation.largest_violations(self.z)
+
+
+def wrench_rms(
+    experiment: Experiment, readings: Sequence[Array]
+) -> tuple[float | None, float | None]:
+    """RMS of each component of force [N] and torque [N m] between readings (S, 6) and measured.
+
+    None of what is not measured.
+    """
+    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    apart = [read - sensor.values for read, sensor in zip(readings, sensors, strict=True)]
+    both = np.concatenate(apart) if apart else np.zeros((0, 6))
+    force, torque = (
+        float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else None
+        for each in (both[:, :3], both[:, 3:])
+    )
+    return force, torque
+
+
+def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
+    """The same of all fitted experiments, which count alike."""
+    squares, counts = np.zeros(2), np.zeros(2)
+    for segment in solution.collocation.segments:
+        found = solution.wrench_rms.get(segment.experiment.name, (None, None))
+        for k, value in enumerate(found):
+            if value is not None:
+                squares[k], counts[k] = squares[k] + value**2, counts[k] + 1
+    force, torque = (
+        float(np.sqrt(square / count)) if count else None
+        for square, count in zip(squares, counts, strict=True)
+    )
+    return force, torque

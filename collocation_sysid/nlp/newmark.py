@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from .forces import Forces
 from .lapack import one_blas_thread
 from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
+from .sensor import Forced
 
 Progress = Callable[[float], None]
 
@@ -37,21 +38,30 @@ def newmark(
     steps_per_sample: int,
     options: NewtonOptions | None,
     progress: Progress | None,
-) -> tuple[Array, Array]:
-    """Positions and velocities (T, 3n) at the samples."""
+    sensed: Index,
+) -> tuple[Array, Array, Forced]:
+    """Positions and velocities (T, 3n) at the samples, and the reactions on some dofs at all steps.
+
+    Parameters
+    ----------
+    sensed : (g,) those dofs
+    """
     stepper = _Stepper(experiment, theta, options)
     times = experiment.t_s
     x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
     state = stepper.start()
     x[0], v[0] = state.x, state.v
     step = experiment.timestep_s / steps_per_sample
+    felt = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
+    felt[:, 0] = stepper.felt(state, sensed)
     for k in range(1, len(times)):
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
+            felt[:, (k - 1) * steps_per_sample + j] = stepper.felt(state, sensed)
         x[k], v[k] = state.x, state.v
         if progress:
             progress(k / (len(times) - 1))
-    return x, v
+    return x, v, Forced.still(*felt)
 
 
 class _Stepper:
@@ -93,6 +103,18 @@ class _Stepper:
                     ) from failure
         return state
 
+    def felt(self, state: _State, dofs: Index) -> tuple[Array, Array]:
+        """The reactions on some dofs in a state, and where they are."""
+        if not len(dofs):
+            return np.zeros(0), np.zeros(0)
+        reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
+        return reaction[dofs], state.x[dofs]
+
+    def _force(self, state: _State, load_s: float) -> Array:
+        """All forces (3n,) in a state, under the loads of a time."""
+        now = state.memory.now if state.memory else None
+        return Forces.of(self.experiment, load_s).total(state.x, state.v, self.theta, now)[0]
+
     def _solver(self, time_s: float) -> Solver:
         return self.solvers.holding(self.experiment.grasped(time_s)[0][0])
 
@@ -110,10 +132,8 @@ class _Stepper:
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""
-        forces, now = Forces.of(self.experiment, load_s), state.memory.now if state.memory else None
-        force = forces.total(state.x, state.v, self.theta, now)[0]
         acceleration = state.a.copy()
-        acceleration[dofs] = (force / forces.mass_kg[0])[dofs]
+        acceleration[dofs] = (self._force(state, load_s) / self._mass(load_s))[dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:

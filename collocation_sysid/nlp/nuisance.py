@@ -297,8 +297,9 @@ def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
         for k in np.flatnonzero(wrench.measured) if wanted.tare else ():
             what = f"tare{which} of {COMPONENTS[k]}"
             add("tare", what, UNITS[k], wanted.tare * float(wrench.sigmas[k]))
-        add("sensor-time", f"time shift of the sensor{which}", "s", wanted.sensor_time_s)
-        add("sensor-lag", f"lag of the sensor{which}", "s", wanted.sensor_lag_s)
+        if not experiment.static:
+            add("sensor-time", f"time shift of the sensor{which}", "s", wanted.sensor_time_s)
+            add("sensor-lag", f"lag of the sensor{which}", "s", wanted.sensor_lag_s)
         add("tool-mass", f"mass of the tool{which}", "kg", wanted.tool_kg)
         for axis in "xyz" if wanted.tool_kg else "":
             add("tool-centre", f"centre of the tool{which}, {axis}", "m", wanted.tool_m)

@@ -97,6 +97,13 @@ class HeldForces:
         self.force[:done], self.slopes[:done] = known.force, known.slopes
 
 
+def forces_on(dynamics: Dynamics, x: Array, theta: Array, dofs: Index) -> Array:
+    """F (N, g) on some dofs at the evaluations of x (N, 3n), also those that grasps take."""
+    force = np.zeros((len(x), len(dofs)))
+    force[dynamics.first_row :] = dynamics.force(x, theta)[:, dofs]
+    return force
+
+
 def reactions(dynamics: Dynamics, force: Array, x: Array, dofs: Index) -> Array:
     """R (N, g) [N] from the forces F (N, g) on the dofs and the positions x (N, 3n)."""
     return dynamics.inertia(x)[:, dofs] - dynamics.combine(dynamics.tables.w, force)

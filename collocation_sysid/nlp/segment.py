@@ -29,7 +29,7 @@ from .parameters import Parameters, ThetaMap
 from .passing import PassingGrasps
 from .row import Row
 from .schemes import Scheme
-from .sensor import Sensor, sensed_dofs, sensors_of
+from .sensor import Grid, Sensor, sensed_dofs, sensors_of
 from .setting import Setting
 from .unsymmetric import adding_skew, skew_values
 
@@ -115,7 +115,7 @@ class Segment:
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """Of the grasps whose wrench is measured."""
-        return sensors_of(self.experiment, self.dynamics, self.nuisance)
+        return sensors_of(self.experiment, Grid.of(self.dynamics), self.nuisance)
 
     @cached_property
     def sensed_dofs(self) -> Index:

@@ -5,19 +5,22 @@ L_w = Σ ρ(‖(ŷ − w) / σ‖) over the forces, and the torques, of all samp
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..arrays import Array, Index
-from .reaction import HeldForces, HeldRows, reaction_slopes, reactions
+from .reaction import HeldForces, HeldRows, forces_on, reaction_slopes, reactions
 from .sensor import Forced, Sensor
 
 if TYPE_CHECKING:
     from .segment import Segment
     from .setting import Setting
+
+
+NOTHING = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +56,8 @@ class Sensing:
     def at(self, x: Array) -> Forced:
         """The reactions at positions x (N, 3n)."""
         dynamics, dofs = self.setting.dynamics, self.segment.sensed_dofs
-        force = np.zeros((len(x), len(dofs)))
-        force[dynamics.first_row :] = dynamics.force(x, self.setting.theta)[:, dofs]
-        nothing = np.zeros((len(x), len(dofs), 0))
-        reaction = reactions(dynamics, force, x, dofs)
-        return Forced(reaction, x[:, dofs], nothing, nothing)
+        force = forces_on(dynamics, x, self.setting.theta, dofs)
+        return Forced.still(reactions(dynamics, force, x, dofs), x[:, dofs])
 
     def along(self, x: Array, held: HeldForces, moved: Array) -> Forced:
         """The same of the first rows x, from their forces, and how they change.
@@ -80,6 +80,15 @@ class Sensing:
             for sensor in self.segment.sensors
         ]
 
+    def response(self, forced: Forced) -> list[Array]:
+        """Changes (S, 2, 3, c) of the residuals of each sensor by the c changes of `forced`."""
+        count = forced.reaction_by.shape[2]
+        columns, size = np.arange(count), count + len(self.phi)
+        return [
+            sensor.linearised(forced, columns, self.phi, self.gravity, size)[1][..., :count]
+            for sensor in self.segment.sensors
+        ]
+
     def projected(self, x: Array, held: HeldForces, moved: Array) -> list[tuple[Array, Array]]:
         """The same after a feasibility step, which is the first of the columns, to first order."""
         forced = self.along(x, held, moved)
@@ -93,14 +102,11 @@ class Sensing:
 
     def readings(self, x: Array) -> list[Array]:
         """What each sensor should read (S, 6), NaN where that is not known."""
-        return [read for _, read, _ in self._read(self.at(x))]
+        return self.of(self.segment.sensors, self.at(x))
 
-    def _read(self, forced: Forced) -> Iterator[tuple[Sensor, Array, Array]]:
-        nothing = np.zeros(0, dtype=np.int64)
-        for sensor in self.segment.sensors:
-            read, slope = sensor.read(forced, nothing, self.phi, self.gravity, self.size)
-            known = sensor.covered(len(forced.reaction))[:, None]
-            yield sensor, np.where(known, read, np.nan), slope
+    def of(self, sensors: Sequence[Sensor], forced: Forced) -> list[Array]:
+        """The same of the experiment's sensors on any grid, from the reactions there."""
+        return [sensor.readings(forced, self.phi, self.gravity[0]) for sensor in sensors]
 
     # Loss -------------------------------------------------------------------------------------
 
@@ -108,8 +114,7 @@ class Sensing:
         """L_w."""
         if not self.segment.sensors:
             return 0.0
-        nothing = np.zeros(0, dtype=np.int64)
-        found = self.linearised(self.at(x), nothing)
+        found = self.linearised(self.at(x), NOTHING)
         return float(sum(self._rho(residual)[0].sum() for residual, _ in found))
 
     def _rho(self, residual: Array) -> tuple[Array, Array]:
@@ -124,16 +129,17 @@ class Sensing:
     def gradient(self, x: Array) -> tuple[Array, Array]:
         """∂L_w/∂x (N, 3n) and ∂L_w/∂(q, φ) (nq + k,)."""
         forced, by_p = self.at(x), np.zeros(self.size)
-        of_reaction, of_place = np.zeros((2, *forced.reaction.shape))
-        for sensor, _, slope in self._read(forced):
-            residual, _ = sensor.linearised(
-                forced, np.zeros(0, dtype=np.int64), self.phi, self.gravity, self.size
-            )
-            weight = sensor.present / sensor.wrench.sigmas
-            pull = self._rho(residual)[1].reshape(-1, 6) * weight
-            by_p += np.einsum("sa,sap->p", pull, slope)
+        of_reaction, of_place = np.zeros_like(forced.reaction), np.zeros_like(forced.reaction)
+        for sensor, (residual, slope) in zip(
+            self.segment.sensors, self.linearised(forced, NOTHING), strict=True
+        ):
+            of_residual = self._rho(residual)[1]
+            by_p += np.einsum("sfa,sfap->p", of_residual, slope)
+            pull = of_residual.reshape(-1, 6) * sensor.present / sensor.wrench.sigmas
             by_force, by_place = sensor.arms(forced)
             k = sensor.grid[: len(by_force)]
+            if not len(k):
+                continue
             on_grid = sensor.kernels(self.phi, len(k))[0].T @ pull
             rows = np.ix_(k + sensor.late, sensor.places), np.ix_(k, sensor.places)
             of_reaction[rows[0]] += np.einsum("ka,kag->kg", on_grid, by_force)
@@ -152,7 +158,8 @@ class Sensing:
         at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
         slopes = setting.force_slopes(at.by_theta, dynamics.evaluated.mass_kg)
         by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
-        rows, state, rate = HeldRows(dynamics.pattern, dofs), *np.zeros((2, *x.shape))
+        rows = HeldRows(dynamics.pattern, dofs)
+        state, rate = np.zeros_like(x), np.zeros_like(x)
         for k, weight in enumerate(whole[first:, dofs]):
             if weight.any():
                 skew = at.by_position_skew[k]

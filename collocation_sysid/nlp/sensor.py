@@ -1,4 +1,4 @@
-"""What the sensor of a grasp reads: the wrench that it gives the body, by an instrument.
+"""What the sensor of a grasp reads: the wrench that the grasp gives the body.
 
 On the grid, in the frame of the sensor with axes Q_k and the point o_k,
 
@@ -16,7 +16,7 @@ compared at its own time, however many there are in a step, so that no average h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,6 +24,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
+from ..experiment.clock import TIME_TOLERANCE_S
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp
 from ..experiment.wrench import Wrench
@@ -52,6 +53,58 @@ class Forced:
     reaction_by: Array
     position_by: Array
 
+    @classmethod
+    def still(cls, reaction: Array, position_m: Array) -> Forced:
+        """Reactions that do not change by anything."""
+        nothing = np.zeros((*reaction.shape, 0))
+        return cls(reaction, position_m, nothing, nothing)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Times of the rows that tell reactions.
+
+    Attributes
+    ----------
+    t_s : (N,) evenly spaced
+    rows : (N,) bool, those that tell one
+    late : int
+        Row t tells of the time t − late.
+    reach : int
+        It depends on the grasp from the time t − reach on.
+    static : bool
+        Equilibria, at times that need not be evenly spaced; between them the wrench is linear.
+    """
+
+    t_s: Array
+    rows: NDArray[np.bool_]
+    late: int
+    reach: int
+    static: bool = False
+
+    @classmethod
+    def of(cls, dynamics: Dynamics) -> Grid:
+        """That of discrete equations of motion."""
+        return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.reach, dynamics.static)
+
+    @classmethod
+    def at(cls, t_s: Array) -> Grid:
+        """Where the reactions at the very times are known."""
+        return cls(t_s, np.ones(len(t_s), dtype=bool), 0, 0)
+
+    @property
+    def step_s(self) -> float:
+        """Time between rows, on the average."""
+        return float(self.t_s[-1] - self.t_s[0]) / max(1, len(self.t_s) - 1)
+
+    def told(self, grasp: Grasp) -> Index:
+        """Times, by their numbers, at which the reactions of a grasp are known."""
+        held = grasp.holds(self.t_s)
+        rows = self.rows & held
+        for lag in range(1, self.reach + 1):
+            rows[lag:] &= held[:-lag]
+        return np.flatnonzero(rows) - self.late
+
 
 @dataclass(frozen=True, eq=False)
 class Tool:
@@ -79,34 +132,31 @@ class Sensor:
         Of the sensor among those of the experiment.
     grasp : Grasp
     wrench : Wrench
-    dynamics : Dynamics
+    on : Grid
     nuisance : NuisanceMap
-    places : (d,) of the grasp's dofs among those that are sensed
+    places : (d,) of the dofs of the grasp's nodes among those that are sensed
+    held : (d,) one along the axes that it holds, else zero
     """
 
     number: int
     grasp: Grasp
     wrench: Wrench
-    dynamics: Dynamics
+    on: Grid
     nuisance: NuisanceMap
     places: Index
+    held: Array
 
     # Where and when --------------------------------------------------------------------------
 
     @cached_property
-    def late(self) -> int:
-        """Row t tells of the time t − late."""
-        return centred_rows(self.dynamics)[1]
-
-    @cached_property
     def grid(self) -> Index:
         """(n,) grid times whose wrench is known, one after the other."""
-        rows, late = centred_rows(self.dynamics)
-        held = self.grasp.holds(self.dynamics.t_s)
-        for lag in range(1, self.dynamics.reach + 1):
-            before = np.concatenate([np.ones(lag, dtype=bool), held[:-lag]])
-            rows = rows & before[: len(rows)]
-        return np.flatnonzero(rows & held) - late
+        return self.on.told(self.grasp)
+
+    @property
+    def late(self) -> int:
+        """How late the rows are that tell them."""
+        return self.on.late
 
     def reached(self, rows: int) -> int:
         """How many of them the first grid rows tell."""
@@ -121,17 +171,17 @@ class Sensor:
     def covered(self, rows: int) -> NDArray[np.bool_]:
         """(S,) samples that the first grid rows suffice to read, however the clock is shifted."""
         count, t_s = self.reached(rows), self.wrench.t_s
-        if count < 2:
+        if not count:
             return np.zeros(len(t_s), dtype=bool)
-        known = self.dynamics.t_s[self.grid[[0, count - 1]]]
-        rounding = 1e-6 * self.dynamics.step_s
+        known = self.on.t_s[self.grid[[0, count - 1]]]
+        rounding = 1e-6 * self.on.step_s + TIME_TOLERANCE_S
         early, late = known[0] + self.limit_s - rounding, known[1] - self.limit_s + rounding
         return (t_s >= early) & (t_s <= late)
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
         """(S, 6) components that are compared."""
-        return self.wrench.present & self.covered(self.dynamics.rows)[:, None]
+        return self.wrench.present & self.covered(len(self.on.t_s))[:, None]
 
     @cached_property
     def frames(self) -> tuple[Array, Array]:
@@ -143,7 +193,7 @@ class Sensor:
         return np.tile(np.eye(3), (*shape, 1)), np.tile(self.wrench.point_m, shape)
 
     def _poses(self, rows: Index) -> tuple[Array, Array]:
-        return self.grasp.poses.at(self.dynamics.t_s[rows])
+        return self.grasp.poses.at(self.on.t_s[rows])
 
     # Its φ ------------------------------------------------------------------------------------
 
@@ -163,11 +213,12 @@ class Sensor:
         k = self.grid[:count]
         turns, points = (each[:count] for each in self.frames)
         arm = forced.position_m[k][:, self.places].reshape(count, -1, 3) - points[:, None]
-        force = forced.reaction[k + self.late][:, self.places].reshape(count, -1, 3)
+        own = forced.reaction[k + self.late][:, self.places] * self.held
+        force = own.reshape(count, -1, 3)
         axes = np.swapaxes(turns, 1, 2)[:, None]
         of_force = np.concatenate([np.broadcast_to(axes, (*arm.shape, 3)), axes @ _cross(arm)], 2)
         of_place = np.concatenate([np.zeros((*arm.shape, 3)), -axes @ _cross(force)], 2)
-        return _by_component(of_force), _by_component(of_place)
+        return _by_component(of_force) * self.held, _by_component(of_place)
 
     def on_grid(self, forced: Forced) -> tuple[Array, Array]:
         """W (n, 6) without the tool, and its changes (n, 6, c)."""
@@ -182,13 +233,14 @@ class Sensor:
         """What the tool takes; None where there is none."""
         if not len(self.phi_places("tool-mass")):
             return None
-        (mass,), centre = self._value("tool-mass", phi), self._value("tool-centre", phi)
+        (mass,), off = self._value("tool-mass", phi), self._value("tool-centre", phi)
         k = self.grid[:count]
         turns, points = (each[:count] for each in self.frames)
         pose, shift = self._poses(k)
         turn_rate, shift_rate = self._accelerations(count)
         about = self.wrench.frame == "grasp"
-        centre = centre + (self.wrench.point_m if about else self.nuisance.grasp_pivot_m)
+        centre = self.wrench.point_m if about else self.nuisance.grasp_pivot_m
+        centre = centre + off if len(off) else centre
         pull = turn_rate @ centre + shift_rate - gravity_m_s2  # (n, 3)
         arm = pose @ centre + shift - points
         axes, crossed = np.swapaxes(turns, 1, 2), _cross(arm)
@@ -203,14 +255,15 @@ class Sensor:
         return Tool(mass * unit, unit, by_centre, by_gravity)
 
     def _accelerations(self, count: int) -> tuple[Array, Array]:
-        """Second derivatives (n, 3, 3) and (n, 3) of the poses, by the stencil of the rows."""
-        rows = self.grid[:count] + self.late
-        stencils = self.dynamics.tables.s[rows] / self.dynamics.step_s**2
-        turn, shift = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        for lag in np.flatnonzero(stencils.any(axis=0)):
-            pose, place = self._poses(rows - lag)
-            turn += stencils[:, lag, None, None] * pose
-            shift += stencils[:, lag, None] * place
+        """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
+        step_s, poses = self.on.step_s, self.grasp.poses
+        if len(poses.t_s) < 3 or self.on.static:
+            return np.zeros((count, 3, 3)), np.zeros((count, 3))
+        around = poses.t_s[0] + step_s, poses.t_s[-1] - step_s
+        middle = np.clip(self.on.t_s[self.grid[:count]], *around)
+        before, now, after = (poses.at(middle + way * step_s) for way in (-1, 0, 1))
+        pairs = zip(before, now, after, strict=True)
+        turn, shift = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
         return turn, shift
 
     # At the samples ---------------------------------------------------------------------------
@@ -221,20 +274,16 @@ class Sensor:
         The last is of shape (0, 0) where no lag is estimated.
         """
         shift = self._value("sensor-time", phi)
-        covered = self.covered(self.grid[count - 1] + self.late + 1) if count else np.zeros(0)
-        at_s = self.wrench.t_s[covered] + (shift[0] if len(shift) else 0.0)
-        begin_s, step_s = self.dynamics.t_s[self.grid[0]], self.dynamics.step_s
-        value, slope = _interpolation((at_s - begin_s) / step_s, count)
-        shape, rows = (len(covered), count), np.flatnonzero(covered)
-        spread = sp.csr_array(
-            (np.ones(len(rows)), (rows, np.arange(len(rows)))), (shape[0], len(rows))
-        )
-        value, slope = spread @ value, spread @ slope / step_s
+        covered = self.covered(int(self.grid[count - 1]) + self.late + 1)
+        at_s = self.wrench.t_s + (float(shift[0]) if len(shift) else 0.0)
+        used = 2 if self.on.static else NEIGHBOURS
+        value, slope = _interpolation(at_s, self.on.t_s[self.grid[:count]], used, covered)
         lag = self._value("sensor-lag", phi)
         if not len(lag):
             return value, slope, np.zeros((0, 0))
-        smoothing, by_lag = low_pass(float(lag[0]), step_s, count)
-        return sp.csr_array(value @ smoothing), sp.csr_array(slope @ smoothing), value @ by_lag
+        smoothing, by_lag = low_pass(float(lag[0]), self.on.step_s, count)
+        smooth = (sp.csr_array(np.asarray(each @ smoothing)) for each in (value, slope))
+        return next(smooth), next(smooth), np.asarray(value @ by_lag)
 
     def read(
         self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
@@ -260,8 +309,9 @@ class Sensor:
             slope[..., first:] += tool.by_gravity @ gravity[1]
             (mass,), centre = self.phi_places("tool-mass"), self.phi_places("tool-centre")
             slope[..., first + mass] += scales[mass] * tool.by_mass
-            slope[..., first + centre] += scales[centre] * tool.by_centre
-        if len(value) < 2:
+            if len(centre):
+                slope[..., first + centre] += scales[centre] * tool.by_centre
+        if not len(value):
             return np.zeros((len(self.wrench.t_s), 6)), np.zeros((len(self.wrench.t_s), 6, size))
         return self._sampled(value, slope, phi, first)
 
@@ -280,6 +330,13 @@ class Sensor:
         of_read[:, components, first + tare] += scales[tare]
         return read, of_read
 
+    def readings(self, forced: Forced, phi: Array, gravity_m_s2: Array) -> Array:
+        """ŷ (S, 6), NaN where it is not known."""
+        still = gravity_m_s2, np.zeros((3, len(phi)))
+        nothing = np.zeros(0, dtype=np.int64)
+        read, _ = self.read(forced, nothing, phi, still, len(phi))
+        return np.where(self.covered(len(forced.reaction))[:, None], read, np.nan)
+
     # Residuals --------------------------------------------------------------------------------
 
     def linearised(
@@ -294,16 +351,20 @@ class Sensor:
         return residual.reshape(-1, 2, 3), slope.reshape(len(slope), 2, 3, size)
 
 
-def sensors_of(
-    experiment: Experiment, dynamics: Dynamics, nuisance: NuisanceMap
-) -> tuple[Sensor, ...]:
+def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tuple[Sensor, ...]:
     """The sensors of an experiment's grasps."""
     dofs, found = sensed_dofs(experiment), []
     for grasp in experiment.grasps:
         if grasp.wrench is not None:
-            places = np.searchsorted(dofs, dofs_of(grasp.nodes))
-            found.append(Sensor(len(found), grasp, grasp.wrench, dynamics, nuisance, places))
+            own = dofs_of(grasp.nodes)
+            held, places = np.isin(own, grasp.dofs) * 1.0, np.searchsorted(dofs, own)
+            found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places, held))
     return tuple(found)
+
+
+def without_sensors(experiment: Experiment) -> Experiment:
+    """The same experiment, its wrenches not measured."""
+    return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
 
 
 def sensed_dofs(experiment: Experiment) -> Index:
@@ -326,25 +387,29 @@ def _by_component(blocks: Array) -> Array:
     return blocks.transpose(0, 2, 1, 3).reshape(count, 6, 3 * nodes)
 
 
-def _interpolation(at: Array, count: int) -> tuple[sp.csr_array, sp.csr_array]:
-    """Weights (S, count) of grid times 0, 1, … at places between them, and their slopes."""
-    used = min(NEIGHBOURS, count)
-    first = np.clip(np.floor(at).astype(int) - (used // 2 - 1), 0, count - used)
-    place = at - first
-    values, slopes = np.zeros((2, len(at), used))
+def _interpolation(
+    at_s: Array, t_s: Array, most: int, covered: NDArray[np.bool_]
+) -> tuple[sp.csr_array, sp.csr_array]:
+    """Lagrange's weights (S, n) of values at `t_s` (n,) for those at covered times, and slopes."""
+    count, used = len(t_s), min(most, len(t_s))
+    first = np.searchsorted(t_s, at_s, side="right") - 1 - (used - 1) // 2
+    around = np.clip(first, 0, count - used)[:, None] + np.arange(used)
+    values, slopes = np.zeros((2, len(at_s), used))
     for i in range(used):
-        others = [j for j in range(used) if j != i]
-        factors = np.array([(place - j) / (i - j) for j in others])
-        values[:, i] = factors.prod(axis=0)
-        for m, j in enumerate(others):
-            slopes[:, i] += np.delete(factors, m, axis=0).prod(axis=0) / (i - j)
-    rows = np.repeat(np.arange(len(at)), used)
-    columns = (first[:, None] + np.arange(used)).ravel()
-    shape = (len(at), count)
-    return (
-        sp.csr_array((values.ravel(), (rows, columns)), shape=shape),
-        sp.csr_array((slopes.ravel(), (rows, columns)), shape=shape),
-    )
+        others = np.delete(around, i, axis=1)
+        spans = t_s[around[:, [i]]] - t_s[others]
+        factors = (at_s[:, None] - t_s[others]) / spans
+        values[:, i] = factors.prod(axis=1)
+        for m in range(used - 1):
+            slopes[:, i] += np.delete(factors, m, axis=1).prod(axis=1) / spans[:, m]
+    rows = np.repeat(np.arange(len(at_s)), used)
+    both = [
+        sp.csr_array(
+            ((weights * covered[:, None]).ravel(), (rows, around.ravel())), (len(at_s), count)
+        )
+        for weights in (values, slopes)
+    ]
+    return both[0], both[1]
 
 
 def low_pass(lag_s: float, step_s: float, count: int) -> tuple[Array, Array]:

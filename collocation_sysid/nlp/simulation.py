@@ -11,12 +11,16 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
+from ..experiment.nuisance import Nuisance
 from .dynamics import Dynamics
 from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
+from .nuisance import NuisanceMap
 from .parameters import Parameters, theta_of
+from .reaction import forces_on, reactions
 from .schemes import Scheme
+from .sensor import Forced, Grid, sensed_dofs, sensors_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +33,19 @@ class Trajectory:
     positions_m : (T, n, 3)
     velocities_m_s : (T, n, 3)
     markers_m : (T, M, 3)
+    reactions : (Grid, Forced)
+        Those on the dofs of grasps with a sensor.
+    wrenches : tuple of (S, 6)
+        What the sensors of the grasps read at their times, [N] and [N m], NaN where that is not
+        known.
     """
 
     t_s: Array
     positions_m: Array
     velocities_m_s: Array
     markers_m: Array
+    reactions: tuple[Grid, Forced]
+    wrenches: tuple[Array, ...]
 
 
 def simulate(
@@ -73,27 +84,44 @@ def simulate(
     SimulationError
         When a step fails even after halvings; names time and element.
     """
-    theta = theta_of(experiment.body, parameters)
+    theta, sensed = theta_of(experiment.body, parameters), sensed_dofs(experiment)
     if timestep_s is not None and not timestep_s > 0:
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
-    if experiment.static:
-        x = march(experiment, Dynamics.of(experiment, integrator), theta, options, progress)
-        v = np.zeros_like(x)
-    elif integrator == "newmark":
+    if integrator == "newmark" and not experiment.static:
         step = timestep_s or experiment.timestep_s / 4
         count = max(1, round(experiment.timestep_s / step))
-        x, v = newmark(experiment, theta, count, options, progress)
+        x, v, forced = newmark(experiment, theta, count, options, progress, sensed)
+        rows = (len(x) - 1) * count + 1
+        at = Grid.at(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:
-        dynamics = Dynamics.of(experiment, integrator, substeps)
+        taken = 1 if experiment.static else substeps
+        dynamics = Dynamics.of(experiment, integrator, taken)
         grid = march(experiment, dynamics, theta, options, progress)
-        x = grid[::substeps]
-        v = np.gradient(grid, dynamics.step_s, axis=0)[::substeps]
+        x = grid[::taken]
+        still = np.zeros_like(grid)
+        v = still if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::taken]
+        at, force = Grid.of(dynamics), forces_on(dynamics, grid, theta, sensed)
+        forced = Forced.still(reactions(dynamics, force, grid, sensed), grid[:, sensed])
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
     markers = experiment.markers.observe(positions)
-    return Trajectory(experiment.t_s, positions, v.reshape(shape), markers)
+    ideal = NuisanceMap.of(replace(experiment, nuisance=Nuisance.none()))
+    wrenches = tuple(
+        sensor.readings(forced, np.zeros(ideal.size), ideal.gravity_m_s2)
+        for sensor in sensors_of(experiment, at, ideal)
+    )
+    return Trajectory(experiment.t_s, positions, v.reshape(shape), markers, (at, forced), wrenches)
+
+
+def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
+    """The same experiment with other values (S, 6) at the grasps that have a sensor."""
+    found, grasps = iter(wrenches), []
+    for grasp in experiment.grasps:
+        sensor = grasp.wrench and replace(grasp.wrench, values=next(found))
+        grasps.append(replace(grasp, wrench=sensor))
+    return replace(experiment, grasps=grasps)
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:

@@ -15,8 +15,9 @@ import casadi
 import numpy as np
 
 from ..arrays import Array
+from ..experiment.experiment import Experiment
 from ..methods.scan import Scan
-from ..methods.solution import Solution
+from ..methods.solution import Solution, pooled_wrench_rms
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
 from ..rollout import Rollout
@@ -110,11 +111,22 @@ def replays(finished: Run) -> list[Replay]:
         if fit is not None or rolled_out is not None:
             motion = finished.motions.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
-            found.append(
-                Replay.of(
-                    experiment, fit, rolled_out, natural, _places_m(finished, experiment.name)
-                )
-            )
+            places_m = _places_m(finished, experiment.name)
+            sensed = _sensed(finished, experiment)
+            found.append(Replay.of(experiment, fit, rolled_out, natural, places_m, sensed))
+    return found
+
+
+def _sensed(finished: Run, experiment: Experiment) -> list[Array]:
+    """(S, 19) of each sensor: time, and the wrench as measured, fitted and rolled out."""
+    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
+    found = []
+    for k, sensor in enumerate(sensors):
+        nothing = np.full_like(sensor.values, np.nan)
+        fit = fitted[experiment.name][k] if experiment.name in fitted else nothing
+        rolled = rollout.wrenches[k] if isinstance(rollout, Rollout) else nothing
+        found.append(np.column_stack([sensor.t_s, sensor.values, fit, rolled]))
     return found
 
 
@@ -179,6 +191,7 @@ def result(finished: Run) -> dict[str, Any]:
                     "fitted": name in fitted,
                     "nuisance": r.nuisance,
                     "places_m": r.places_m,
+                    **_wrench_rms(r.wrench_rms),
                 }
                 if isinstance(r, Rollout)
                 else {"failed": r, "fitted": name in fitted}
@@ -384,8 +397,16 @@ def _fit(solution: Solution) -> dict[str, Any]:
             "rms_m": solution.rms_by_experiment_m[name],
             "samples": markers.samples,
             "missing": int(markers.missing.sum()),
-        }
-    return {"rms_m": solution.rms_m, "experiments": experiments}
+        } | _wrench_rms(solution.wrench_rms.get(name))
+    return {"rms_m": solution.rms_m, **_wrench_rms(pooled_wrench_rms(solution))} | {
+        "experiments": experiments
+    }
+
+
+def _wrench_rms(found: tuple[float | None, float | None] | None) -> dict[str, float]:
+    """Those that there are."""
+    named = zip(("wrench_rms_n", "wrench_rms_nm"), found or (None, None), strict=True)
+    return {name: value for name, value in named if value is not None}
 
 
 def _pooled_rms(finished: Run, rolled: Mapping[str, Rollout]) -> float | None:

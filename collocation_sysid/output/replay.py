@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,9 @@ class Replay:
     positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
     rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
     natural_hz : (k,) natural frequencies with the answer, ascending
+    wrenches : sequence of (S, 19)
+        Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
+        out, NaN where there are none.
     static : bool
         Whether every sample is an equilibrium of its own.
     """
@@ -95,6 +99,7 @@ class Replay:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
+    wrenches: Sequence[Array] = ()
     static: bool = False
 
     @classmethod
@@ -105,6 +110,7 @@ class Replay:
         rolled_out: tuple[Array, Array] | None = None,
         natural_hz: Array | None = None,
         places_m: Array | None = None,
+        wrenches: Sequence[Array] = (),
     ) -> Replay:
         """Gather an experiment with (positions, markers) as fitted, and as rolled out.
 
@@ -131,6 +137,7 @@ class Replay:
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
             natural_hz,
+            wrenches,
             experiment.static,
         )
 
@@ -156,7 +163,7 @@ class Replay:
             "up": self.up,
             "natural_hz": self.natural_hz,
             "static": np.array(True) if self.static else None,
-        }
+        } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
         shared: dict[str, Any] = {
             "undeformed_m": self.undeformed_m,
             "tetrahedra": self.tetrahedra.astype(np.int32),
@@ -189,6 +196,8 @@ class Replay:
         found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
+        keys = (f"{prefix}wrench_{k}" for k in count(1))
+        found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
         found["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(found)
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]

@@ -73,6 +73,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     for section in file.experiment:
         names += [section.markers.file]
         names += [grasp.poses or grasp.displacement for grasp in section.grasps]
+        names += [grasp.wrench.file for grasp in section.grasps if grasp.wrench is not None]
         names += [force.file for force in section.force]
     return tuple(folder / name for name in names if name is not None)
 

@@ -22,13 +22,16 @@ from ..experiment import (
     Nuisance,
     PointMass,
     PoseSequence,
+    Wrench,
     align,
     displaced_axes,
     held_dofs,
     read_displacement,
     read_forces,
     read_poses,
+    read_wrench,
 )
+from ..experiment.wrench_files import within
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
 from ..files import require_regular
@@ -43,6 +46,7 @@ from .recording_schema import (
     MassSection,
     NodesSection,
     NuisanceSection,
+    WrenchSection,
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
@@ -61,6 +65,10 @@ NUISANCES = {
     "pose": {"pose_shift_m": "prior_m", "pose_turn_rad": "prior_rad"},
     "displacement_zero": {"displacement_zero_m": "prior_m"},
     "camera_offsets": {"camera_offset_m": "prior_m"},
+    "tare": {"tare": "prior_sigmas"},
+    "sensor_time": {"sensor_time_s": "prior_s"},
+    "sensor_lag": {"sensor_lag_s": "prior_s"},
+    "tool": {"tool_kg": "prior_kg", "tool_m": "prior_m"},
 }
 
 
@@ -129,7 +137,7 @@ class RecordingReader:
         table = self._table(poses)
         t_s, poses, table = self._align(poses, table)
         grasps = tuple(
-            self._grasp(k, grasp, sequence)
+            self._grasp(k, grasp, sequence, t_s)
             for k, (grasp, sequence) in enumerate(zip(section.grasps, poses, strict=True))
         )
         masses = tuple(self._mass(k, mass) for k, mass in enumerate(section.mass))
@@ -220,7 +228,7 @@ class RecordingReader:
     def _note(self, *notes: str) -> None:
         self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
 
-    def _grasp(self, k: int, grasp: GraspSection, poses: PoseSequence) -> Grasp:
+    def _grasp(self, k: int, grasp: GraspSection, poses: PoseSequence, t_s: Array) -> Grasp:
         nodes = self._nodes(grasp.nodes, self._grasp_key(k, "nodes"))
         return Grasp(
             nodes,
@@ -230,6 +238,7 @@ class RecordingReader:
             ),
             selection=selection(grasp.nodes),
             zero=self._zero(k, grasp),
+            wrench=grasp.wrench and self._wrench(grasp.wrench, self._grasp_key(k, "wrench"), t_s),
         )
 
     def _zero(self, k: int, grasp: GraspSection) -> str:
@@ -238,6 +247,21 @@ class RecordingReader:
             return ""
         file = existing_file(self.folder, grasp.displacement, self._grasp_key(k, "displacement"))
         return displaced_axes(file)
+
+    def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
+        """What is measured within the experiment's time; zeros to simulate without a file."""
+        given = section.model_dump(exclude={"file"})
+        missing = not (self.folder / section.file).exists()
+        try:
+            if self.simulation and missing:
+                given["sigma_nm"] = section.sigma_nm or 1.0
+                return Wrench(t_s, np.zeros((len(t_s), 6)), **given)
+            at_s, values = read_wrench(existing_file(self.folder, section.file, f"{key}.file"))
+            inside = within(at_s, t_s, section.file, self.section.kind == "static")
+            self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
+            return Wrench(at_s[inside], values[inside], **given)
+        except InputError as error:
+            raise error.located(None, key) from error
 
     def _mass(self, k: int, mass: MassSection) -> PointMass:
         nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")

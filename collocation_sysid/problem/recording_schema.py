@@ -79,6 +79,29 @@ class TransformSection(Section):
         return matrix
 
 
+class WrenchSection(Section):
+    """The force and the torque that the grasp was measured to give the body."""
+
+    file: Text = Field(
+        description="CSV with t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, at its own "
+        "rate; blank cells are missing."
+    )
+    sigma_n: Positive = Field(description="Standard deviation of the noise of each force [N].")
+    sigma_nm: Positive | None = Field(
+        None, description="Standard deviation of the noise of each torque [N m]; needed with any."
+    )
+    frame: Literal["world", "grasp"] = Field(
+        "world",
+        description='Axes of the components: those of the poses\' world, or "grasp" for those of '
+        "the undeformed body as the grasp carries it.",
+    )
+    point_m: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description="Point [x, y, z] of the torque: fixed in the world, or on the undeformed body "
+        "and moving along.",
+    )
+
+
 class GraspSection(Section):
     """Nodes held by a gripper or a test bench, and how it moves."""
 
@@ -128,6 +151,9 @@ class GraspSection(Section):
     )
     sigma_rad: NotNegative | None = Field(
         None, description="Standard deviation of the noise in each rotation, about each axis [rad]."
+    )
+    wrench: WrenchSection | None = Field(
+        None, description="What it was measured to give the body: file, sigma_n, sigma_nm, …"
     )
     from_s: Finite | None = Field(None, description="First time at which it holds.")
     until_s: Finite | None = Field(
@@ -310,6 +336,21 @@ class AnglePrior(Section):
     prior_rad: Positive = Field(description="Standard deviation [rad].")
 
 
+class TarePrior(Section):
+    """How well the zero of a sensor is known."""
+
+    prior_sigmas: Positive = Field(description="Standard deviation, in sigma_n and sigma_nm.")
+
+
+class ToolPrior(Section):
+    """How well it is known what a sensor carries beside the body."""
+
+    prior_kg: Positive = Field(description="Standard deviation of its mass, about zero [kg].")
+    prior_m: Positive = Field(
+        0.05, description="Standard deviation of each coordinate of its centre [m]."
+    )
+
+
 class PosePrior(Section):
     """How well a pose is known; what is left out is taken as exact."""
 
@@ -345,10 +386,21 @@ OffOrPose = Annotated[
 ]
 
 
+OffOrTare = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[TarePrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+OffOrTool = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[ToolPrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+
+
 class NuisanceSection(Section):
     """What is estimated of this recording alone, each with a prior around zero.
 
-    The first four are estimated unless they are "none".
+    The first four are estimated unless they are "none", and where a wrench is measured tare and
+    sensor_time.
     """
 
     marker_offsets: OffOrLength | None = Field(
@@ -381,6 +433,24 @@ class NuisanceSection(Section):
     )
     camera_offsets: OffOrLength | None = Field(
         None, description="A constant offset of every marker in the cameras' frame: prior_m."
+    )
+    tare: OffOrTare | None = Field(
+        None,
+        description="A constant offset of every component of a wrench: prior_sigmas, 10 by "
+        "default.",
+    )
+    sensor_time: OffOrTime | None = Field(
+        None,
+        description="How much later than their times say wrenches were measured: prior_s, 5 ms by "
+        "default.",
+    )
+    sensor_lag: OffOrTime | None = Field(
+        None, description="Time constant of a first-order low-pass in the sensor: prior_s."
+    )
+    tool: OffOrTool | None = Field(
+        None,
+        description="A mass between sensor and body, and its centre about point_m: prior_kg, "
+        "prior_m.",
     )
 
 

@@ -27,6 +27,7 @@ from ..nlp.collocation import Collocation
 from .cause import Cause, ranked
 from .description import doubts
 from .mistakes import gravity_mistakes
+from .wrench_causes import wrench_causes
 
 if TYPE_CHECKING:
     from ..run import Run
@@ -68,11 +69,12 @@ def likely_causes(found: Run | Solution, budget_s: float = BUDGET_S) -> tuple[Ca
     solution = found if isinstance(found, Solution) else found.solution
     fitted = [segment.experiment for segment in solution.collocation.segments]
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
-    if max(misfits) <= NOISE:
-        return ()
     causes, worst = [], fitted[int(np.argmax(misfits))]
     # The answer itself is there, and worth writing when somebody interrupts.
     with contextlib.suppress(KeyboardInterrupt):
+        causes += wrench_causes(solution)
+        if max(misfits) <= NOISE:
+            return ranked(causes)
         causes += doubts(worst, solution.parameters)
         causes += _refitted(solution.collocation, worst, time.monotonic() + budget_s)
     return ranked(causes)

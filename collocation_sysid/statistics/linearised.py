@@ -6,17 +6,17 @@ possibly nuisance parameters of single experiments, such as the offset of a mark
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation
+from ..nlp.collocation import Collocation, Part
 from ..nlp.parameters import ThetaMap
-from .sensitivity import marker_sensitivities
+from .sensitivity import Response, responses
 
 Mask = NDArray[np.bool_]
 
@@ -26,7 +26,9 @@ AT_BOUND = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class FitBlock:
-    """One experiment's residuals and their slopes at the answer.
+    """Residuals of an experiment's markers, or of one of its sensors, and slopes at the answer.
+
+    A sensor has two "markers", its force and its torque, in newtons and newton metres.
 
     Attributes
     ----------
@@ -40,6 +42,10 @@ class FitBlock:
     sigma_m : (M,) standard deviations given
     misfit : (T, M, 3), optional
         Residuals as they are, where Huber's loss has shortened those in `residual`.
+    components : (T, M, 3) bool, optional
+        Coordinates that are there, where not all three of a sample need be.
+    of_sensor : bool
+        Of a sensor, not of markers.
     static : bool
         Whether samples are equilibria, of which no frequency can be told.
     """
@@ -52,7 +58,16 @@ class FitBlock:
     slope: Array
     sigma_m: Array
     misfit: Array | None = None
+    components: Mask | None = None
+    of_sensor: bool = False
     static: bool = False
+
+    @cached_property
+    def seen(self) -> Mask:
+        """(T, M, 3) coordinates that are there."""
+        if self.components is not None:
+            return self.components
+        return np.repeat(self.present[..., None], 3, axis=2)
 
     @property
     def wild(self) -> Mask:
@@ -64,7 +79,7 @@ class FitBlock:
     @property
     def measurements(self) -> int:
         """Scalar measurements that are present."""
-        return 3 * int(self.present.sum())
+        return int(self.seen.sum())
 
     @cached_property
     def channels(self) -> tuple[Array, Array, Mask]:
@@ -73,7 +88,7 @@ class FitBlock:
         return (
             self.residual.reshape(samples, 3 * markers),
             self.slope.reshape(samples, 3 * markers, self.slope.shape[-1]),
-            np.repeat(self.present, 3, axis=1),
+            self.seen.reshape(samples, 3 * markers),
         )
 
 
@@ -109,7 +124,7 @@ class LinearisedFit:
     Attributes
     ----------
     blocks : tuple of FitBlock
-        One per fitted experiment.
+        Of each fitted experiment that of its markers, then those of its sensors.
     names : (p,) the shared parameters first, which are q; then φ, with their unit in
         brackets: ``"gravity/offset Tip1 x [m]"``
     shared : int
@@ -136,54 +151,31 @@ class LinearisedFit:
 
     @property
     def chi_squared(self) -> float:
-        """Σ residual² of the markers, without priors."""
+        """Σ residual² of markers and wrenches, without priors."""
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
 
 
-def linearised_fit(
-    collocation: Collocation, z: Array, marker_z: Sequence[Array] | None = None
-) -> LinearisedFit:
+def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """The fit near a solution.
 
     Parameters
     ----------
     collocation : Collocation
     z : (variables,) a point that satisfies the equations of motion, the optimum
-    marker_z : sequence of (T, 3M, nq), optional
-        `marker_sensitivities`, where they are known already.
 
     Raises
     ------
     SimulationError
         Where the equations of motion are singular.
     """
-    p = collocation.parameters_of(z)
-    if marker_z is None:
-        marker_z = marker_sensitivities(collocation, z)
-    blocks = []
-    for part, by_p in zip(collocation.parts(z), marker_z, strict=True):
-        segment, markers = part.segment, part.segment.experiment.markers
-        residual, here = segment.observation.linearised(
-            part.x, part.phi, by_p, segment.moving, collocation.nq
-        )
-        slope = np.zeros((*residual.shape, len(p)))
-        slope[..., segment.places] = here
-        misfit = residual
-        if collocation.huber is not None:
-            residual, slope = _reweighted(residual, slope, collocation.huber)
-        blocks.append(
-            FitBlock(
-                name=segment.experiment.name,
-                t_s=markers.t_s,
-                marker_names=markers.names,
-                present=segment.observation.present,
-                residual=residual,
-                slope=slope,
-                sigma_m=markers.sigma_m,
-                misfit=misfit,
-                static=segment.experiment.static,
-            )
-        )
+    p, blocks = collocation.parameters_of(z), []
+    for part, response in zip(collocation.parts(z), responses(collocation, z), strict=True):
+        static = part.segment.experiment.static
+        for block in (_of_markers(part, response), *_of_sensors(part, response)):
+            slope = np.zeros((*block.residual.shape, len(p)))
+            slope[..., part.segment.places] = block.slope
+            block = replace(block, slope=slope, misfit=block.residual, static=static)
+            blocks.append(block if collocation.huber is None else _reweighted(block, collocation))
     prior_residual, prior_slope = collocation.prior(p)
     lower, upper = collocation.bounds_p
     return LinearisedFit(
@@ -197,12 +189,50 @@ def linearised_fit(
     )
 
 
-def _reweighted(residual: Array, slope: Array, threshold: float) -> tuple[Array, Array]:
+def _of_markers(part: Part, response: Response) -> FitBlock:
+    """The block of an experiment's markers, with slopes by its own (q, φ)."""
+    segment, markers = part.segment, part.segment.experiment.markers
+    residual, slope = segment.observation.linearised(
+        part.x, part.phi, response.markers, segment.moving, segment.nq
+    )
+    name, present = segment.experiment.name, segment.observation.present
+    return FitBlock(name, markers.t_s, markers.names, present, residual, slope, markers.sigma_m)
+
+
+def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
+    """Likewise those of its sensors."""
+    sensors, found = part.segment.sensors, []
+    if not sensors:
+        return found
+    forced = part.sensing.along(part.x, response.held, response.moved)
+    linear = part.sensing.linearised(forced, part.segment.moving)
+    for k, (sensor, (residual, slope)) in enumerate(zip(sensors, linear, strict=True)):
+        which = "" if len(sensors) == 1 else f" {k + 1}"
+        seen = sensor.present.reshape(-1, 2, 3)
+        found.append(
+            FitBlock(
+                part.segment.experiment.name,
+                sensor.wrench.t_s,
+                (f"force{which}", f"torque{which}"),
+                seen.any(axis=2),
+                residual,
+                slope,
+                sensor.wrench.sigmas[[0, 3]],
+                components=seen,
+                of_sensor=True,
+            )
+        )
+    return found
+
+
+def _reweighted(block: FitBlock, collocation: Collocation) -> FitBlock:
     """Samples beyond Huber's threshold as it sees them.
 
     Slopes have the weight of the fit's normal equations; residuals end at the threshold, so that a
     few wild samples tell nothing of the others' noise.
     """
-    length = np.linalg.norm(residual, axis=2)
-    weight = (threshold / np.maximum(length, threshold))[..., None]
-    return residual * weight, slope * np.sqrt(weight)[..., None]
+    assert collocation.huber is not None
+    length = np.linalg.norm(block.residual, axis=2)
+    weight = (collocation.huber / np.maximum(length, collocation.huber))[..., None]
+    slope = block.slope * np.sqrt(weight)[..., None]
+    return replace(block, residual=block.residual * weight, slope=slope)

@@ -1,4 +1,4 @@
-"""How large the errors are against the σ given, marker by marker.
+"""How large the errors are against the σ given, marker by marker; forces and torques count as such.
 
 The residuals are r = M e + D Lᵀ Pᵀ e_P with M = I − D Dᵀ (see `information`) and e_P the errors of
 the priors. If the errors of marker m have s_m² times the variance given, its residuals have
@@ -143,7 +143,7 @@ def noise_level(
             rows = by_marker[:, m].reshape(3 * len(block.t_s), slope.shape[2])
             names.append(f"{block.name}/{block.marker_names[m]}")
             squares.append(float(np.sum(block.residual[:, m] ** 2)) / shortened(block))
-            counts.append(3 * int(block.present[:, m].sum()))
+            counts.append(int(block.seen[:, m].sum()))
             shares.append(rows.T @ rows)
     of_score, besides = _besides(fit, information, extra)
     return _level(
@@ -163,7 +163,7 @@ def drawn(fit: LinearisedFit, extra: Extra) -> list[Array]:
     found = []
     for block, each in zip(fit.blocks, extra, strict=True):
         samples = np.zeros((count, *block.residual.shape)) if each is None else each
-        found.append(samples[:count] * block.present[..., None])
+        found.append(samples[:count] * block.seen)
     return found
 
 
@@ -184,7 +184,7 @@ def _besides(
     if extra is None or all(each is None for each in extra):
         return np.zeros_like(information.prior), np.zeros((int(np.concatenate(seen).sum()), 1))
     scores, left = projected(information, drawn(fit, extra))
-    present = [block.present[..., None] for block in fit.blocks]
+    present = [block.seen for block in fit.blocks]
     sums = [
         np.sum((each * there) ** 2, axis=(1, 3))[:, used].T
         for each, there, used in zip(left, present, seen, strict=True)

@@ -194,10 +194,8 @@ def changes_towards(fit: LinearisedFit, apart: Sequence[Array]) -> Array:
     rows = [np.diag(fit.prior_slope[free])]
     right = [np.zeros(len(free))]
     for block, way in zip(fit.blocks, apart, strict=True):
-        seen = block.present.ravel()
-        slope = block.slope[..., free].reshape(len(seen), 3, len(free))
-        rows.append(slope[seen].reshape(-1, len(free)))
-        right.append((way * _weight(block)).reshape(len(seen), 3)[seen].ravel())
+        rows.append(block.slope[..., free][block.seen])
+        right.append((way * _weight(block))[block.seen])
     matrix = np.concatenate(rows)
     units = np.linalg.norm(matrix, axis=0)
     units[units == 0] = 1.0

@@ -20,7 +20,9 @@ from ..experiment.grasp import Grasp
 from ..experiment.poses import PoseSequence
 from ..nlp.collocation import Collocation, Part
 from ..nlp.lapack import one_blas_thread
+from ..nlp.reaction import HeldForces
 from ..nlp.tangent import BlockSolver
+from .sensitivity import read_along
 
 # Samples of D η, and the fewest and the memory where bodies are large.
 DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
@@ -86,20 +88,20 @@ def pose_noise_draws(
 
     Returns
     -------
-    draws : list by experiment of (K, T, M, 3) in standard deviations of the markers, or None
+    draws : list by block, see `LinearisedFit`, of (K, T, M, 3) in standard deviations, or None
     noises : tuple of PoseNoise, those that matter
     """
     draws: list[Array | None] = []
     noises: list[PoseNoise] = []
     for part in collocation.parts(z):
         here = [_noise(part.segment.experiment.name, g) for g in part.segment.experiment.grasps]
-        found = None
+        found: list[Array | None] = [None] * (1 + len(part.segment.sensors))
         if any(noise.sigma_m or noise.sigma_rad for noise in here):
-            found = _drawn(part, here, np.random.default_rng(seed))
-            if np.sqrt(np.mean(found**2)) < NEGLIGIBLE:
-                found = None
-        draws.append(found)
-        if found is not None:
+            drawn = _drawn(part, here, np.random.default_rng(seed))
+            if any(np.sqrt(np.mean(each**2)) >= NEGLIGIBLE for each in drawn):
+                found = [*drawn]
+        draws += found
+        if found[0] is not None:
             noises += [noise for noise in here if noise.sigma_m or noise.sigma_rad]
     return draws, tuple(noises)
 
@@ -111,19 +113,22 @@ def _noise(name: str, grasp: Grasp) -> PoseNoise:
     return PoseNoise(name, sigma_m, sigma_rad, grasp.sigma_m is None)
 
 
-def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) -> Array:
-    """(K, T, M, 3) changes of the residuals."""
+def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) -> list[Array]:
+    """(K, T, M, 3) changes of the residuals of the markers, and of each sensor."""
     segment, held = part.segment, part.setting.held
     numbers = held.positions_m.size * 8
     count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
     moved = np.zeros((*held.positions_m.shape, count))
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
         _add_noise(moved, part, grasp, noise, rng)
-    rows = BlockSolver(segment).response(part.x, part.setting, moved)
-    sampled = set(segment.observation.grid_rows.tolist())
-    operator = segment.observation.operator(part.phi)
-    at_samples = np.stack([operator @ row for t, row in enumerate(rows) if t in sampled])
-    return np.moveaxis(segment.observation.response(part.x, part.phi, at_samples), 3, 0)
+    sensing = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), count)
+    rows = BlockSolver(segment).response(part.x, part.setting, moved, sensing)
+    response = read_along(part, rows, sensing)
+    changes = [segment.observation.response(part.x, part.phi, response.markers)]
+    if segment.sensors:
+        forced = part.sensing.along(part.x, response.held, response.moved)
+        changes += part.sensing.response(forced)
+    return [np.moveaxis(change, 3, 0) for change in changes]
 
 
 def _add_noise(

@@ -75,31 +75,46 @@ class Scatter:
         return np.where(self.disagreeing, enough, variances)
 
 
-def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
+def recordings_of(fit: LinearisedFit) -> dict[str, list[int]]:
+    """Numbers of the blocks of each recording, by its name."""
+    found: dict[str, list[int]] = {}
+    for k, block in enumerate(fit.blocks):
+        found.setdefault(block.name, []).append(k)
+    return found
+
+
+def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, Array]]:
     """The fit to each recording alone, and its shared parameters (nq,) less the joint ones.
 
-    Priors of shared parameters are no recording's, and left out.
+    Priors of shared parameters are no recording's, and left out. The numbers are those of its
+    blocks.
     """
-    for block in fit.blocks:
+    for name, numbers in recordings_of(fit).items():
+        blocks = [fit.blocks[k] for k in numbers]
         local = fit.names[fit.shared :]
-        own = fit.shared + np.flatnonzero([name.startswith(f"{block.name}: ") for name in local])
+        own = fit.shared + np.flatnonzero([other.startswith(f"{name}: ") for other in local])
         columns = np.concatenate([np.arange(fit.shared), own])
         prior = np.where(columns < fit.shared, 0.0, fit.prior_slope[columns])
-        slope = block.slope[..., columns]
-        rows = np.concatenate([slope.reshape(-1, len(columns)), np.diag(prior)])
-        right = np.concatenate([block.residual.ravel(), _prior_residual(fit, columns)])
+        slopes = [block.slope[..., columns] for block in blocks]
+        of_data = [slope.reshape(-1, len(columns)) for slope in slopes]
+        rows = np.concatenate([*of_data, np.diag(prior)])
+        residuals = [block.residual.ravel() for block in blocks]
+        right = np.concatenate([*residuals, _prior_residual(fit, columns)])
         units = np.linalg.norm(rows, axis=0)
         units[units == 0] = 1.0
         step = -np.linalg.lstsq(rows / units, right)[0] / units
         alone = replace(
             fit,
-            blocks=(replace(block, residual=block.residual + slope @ step, slope=slope),),
+            blocks=tuple(
+                replace(block, residual=block.residual + slope @ step, slope=slope)
+                for block, slope in zip(blocks, slopes, strict=True)
+            ),
             names=tuple(fit.names[k] for k in columns),
             prior_residual=_prior_residual(fit, columns) + prior * step,
             prior_slope=prior,
             at_bound=np.zeros(len(columns), dtype=bool),
         )
-        yield alone, step[: fit.shared]
+        yield numbers, alone, step[: fit.shared]
 
 
 def _prior_residual(fit: LinearisedFit, columns: NDArray[np.int64]) -> Array:

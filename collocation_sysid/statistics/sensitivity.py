@@ -6,11 +6,15 @@ shared parameters q and those φ of an experiment that move its body, see `Segme
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation
+from ..nlp.collocation import Collocation, Part
 from ..nlp.lapack import one_blas_thread
+from ..nlp.reaction import HeldForces
 from ..nlp.tangent import BlockSolver
 
 
@@ -30,12 +34,26 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     ]
 
 
-@one_blas_thread()
-def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """d(markers)/dp of each experiment at its samples, (T, 3M, m); column 3 m + axis.
+@dataclass(frozen=True, eq=False)
+class Response:
+    """How what is measured in one experiment follows the m parameters that move its body.
 
-    Of the plain markers, h(x), by the parameters that move the body. Needs no more memory than the
-    result.
+    Attributes
+    ----------
+    markers : (T, 3M, m) of the plain markers, h(x), at its samples; column 3 m + axis
+    held : HeldForces
+        On the dofs of grasps with a sensor.
+    moved : (N, g, m) how these dofs move
+    """
+
+    markers: Array
+    held: HeldForces
+    moved: Array
+
+
+@one_blas_thread()
+def responses(collocation: Collocation, z: Array) -> list[Response]:
+    """The response of each experiment; needs no more memory than the result.
 
     Raises
     ------
@@ -44,8 +62,26 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     """
     found = []
     for part in collocation.parts(z):
-        rows = BlockSolver(part.segment).sensitivities(part.x, part.setting)
-        sampled = set(part.segment.observation.grid_rows.tolist())
-        operator = part.segment.observation.operator(part.phi)
-        found.append(np.stack([operator @ row for t, row in enumerate(rows) if t in sampled]))
+        segment, dofs = part.segment, part.segment.sensed_dofs
+        held = HeldForces.nothing(len(part.x), len(dofs), len(segment.moving))
+        rows = BlockSolver(segment).sensitivities(part.x, part.setting, held)
+        found.append(read_along(part, rows, held))
     return found
+
+
+def read_along(part: Part, rows: Iterable[Array], held: HeldForces) -> Response:
+    """What changes (3n, m) of row after row of x change of what is measured."""
+    segment = part.segment
+    sampled = set(segment.observation.grid_rows.tolist())
+    operator = segment.observation.operator(part.phi)
+    markers, moved = [], []
+    for t, row in enumerate(rows):
+        moved.append(row[segment.sensed_dofs])
+        if t in sampled:
+            markers.append(operator @ row)
+    return Response(np.stack(markers), held, np.stack(moved))
+
+
+def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
+    """d(markers)/dp of each experiment at its samples, (T, 3M, m), see `Response`."""
+    return [response.markers for response in responses(collocation, z)]

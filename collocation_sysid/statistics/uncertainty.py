@@ -15,7 +15,7 @@ output names which of them was used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -43,7 +43,7 @@ from .linearised import AT_BOUND, LinearisedFit, linearised_fit
 from .memory_notes import memory_notes
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
 from .pose_noise import pose_noise_draws
-from .scatter import Scatter, scatter_of, single_fits
+from .scatter import Scatter, recordings_of, scatter_of, single_fits
 from .sensitivity import marker_sensitivities, sensitivities
 
 __all__ = [
@@ -134,7 +134,6 @@ class Uncertainty:
 def covariance(
     collocation: Collocation,
     z: Array,
-    marker_z: Sequence[Array] | None = None,
     noise: NoiseOption = "auto",
     errors: ErrorsOption = "auto",
 ) -> Uncertainty:
@@ -144,8 +143,6 @@ def covariance(
     ----------
     collocation : Collocation
     z : (variables,) a point that satisfies the equations of motion, the optimum
-    marker_z : sequence of (T, 3M, nq), optional
-        `marker_sensitivities`, where they are known already.
     noise, errors
         See `uncertainty_of`.
 
@@ -157,7 +154,7 @@ def covariance(
         Where the equations of motion are singular.
     """
     _check(noise, errors)
-    fit = linearised_fit(collocation, z, marker_z)
+    fit = linearised_fit(collocation, z)
     q, (extra, _) = z[: collocation.nq], pose_noise_draws(collocation, z)
     return uncertainty_of(fit, collocation.parameters, q, noise, errors, extra)
 
@@ -269,14 +266,14 @@ def _scatter(
     extra: Extra | None,
 ) -> Scatter | None:
     """What recordings say one by one, with error bars of their own."""
-    if len(fit.blocks) < 2:
+    if len(recordings_of(fit)) < 2:
         return None
     names, steps, variances = [], [], []
     sizes = relative_slopes(parameters, q)
-    for k, (alone, step) in enumerate(single_fits(fit)):
+    for blocks, alone, step in single_fits(fit):
         if alone.measurements <= len(alone.names):
             continue
-        own = None if extra is None else [extra[k]]
+        own = None if extra is None else [extra[k] for k in blocks]
         found = uncertainty_of(alone, parameters, q, noise, errors, own)
         names.append(alone.blocks[0].name)
         steps.append(step)
@@ -332,7 +329,7 @@ def _expected(
     rng = np.random.default_rng(0)
     size = np.sqrt(max(1.0, level.pooled))
     errors = [
-        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.present[..., None]
+        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.seen
         for each, block in zip(added, fit.blocks, strict=True)
     ]
     _, left = projected(factored, errors)
@@ -341,7 +338,7 @@ def _expected(
             replace(
                 fit,
                 blocks=tuple(
-                    replace(block, residual=each[k] * block.present[..., None])
+                    replace(block, residual=each[k] * block.seen)
                     for block, each in zip(fit.blocks, left, strict=True)
                 ),
             ),

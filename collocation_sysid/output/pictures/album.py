@@ -23,6 +23,7 @@ from .scan import scan_picture
 from .shapes import shapes
 from .spectrum import spectrum
 from .tracks import tracks
+from .wrench import wrench_picture
 
 
 def album(
@@ -90,6 +91,9 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
     if len(names) and not replay.static:
         spectral = spectrum(t_s, measured, fitted, replay.natural_hz)
         pictures[f"spectrum_{replay.name}"] = spectral
+    for k, sensed in enumerate(replay.wrenches, start=1):
+        which = "" if len(replay.wrenches) == 1 else f"_{k}"
+        pictures[f"wrench_{replay.name}{which}"] = wrench_picture(sensed)
     if replay.shapes_m is not None and np.isfinite(replay.shapes_m).all(axis=(1, 2)).any():
         pictures[f"shapes_{replay.name}"] = shapes(
             t_s, replay.shapes_m, replay.surface, replay.held, measured, replay.up,

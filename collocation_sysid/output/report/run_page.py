@@ -14,6 +14,7 @@ from ..replay import LARGEST, RESULT_FILE, read_arrays, reading_run
 from .page import millimetres, number, picture, rendered
 
 SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
+SHOWN_UNITS |= {"N": (1.0, " N"), "N m": (1e3, " mN m"), "kg": (1e3, " g")}
 MEANINGS = {
     "good": "nothing speaks against the answer and its error bars",
     "check": "usable after a look at the reasons",
@@ -30,6 +31,7 @@ CAPTIONS = {
     "shapes": "The body at times of the recording; orange: measured markers.",
     "mesh": "The mesh, its grasped nodes and the markers' places as found.",
     "tracks": "Measured, fitted and rolled-out markers, the residual below.",
+    "wrench": "Wrench of a grasp: measured, fitted and rolled out.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % confidence ellipses of pairs of parameters.",

@@ -1,0 +1,173 @@
+"""Fits with measured wrenches: methods, error bars, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problems_small import GUESS, TRUTH, hung_cube, relative_errors
+from wrenches_small import SIGMA_N, SIGMA_NM, sensing
+
+import collocation_sysid as cs
+from collocation_sysid.check.derivatives import derivative_errors, shortened
+from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.shooting import Shooting
+from collocation_sysid.methods.start import initial_variables
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.simulation import simulate, with_markers, with_wrenches
+from collocation_sysid.problem import Problem
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.uncertainty import covariance
+
+NOISE_M = 1e-3
+UNKNOWN = {item.name: cs.Unknown(item.guess, item.lower, item.upper) for item in GUESS.items}
+
+
+@cache
+def swung(seed: int = 0, nuisance: Nuisance | None = None, steps: int = 40) -> Experiment:
+    """The cube swung for a while, seen and felt with noise, all by the midpoint rule."""
+    rng = np.random.default_rng(seed)
+    cube = sensing(replace(hung_cube(steps), nuisance=nuisance or Nuisance.none()), frame="grasp")
+    found = simulate(cube, TRUTH, "midpoint")
+    tracks = found.markers_m + NOISE_M * rng.normal(size=found.markers_m.shape)
+    noise = np.repeat([SIGMA_N, SIGMA_NM], 3)
+    wrenches = [values + noise * rng.normal(size=values.shape) for values in found.wrenches]
+    return with_wrenches(with_markers(cube, tracks), wrenches)
+
+
+def blind(experiment: Experiment) -> Experiment:
+    """The experiment without its sensors."""
+    return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
+
+
+def test_methods_find_the_same_optimum():
+    collocation = Collocation([swung()], GUESS)
+    reduced = ReducedSpace()(collocation)
+    assert np.abs(relative_errors(reduced)).max() < 0.2
+    for gradient in ("forward", "adjoint"):
+        shot = Shooting(gradient=gradient)(collocation)
+        assert shot.status.converged
+        np.testing.assert_allclose(shot.q, reduced.q, atol=2e-5)
+    assert reduced.kkt_residual < 1e-6
+
+
+def test_a_sensor_improves_what_is_known_of_the_stiffness():
+    """Of a body whose density is known."""
+    deviations = {}
+    for name, experiment in (("felt", swung()), ("only seen", blind(swung()))):
+        collocation = Collocation([experiment], GUESS)
+        solution = ReducedSpace()(collocation)
+        found = covariance(collocation, solution.z)
+        (young,) = (found.derived[n] for n in found.derived if n.startswith("young"))
+        deviations[name] = young.std_error
+    assert deviations["felt"] < 0.8 * deviations["only seen"]
+
+
+def test_error_bars_are_those_of_the_slopes():
+    collocation = Collocation([swung()], GUESS)
+    solution = ReducedSpace()(collocation)
+    markers, sensor = linearised_fit(collocation, solution.z).blocks
+    assert (sensor.of_sensor, markers.of_sensor) == (True, False)
+    assert sensor.measurements == int(collocation.segments[0].sensors[0].present.sum())
+    rows = [b.slope.reshape(-1, 4)[b.seen.ravel()] for b in (markers, sensor)]
+    of_both = np.linalg.inv(sum(r.T @ r for r in rows))
+    found = covariance(collocation, solution.z, noise="given", errors="independent")
+    np.testing.assert_allclose(found.covariance, of_both, rtol=1e-6)
+    assert {"hung cube/force", "hung cube/torque"} <= set(found.level.names)
+
+
+def test_the_noise_of_a_sensor_is_judged_by_itself():
+    """Its sigma is scaled where it is wrong, and the markers' is not."""
+    loud = swung()
+    (grasp,) = loud.grasps
+    assert grasp.wrench is not None
+    quiet = replace(grasp.wrench, sigma_n=grasp.wrench.sigma_n / 4)
+    collocation = Collocation([replace(loud, grasps=[replace(grasp, wrench=quiet)])], GUESS)
+    found = covariance(collocation, ReducedSpace()(collocation).z)
+    assert found.noise == "by-marker"
+    assert found.level.factors["hung cube/force"] == pytest.approx(4, rel=0.15)
+    assert found.level.factors["hung cube/torque"] == pytest.approx(1, rel=0.15)
+    assert found.level.factors["hung cube/m3"] == pytest.approx(1, rel=0.2)
+
+
+def test_tare_clock_lag_and_tool_are_found():
+    wanted = Nuisance.none(
+        tare=20.0, sensor_time_s=0.004, sensor_lag_s=0.01, tool_kg=0.02, tool_m=0.02
+    )
+    collocation = Collocation([swung(0, wanted, 60)], GUESS)
+    (segment,) = collocation.segments
+    names, scales = segment.nuisance.names, segment.nuisance.scales
+    true = np.zeros(len(names))
+    for part, value in (("tare", 0.005), ("shift of the sensor", 0.003), ("lag", 0.008)):
+        true[[part in name for name in names]] = value
+    true[["mass of the tool" in name for name in names]] = 0.012
+    true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
+    phi = true / scales
+    made = simulate(swung(0, wanted, 60), TRUTH, "midpoint")
+    grid, forced = made.reactions
+    (sensor,) = segment.sensors
+    read = replace(sensor, on=grid).readings(forced, phi, segment.nuisance.gravity_m_s2)
+    measured = with_wrenches(swung(0, wanted, 60), [read])
+    collocation = Collocation([with_markers(measured, made.markers_m)], GUESS)
+    solution = ReducedSpace()(collocation)
+    found = collocation.parameters_of(solution.z)[4:] * scales
+    assert solution.status.converged
+    # Priors around zero pull a little.
+    np.testing.assert_allclose(found, true, atol=0.1 * scales.max(), rtol=0.1)
+    np.testing.assert_allclose(relative_errors(solution), 0, atol=0.01)
+
+
+def test_a_run_tells_of_the_wrench(tmp_path: Path):
+    experiment = swung(1, Nuisance.none(tare=10.0, sensor_time_s=0.002))
+    problem = Problem([experiment], UNKNOWN, rollout=cs.RolloutOptions(integrator="scheme"))
+    run = cs.run(problem, method="reduced-space", seek_causes=False)
+    assert run.trust.verdict == "good", run.trust.reasons
+    folder = run.save(tmp_path / "run", frames=False)
+    result = json.loads((folder / "result.json").read_text())
+    assert result["fit"]["wrench_rms_n"] == pytest.approx(SIGMA_N, rel=0.3)
+    assert result["fit"]["wrench_rms_nm"] == pytest.approx(SIGMA_NM, rel=0.3)
+    assert "tare of fx [N]" in result["nuisance"]["hung cube"]
+    assert (folder / "wrench_hung_cube.png").is_file()
+    with np.load(folder / "trajectory.npz") as stored:
+        assert stored["wrench_1"].shape == (41, 19)
+    from collocation_sysid.output.redraw import redraw
+    from collocation_sysid.output.report import run_page
+    from collocation_sysid.terminal import plain_text, summary
+
+    said = plain_text(summary(run, folder))
+    assert "wrench of 'hung cube'" in said
+    assert "tare up to" in said
+    assert "sensor late by" in said
+    assert "Wrench of a grasp" in run_page(folder)
+    assert any(file.name.startswith("wrench") for file in redraw(folder, tmp_path / "again"))
+
+
+def test_interior_point_finds_the_same_optimum():
+    collocation = Collocation([swung(steps=12)], GUESS)
+    reduced = ReducedSpace()(collocation)
+    found = InteriorPoint(max_iterations=300)(collocation)
+    assert found.status.converged
+    np.testing.assert_allclose(found.q, reduced.q, atol=1e-6)
+    assert any("limited-memory" in note for note in found.notes)
+
+
+def test_methods_that_need_second_derivatives_refuse_wrenches():
+    with pytest.raises(cs.InputError, match="needs second derivatives"):
+        cs.SqpMethod()(Collocation([swung(steps=12)], GUESS))
+    exact = ReducedSpace(hessian="exact")
+    with pytest.raises(cs.InputError, match="second derivatives of measured wrenches"):
+        exact(Collocation([swung(steps=12)], GUESS))
+
+
+def test_check_compares_the_slopes_of_wrenches():
+    problem = Problem([swung()], UNKNOWN)
+    short = shortened(problem, 12).collocation()
+    jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
+    assert jacobian < 1e-6
+    assert hessian < 1e-6
