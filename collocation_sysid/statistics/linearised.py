@@ -196,7 +196,16 @@ def _of_markers(part: Part, response: Response) -> FitBlock:
         part.x, part.phi, response.markers, segment.moving, segment.nq
     )
     name, present = segment.experiment.name, segment.observation.present
-    return FitBlock(name, markers.t_s, markers.names, present, residual, slope, markers.sigma_m)
+    return FitBlock(
+        name,
+        markers.t_s,
+        markers.names,
+        present,
+        residual,
+        slope,
+        markers.sigma_m,
+        static=segment.experiment.static,
+    )
 
 
 def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
@@ -218,6 +227,7 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
                 residual,
                 slope,
                 sensor.wrench.sigmas[[0, 3]],
+                static=part.segment.experiment.static,
                 components=seen,
                 of_sensor=True,
             )
