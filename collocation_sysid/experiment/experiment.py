@@ -205,9 +205,16 @@ class Experiment:
         return positions.reshape(len(positions), -1)[:, self.held_dofs]
 
     def node_mass_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
+        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg].
+
+        Of the body's densities as stated.
+        """
+        return self.body.node_mass + self.tied_mass_kg(t_s)
+
+    def tied_mass_kg(self, t_s: ArrayLike) -> Array:
+        """Return the mass of all point masses that each node carries at `t_s` (T,), (T, n) [kg]."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
-        mass = np.broadcast_to(self.body.node_mass, (len(times), n))
+        mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
             mass = mass + point.at_nodes(times, n)
         return mass

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
-from .forces import Forces
+from .forces import Forces, Mass
 from .lapack import one_blas_thread
 from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
@@ -97,7 +97,7 @@ class _Stepper:
         return self.solvers.holding(self.experiment.grasped(time_s)[0][0])
 
     def _mass(self, time_s: float) -> Array:
-        return np.repeat(self.experiment.node_mass_kg(time_s)[0], 3)
+        return Mass.of(self.experiment, time_s).row(0, self.theta)
 
     def _after_a_change(self, state: _State, goal_s: float) -> _State:
         """The state with the accelerations after nodes are let go or a mass has joined."""
@@ -113,14 +113,14 @@ class _Stepper:
         forces, now = Forces.of(self.experiment, load_s), state.memory.now if state.memory else None
         force = forces.total(state.x, state.v, self.theta, now)[0]
         acceleration = state.a.copy()
-        acceleration[dofs] = (force / forces.mass_kg[0])[dofs]
+        acceleration[dofs] = (force / forces.mass.row(0, self.theta))[dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
         theta, h = self.theta, end_s - state.t_s
         forces = Forces.of(self.experiment, load_s)
-        mass = forces.mass_kg[0]
+        mass = forces.mass.row(0, theta)
         carried = state.memory.ahead(h) if state.memory else None
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
