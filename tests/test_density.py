@@ -8,23 +8,26 @@ import numpy as np
 import pytest
 from checks import assert_derivative
 from problems_small import (
-    bar_in_two_hands,
     bar_let_go,
     cube_with_nuisance,
     hung_cube,
     measured_with,
-    nodes_where,
     quadratic_bar,
 )
 
 from collocation_sysid.experiment import Experiment, PointMass
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.constants import is_density
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.shooting import adjoint_gradient, simulated
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters, Unknown
+from collocation_sysid.nlp.simulation import simulate, with_markers
 
-DENSITY_KG_M3 = {"density_kg_m3": 30.0, "core.density_kg_m3": 55.0}
+# In the ratio that is stated: then known masses are damped alike.
+DENSITY_KG_M3 = {"density_kg_m3": 36.0, "core.density_kg_m3": 60.0}
 TRUTH = {
     "lambda_pa": 200.0,
     "mu_pa": 300.0,
@@ -115,3 +118,75 @@ def test_derivatives_of_the_program_by_densities(name, scheme, rng):
         return collocation.gradient(at) + collocation.jacobian(at).T @ weights
 
     assert_derivative(slope, lambda d: hessian @ d, z, rng, tolerance=1e-7, scale=scale)
+
+
+# The same optimum ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["hung cube", "let go"])
+def test_methods_find_densities_where_a_known_mass_sets_the_scale(name):
+    experiment = measured_with(MADE[name](), TRUTH)
+    collocation = Collocation([experiment], parameters())
+    reduced, interior, shot = (
+        METHODS[m]()(collocation) for m in ("reduced-space", "interior-point", "shooting")
+    )
+    for solution in (reduced, interior, shot):
+        assert solution.status.converged, solution.message
+        for each in GUESS:
+            assert solution.parameters[each] == pytest.approx(TRUTH[each], rel=1e-3)
+    values = [[*solution.parameters.values()] for solution in (reduced, interior)]
+    np.testing.assert_allclose(*values, rtol=1e-5)
+    assert reduced.kkt_residual < 1e-8
+
+
+# Along the equations of motion --------------------------------------------------------------
+
+REMEMBERED = TRUTH | {"prony_1.share": 0.4, "prony_1.tau_s": 0.03}
+TOLD = {name: (make, TRUTH) for name, make in MADE.items()} | {
+    "memory": (lambda: with_core(weighted(hung_cube(6)), prony=["prony_1"]), REMEMBERED)
+}
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
+    make, truth = TOLD[name]
+    collocation = Collocation([noisy_with(make(), truth)], parameters(truth))
+    p = collocation.guess_p
+    z = simulated(collocation, p)
+    adjoint = adjoint_gradient(collocation, z)
+    rows = [segment.grid_rows for segment in collocation.segments]
+    point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
+    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
+
+    def objective(at: np.ndarray) -> float:
+        return collocation.objective(simulated(collocation, at))
+
+    assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
+
+
+@pytest.mark.parametrize("name", TOLD)
+@pytest.mark.parametrize("integrator", ["newmark", "midpoint"])
+def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
+    make, truth = TOLD[name]
+    free = make()
+    stated = {n: v for n, v in truth.items() if not is_density(n)}
+    rest, core = free.body.parts
+    body = Body(
+        free.body.mesh,
+        density_kg_m3=DENSITY_KG_M3["density_kg_m3"],
+        element=free.body.element.name,
+        damping=rest.damping,
+        prony=rest.prony,
+        regions=[Region("core", core.cells, density_kg_m3=DENSITY_KG_M3["core.density_kg_m3"])],
+    )
+    found = simulate(free, truth, integrator).markers_m
+    expected = simulate(replace(free, body=body), stated, integrator).markers_m
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
+def noisy_with(experiment: Experiment, truth) -> Experiment:
+    made = measured_with(experiment, truth)
+    tracks = made.markers.positions_m
+    noise = 1e-3 * np.random.default_rng(7).normal(size=tracks.shape)
+    return with_markers(made, tracks + noise)

@@ -228,6 +228,13 @@ class Experiment:
         return total
 
     @property
+    def knows_a_force(self) -> bool:
+        """Whether any known force or mass acts on the body, which sets the scale of all others."""
+        free = self.free_nodes
+        tied, forces = self.tied_mass_kg(self.t_s), self.node_forces_n(self.t_s)
+        return bool(tied[:, free].any() or forces[:, free].any())
+
+    @property
     def pattern(self) -> SymmetricPattern:
         """Sparsity of the slopes of the forces on its body."""
         return self.body.pattern
