@@ -62,9 +62,9 @@ class Model:
         names = []
         for part in self.parts:
             owns = [c.name for c in part.constants] + list(elastic_names(part.material))
+            owns.append(DENSITY.name)
             names += [part.full_name(own) for own in owns] + owns
-            names += [MASS.name] if part.free_density else []
-        return tuple(dict.fromkeys(names))
+        return tuple(dict.fromkeys([*names, MASS.name]))
 
     def assembled(self, values: Mapping[str, Any]) -> list[Any]:
         """θ from values by the user's names: numbers, or CasADi expressions.

@@ -19,6 +19,7 @@ from ..nlp.parameters import Parameters, ThetaMap
 
 # What is left over of a change of all constants that parameters cannot bring about.
 LEFT = 1e-8
+REMEDY = "fix a density, give a known mass, or measure a wrench"
 
 
 def open_scale(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
@@ -35,14 +36,19 @@ def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -
 
 def scale_notes(experiments: Iterable[Experiment], parameters: Parameters) -> list[str]:
     """What to do about a scale that is open."""
-    names = open_scale(experiments, parameters)
-    return [f"{_open(names)}; fix a density, give a known mass, or measure a wrench"] * bool(names)
+    found = scale_concern(experiments, parameters)
+    return [] if found is None else [f"{found}; {REMEDY}"]
 
 
 def scale_concern(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
     """The same of an answer, None where the scale is known."""
     names = open_scale(experiments, parameters)
-    return _open(names) if names else None
+    if not names:
+        return None
+    return (
+        f"only the ratios of {_listed(names)} can be told (E/ρ): no known force or mass sets their "
+        "scale"
+    )
 
 
 def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
@@ -52,15 +58,6 @@ def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters)
         return None
     verb = "is" if len(names) == 1 else "are"
     return f"no known force sets the scale: {_listed(names)} {verb} relative to the stated density"
-
-
-def _open(names: tuple[str, ...]) -> str:
-    stiff = [name for name in names if not is_density(name)]
-    heavy = [name for name in names if is_density(name)]
-    return (
-        f"of {_listed(stiff)} and {_listed(heavy)} only the ratios can be told (E/ρ), for no known "
-        "force or mass sets their scale"
-    )
 
 
 def _moved(
