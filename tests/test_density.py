@@ -56,7 +56,7 @@ def with_core(experiment: Experiment, **changes) -> Experiment:
 
 def weighted(experiment: Experiment) -> Experiment:
     """The experiment with a known mass on two of its nodes."""
-    here = experiment.free_nodes[-2:]
+    here = experiment.free_dofs[[-4, -1]] // 3
     return replace(experiment, masses=(*experiment.masses, PointMass(here, 0.01)))
 
 

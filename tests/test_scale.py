@@ -33,7 +33,7 @@ def names_of(found: Problem) -> tuple[str, ...]:
 
 
 def tip(experiment: Experiment) -> np.ndarray:
-    return experiment.free_nodes[:2]
+    return experiment.free_dofs[[0, 3]] // 3
 
 
 def test_without_a_force_all_moduli_and_densities_are_open():
@@ -76,7 +76,7 @@ def test_a_known_mass_or_force_on_free_nodes_closes_it():
     force = Force(tip(cube), [[0.0, 0.0, 0.1]])
     assert names_of(problem(OPEN, masses=[mass])) == ()
     assert names_of(problem(OPEN, forces=[force])) == ()
-    held = PointMass(cube.held_nodes[:2], 0.01)
+    held = PointMass(cube.held_dofs[[0, 3]] // 3, 0.01)
     assert names_of(problem(OPEN, masses=[held])) == NAMES
 
 

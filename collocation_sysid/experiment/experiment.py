@@ -229,10 +229,12 @@ class Experiment:
 
     @property
     def knows_a_force(self) -> bool:
-        """Whether any known force or mass acts on the body, which sets the scale of all others."""
-        free = self.free_nodes
-        tied, forces = self.tied_mass_kg(self.t_s), self.node_forces_n(self.t_s)
-        return bool(tied[:, free].any() or forces[:, free].any())
+        """Whether a known mass or force, or a measured one, sets the scale of all forces."""
+        if any(grasp.wrench is not None for grasp in self.grasps):
+            return True
+        tied = np.repeat(self.tied_mass_kg(self.t_s), 3, axis=1)
+        forces = self.node_forces_n(self.t_s).reshape(tied.shape)
+        return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
     def pattern(self) -> SymmetricPattern:

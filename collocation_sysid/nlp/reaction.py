@@ -103,6 +103,6 @@ def reactions(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Ar
 
 
 def reaction_slopes(dynamics: Dynamics, mass_kg: Array, slopes: Array, moved: Array) -> Array:
-    """dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
+    """Changes dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
     second = dynamics.combine(dynamics.tables.s, moved) / dynamics.step_s**2
     return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, slopes)

@@ -65,9 +65,7 @@ class Sensing:
         dynamics = self.setting.dynamics
         return dynamics.mass.at(self.setting.theta)[:, self.segment.sensed_dofs]
 
-    def along(
-        self, x: Array, held: HeldForces, moved: Array, first: int | None = None
-    ) -> Forced:
+    def along(self, x: Array, held: HeldForces, moved: Array, first: int | None = None) -> Forced:
         """The same of the first rows x, from their forces, and how they change.
 
         Parameters
