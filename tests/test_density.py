@@ -14,6 +14,7 @@ from problems_small import (
     measured_with,
     quadratic_bar,
 )
+from wrenches_small import sensing
 
 from collocation_sysid.experiment import Experiment, PointMass
 from collocation_sysid.fem.body import Body
@@ -156,6 +157,24 @@ def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
     adjoint = adjoint_gradient(collocation, z)
     rows = [segment.grid_rows for segment in collocation.segments]
     point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
+    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
+
+    def objective(at: np.ndarray) -> float:
+        return collocation.objective(simulated(collocation, at))
+
+    assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
+
+
+def test_gradients_where_a_wrench_tells_the_density(rng):
+    cube = with_core(sensing(hung_cube(8)))
+    wrench = replace(cube.grasps[0].wrench, values=0.01 * rng.standard_normal((9, 6)))
+    cube = replace(cube, grasps=[replace(cube.grasps[0], wrench=wrench)])
+    collocation = Collocation([noisy_with(cube, TRUTH)], parameters())
+    p = collocation.guess_p
+    z = simulated(collocation, p)
+    adjoint = adjoint_gradient(collocation, z)
+    point = Horizon(collocation, [9]).evaluate(p, collocation.unpack(z)[1])
     forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
     np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
 

@@ -113,9 +113,7 @@ def test_moduli_relative_to_a_density_as_stated_are_called_so():
     found = problem(STIFF | DAMPED)
     assert relative_moduli(found.experiments, found.parameters) == ("lambda_pa", "mu_pa")
     said = relative_sentence(found.experiments, found.parameters)
-    assert said == (
-        "no known force sets the scale: lambda_pa and mu_pa are relative to the stated density"
-    )
+    assert said == ("no known force sets the scale: λ and μ are relative to the stated density")
     cube = hung_cube()
     loaded = problem(STIFF | DAMPED, masses=[PointMass(tip(cube), 0.01)])
     assert relative_sentence(loaded.experiments, loaded.parameters) is None

@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body
-from ..fem.constants import DENSITY, bare, is_density, is_modulus
+from ..fem.constants import DENSITY, bare, is_density, is_modulus, symbol_of
 from ..methods.scan import SOFT_PA, usual_parameters
 from ..nlp.parameters import Parameters, ThetaMap
 
@@ -56,8 +56,10 @@ def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters)
     names = relative_moduli(experiments, parameters)
     if not names or open_scale(experiments, parameters):
         return None
-    verb = "is" if len(names) == 1 else "are"
-    return f"no known force sets the scale: {_listed(names)} {verb} relative to the stated density"
+    verb, symbols = "is" if len(names) == 1 else "are", [symbol_of(name) for name in names]
+    return (
+        f"no known force sets the scale: {_listed(symbols)} {verb} relative to the stated density"
+    )
 
 
 def _moved(
