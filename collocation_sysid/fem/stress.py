@@ -30,6 +30,7 @@ from .point import Pieces, Point
 if TYPE_CHECKING:
     from .body import Body
 
+
 def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
     last = point.phase(name, pieces)
     return PointKernel(last.pieces, tuple(point.fields), last.contractions)

@@ -107,7 +107,8 @@ class Unconstrained:
         rows = ((given, s, explicit[s.rows]) for given, s in pairs)
         return np.concatenate(
             [
-                each if given.rows_per_time == s.rows_per_time
+                each
+                if given.rows_per_time == s.rows_per_time
                 else each.reshape(-1, s.dofs)[:, given.row_dofs].ravel()
                 for given, s, each in rows
             ]

@@ -344,9 +344,7 @@ class Collocation:
         """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
         return self.linearised(self.parts(z), out)
 
-    def linearised(
-        self, parts: Sequence[Part], out: Array | None = None
-    ) -> tuple[Array, Array]:
+    def linearised(self, parts: Sequence[Part], out: Array | None = None) -> tuple[Array, Array]:
         """The same where the experiments are, at the memory as it is."""
         values = np.empty(len(self.jacobian_structure[1])) if out is None else out
         columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)

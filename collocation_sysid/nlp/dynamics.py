@@ -144,7 +144,7 @@ class Dynamics:
 
     @property
     def state_weights(self) -> Array:
-        """(N, reach + 1) p, and that of a given start: nothing is evaluated there but its stress."""
+        """(N, reach + 1) p, and that of a given start, where only a stress is evaluated."""
         weights = self.tables.p.copy()
         weights[: self.first_row, 0] = 1.0
         return weights
