@@ -154,7 +154,7 @@ class Dynamics:
 
     @property
     def state_weights(self) -> Array:
-        """(N, reach + 1) p, and that of a given start: only its stress is evaluated there."""
+        """(N, reach + 1) p, and that of a given start, where only a stress is evaluated."""
         weights = self.tables.p.copy()
         weights[: self.first_row, 0] = 1.0
         return weights
