@@ -41,7 +41,7 @@ def problem_file() -> str:
         "TOML, in SI units with the unit in the key; unknown keys are refused. A key without a "
         "default and without “optional” has to be given. `collocation-sysid new NAME` writes a "
         "commented file, `collocation-sysid schema` prints this as JSON schema for editors.",
-        *(part for table in _tables("", schema, schema["$defs"]) for part in table),
+        *dict.fromkeys("\n\n".join(t) for t in _tables("", schema, schema["$defs"])),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -53,8 +53,7 @@ def _tables(name: str, table: Schema, known: Schema, listed: bool = False) -> It
     for key, entry in table.get("properties", {}).items():
         where = f"{name}.{key}".lstrip(".")
         inner += [(where, each, many) for each, many in _models(entry, known)]
-        default = f"`{_toml(entry['default'])}`" if entry.get("default") is not None else ""
-        default = default or ("" if key in required else "optional")
+        default = "" if key in required else _default(entry)
         said = " ".join(entry.get("description", "").split())
         rows.append(f"| `{key}` | {_kind(entry, known)} | {default} | {_cell(said)} |")
     title = f"`[[{name}]]`" if listed else f"`[{name}]`"
@@ -67,6 +66,11 @@ def _tables(name: str, table: Schema, known: Schema, listed: bool = False) -> It
         yield from _tables(where, each, known, many)
 
 
+def _default(entry: Schema) -> str:
+    value = entry.get("default")
+    return "optional" if value is None or isinstance(value, dict) else f"`{_toml(value)}`"
+
+
 def _models(entry: Schema, known: Schema, listed: bool = False) -> Iterator[tuple[Schema, bool]]:
     """Tables that a value may be, and whether there may be several."""
     if "$ref" in entry:
@@ -74,6 +78,8 @@ def _models(entry: Schema, known: Schema, listed: bool = False) -> Iterator[tupl
         if "properties" in found:
             yield found, listed
         return
+    if "properties" in entry:
+        yield entry, listed
     for each in (*entry.get("anyOf", ()), *entry.get("oneOf", ())):
         yield from _models(each, known, listed)
     if "items" in entry:
@@ -104,6 +110,8 @@ def _kind(entry: Schema, known: Schema) -> str:
 def _toml(value: Any) -> str:
     if isinstance(value, str):
         return f'"{value}"'
+    if isinstance(value, tuple):
+        value = list(value)
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 

@@ -94,6 +94,8 @@ RESULTS = [
     of_result("another's", whole('{"schema": 7, "answer": 42}')),
     of_result("deep", whole("[" * 100_000)),
     of_result("digits", whole('{"fit": ' + "9" * 5000 + "}")),
+]
+ENTRIES = [
     of_result("no parameters", entry(None, "parameters")),
     of_result("fit of another kind", entry([1], "fit")),
     of_result("text for a number", entry("x", "parameters", "mu_pa", "value")),
@@ -123,6 +125,13 @@ def test_every_reader_refuses_a_damaged_result(run: Path, tmp_path: Path, damage
     refused("animate", run, "--to", tmp_path / "film.gif")
     refused("refine", run)
     assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize("damage", ENTRIES)
+def test_the_page_refuses_entries_of_another_kind(run: Path, damage: Damage):
+    damage(run)
+    assert "damaged" in refused("report", run)
+    assert not (run / "report.html").exists()
 
 
 @pytest.mark.parametrize("damage", ARRAYS)
