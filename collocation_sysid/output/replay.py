@@ -234,7 +234,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
         if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
             raise ValueError(f"{key} holds numbers that are not finite")
-        if kinds == "f" and np.nanmax(np.abs(array), initial=0.0) > LARGEST:
+        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
             raise ValueError(f"{key} holds numbers above {LARGEST:g}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
