@@ -25,6 +25,7 @@ from .rollout import Rollout
 from .run import Run
 from .statistics.numerical import Refinement
 from .statistics.places import Place
+from .statistics.scale import relative_sentence
 from .statistics.uncertainty import Estimate
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
@@ -139,7 +140,8 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [parameter_table(finished), *_damping(finished), *_numerical(finished)]
+    parts += [parameter_table(finished), *_damping(finished), *_scale(finished)]
+    parts += _numerical(finished)
     parts += [*_verdict(finished), *_nuisance(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
@@ -226,6 +228,12 @@ def _damping(finished: Run) -> list[Text]:
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     said = [law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws]
     return [Text(f"{GAMMA_R.symbol} is that of damping = {' and '.join(said)}")] if laws else []
+
+
+def _scale(finished: Run) -> list[Text]:
+    """What the moduli rest on, where nothing else sets their scale."""
+    said = relative_sentence(finished.problem.experiments, finished.problem.parameters)
+    return [] if said is None else [Text(said)]
 
 
 def _guess(item: Parameter) -> str:

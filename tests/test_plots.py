@@ -216,6 +216,12 @@ def test_sparsity_shows_the_first_blocks_below_the_diagonal():
     assert (blocks[(lag < -1) | (lag > 3)] == 0).all()
 
 
+def test_sparsity_needs_few_of_the_timesteps():
+    solution = solved()
+    jacobian_sparsity(solution.collocation, solution.z)
+    assert "jacobian_structure" not in vars(solution.collocation)
+
+
 def test_sparsity_shows_the_mesh_graph_of_one_block():
     solution = solved()
     segment = solution.collocation.segments[0]

@@ -2,14 +2,49 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
-from problems_small import EDGE_M, GUESS, IDEAL, TRUTH, as_theta, box, nodes_where, vertex_markers
+import pytest
+from problems_small import (
+    EDGE_M,
+    GUESS,
+    IDEAL,
+    TRUTH,
+    as_theta,
+    box,
+    hung_cube,
+    nodes_where,
+    vertex_markers,
+)
 from scipy.optimize import brentq
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
+import collocation_sysid as cs
+from collocation_sysid.check.derivatives import derivative_errors
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import (
+    Experiment,
+    Grasp,
+    Nuisance,
+    PoseSequence,
+    displaced_axes,
+    read_displacement,
+)
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.shooting import Shooting
+from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.dynamics import Dynamics
+from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.rest import rest_state
 from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.rollout import Rollout
+from collocation_sysid.run import run
+from collocation_sysid.statistics.stillness import stillness_notes
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])
@@ -105,3 +140,185 @@ def test_a_large_step_of_a_platen_is_taken_in_parts():
 
 def measured(experiment: Experiment, values=TRUTH) -> Experiment:
     return with_markers(experiment, simulate(experiment, values).markers_m)
+
+
+def noisy(experiment: Experiment, sigma_m: float = 1e-4) -> Experiment:
+    found = measured(experiment)
+    rng = np.random.default_rng(1)
+    tracks = found.markers.positions_m
+    return with_markers(found, tracks + sigma_m * rng.normal(size=tracks.shape))
+
+
+ELASTIC_ONLY = Parameters(
+    (*GUESS.items[:2], *(replace(i, guess=TRUTH[i.name], fixed=True) for i in GUESS.items[2:]))
+)
+HANGING = (0.0, 0.0, -9.81)
+
+
+def test_interior_point_reduced_space_and_shooting_find_the_same_static_optimum():
+    collocation = Collocation([noisy(block("xyz", gravity_m_s2=HANGING))], ELASTIC_ONLY)
+    found = [
+        method(collocation).parameters for method in (ReducedSpace(), InteriorPoint(), Shooting())
+    ]
+    for other in found[1:]:
+        assert other == pytest.approx(found[0], rel=1e-6)
+
+
+def test_static_and_dynamic_experiments_share_their_parameters():
+    static = noisy(block("xyz", gravity_m_s2=HANGING))
+    moving = noisy(hung_cube(6))
+    collocation = Collocation([static, moving], GUESS)
+    found = ReducedSpace()(collocation).parameters
+    assert InteriorPoint()(collocation).parameters["mu_pa"] == pytest.approx(
+        found["mu_pa"], rel=1e-5
+    )
+    assert found["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=0.05)
+    assert found["gamma_r_s"] == pytest.approx(TRUTH["gamma_r_s"], rel=0.3)
+
+
+@pytest.mark.parametrize("platen", ["z", "xyz"])
+def test_derivatives_of_static_experiments_are_those_of_differences(platen):
+    experiment = measured(block(platen, gravity_m_s2=HANGING))
+    collocation = Collocation([experiment], GUESS, explicit_grasps=platen == "z")
+    z, _ = initial_variables(collocation)
+    assert max(derivative_errors(collocation, z)) < 1e-6
+
+
+def test_the_zero_of_a_displacement_is_found_with_its_derivatives():
+    true, experiment = 0.5e-3, block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3))
+    top = experiment.grasps[1]
+    shifted = replace(top, poses=top.poses.shifted([0.0, 0.0, true]))
+    tracks = measured(replace(experiment, grasps=replaced(experiment.grasps, shifted))).markers
+    unsure = replaced(experiment.grasps, replace(top, zero="z"))
+    seen = with_markers(replace(experiment, grasps=unsure), tracks.positions_m)
+    collocation = Collocation([seen], ELASTIC_ONLY.with_guess(TRUTH))
+    z, _ = initial_variables(collocation)
+    assert max(derivative_errors(collocation, z)) < 1e-6
+    solution = ReducedSpace()(collocation)
+    (phi,) = [part.phi for part in collocation.parts(solution.z)]
+    assert collocation.segments[0].nuisance.names == ("block: zero of grasp 2, z [m]",)
+    # The prior, about zero, has its say beside markers of a millimetre.
+    assert phi[0] * 1e-3 == pytest.approx(true, rel=0.1)
+
+
+def replaced(grasps, top):
+    return (grasps[0], top, *grasps[2:])
+
+
+def test_a_static_problem_tells_nothing_of_damping_before_and_after():
+    problem = cs.Problem([noisy(block("xyz", gravity_m_s2=HANGING))], parameters=GUESS)
+    (note,) = stillness_notes(problem.experiments, GUESS)
+    assert note.startswith("'block' is static: no information on damping; fix gamma_r_s and")
+    found = run(problem)
+    assert found.estimates["gamma_r_s"].std_error is None
+    assert "these data do not tell gamma_r_s and gamma_m_1_s" in found.trust.reasons
+    assert isinstance(found.rollouts["block"], Rollout)
+    assert found.rollouts["block"].rms_m == pytest.approx(found.solution.rms_m, rel=1e-6)
+
+
+def test_a_held_block_relaxes_as_the_standard_linear_solid():
+    share, tau_s = 0.5, 2.0
+    t_s = np.array([0.0, 0.3, 1.0, 2.5, 7.0])
+    body = Body(box_mesh((EDGE_M,) * 3, (1, 1, 1)), density_kg_m3=30.0, prony=["prony_1"])
+    everywhere = Grasp(np.arange(len(body.nodes_m)), pressed(t_s, 0.0 * t_s))
+    free = Experiment(
+        body,
+        t_s,
+        [everywhere],
+        vertex_markers(body, [0], t_s),
+        gravity_m_s2=(0.0, 0.0, 0.0),
+        kind="static",
+        loaded_since_s=0.0,
+        start="equilibrium",
+    )
+    values = TRUTH | {"prony_1.share": share, "prony_1.tau_s": tau_s}
+    theta = body.theta(values)
+    x = np.tile((body.nodes_m * [1.0, 1.0, 0.8]).ravel(), (len(t_s), 1))
+    dynamics = Dynamics.of(free, "midpoint")
+    carried = dynamics.carried(dynamics.history(x, theta))
+    force = body.force(x, 0 * x, theta, carried=carried)
+    relaxed = body.force(x[:1], 0 * x[:1], theta)
+    expected = (1 + share * np.exp(-t_s / tau_s))[:, None] * relaxed
+    np.testing.assert_allclose(force, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
+    body = Body(box_mesh((EDGE_M,) * 3, (2, 2, 2)), density_kg_m3=30.0, prony=["prony_1"])
+    values = TRUTH | {"prony_1.share": 0.5, "prony_1.tau_s": 2.0}
+    t_s = np.array([0.0, 0.1, 1.0, 40.0])
+    z_m = np.array([0.0, -0.02, -0.02, -0.02])
+    pressing = block("xyz", t_s, z_m, body=body, gravity_m_s2=(0.0, 0.0, -9.81))
+    x = simulate(pressing, values).positions_m
+    rest = rest_state(pressing, body.theta(values), 40.0).reshape(-1, 3)
+    off = np.abs(x[1:] - rest).max(axis=(1, 2))
+    # Over the last interval the stress is taken to fall evenly.
+    assert off[2] < 0.05 * off[1] < 0.05 * off[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "slow"}, "kind is 'slow'; expected one of dynamic, static"),
+        ({"start": "undeformed"}, "start is 'undeformed', but the experiment is static"),
+        ({"start_rule": "paper"}, "start_rule is 'paper', but the experiment is static"),
+        ({"t_s": TIMES[[0, 2, 1, 3]]}, "row 3: t_s: t_s = 1 follows 1.5; time must increase"),
+        ({"markers": None}, "nothing is measured: there are no markers and no wrench"),
+    ],
+)
+def test_static_experiments_that_make_no_sense_are_refused(change, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        replace(block(), **change)
+
+
+@pytest.mark.parametrize(
+    ("kept", "free"),
+    [
+        ([1], "it can move along x and move along y and turn about z"),
+        ([1, 2], "it can move along y"),
+        ([2, 3], "it can move along z"),
+        ([], "it can move and turn as a whole"),
+    ],
+)
+def test_the_motion_that_is_left_free_is_named(kept, free):
+    experiment = block()
+    with pytest.raises(InputError, match=re.escape(free)):
+        replace(experiment, grasps=[experiment.grasps[k] for k in kept])
+
+
+def test_grasps_may_share_nodes_along_different_axes_only():
+    experiment = block()
+    top = experiment.grasps[1]
+    replace(experiment, grasps=(*experiment.grasps[:3], replace(experiment.grasps[3], axes="y")))
+    with pytest.raises(InputError, match="held by the grasps 2 and 5 at the same time along z"):
+        replace(experiment, grasps=(*experiment.grasps, replace(top, axes="xz")))
+    with pytest.raises(InputError, match="axes of a grasp is 'zx'; expected one of x, y, z, xy"):
+        replace(top, axes="zx")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t_s,z\n0,0\n1,1\n", "the column z names no unit: call it z_m or z_mm"),
+        ("t_s,q_m\n0,0\n", "expected t_s and any of x_m, y_m, z_m (or _cm, _mm, _in)"),
+        ("t_s,z_m,z_mm\n0,0,0\n", "each axis once"),
+        ("z_m\n0\n", "expected t_s and any of"),
+        ("t_s,z_m\n0,0\n0,1\n", "line 3: t_s = 0 follows 0; time must increase"),
+        ("t_s,z_m\n0,\n", "line 2"),
+        ("t_s\n0\n", "expected t_s and any of"),
+    ],
+)
+def test_displacements_that_make_no_sense_are_refused(tmp_path, text, message):
+    file = tmp_path / "crosshead.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_displacement(file)
+    assert message in str(caught.value)
+
+
+def test_a_displacement_is_a_shift_in_metres(tmp_path):
+    file = tmp_path / "crosshead.csv"
+    file.write_text("t_s,z_mm,x_m\n0,0,0\n2,-3,0.1\n", encoding="utf-8")
+    poses = read_displacement(file)
+    np.testing.assert_allclose(poses.positions_m, [[0, 0, 0], [0.1, 0, -3e-3]])
+    np.testing.assert_array_equal(poses.quaternions_xyzw[:, 3], 1.0)
+    assert displaced_axes(file) == "xz"

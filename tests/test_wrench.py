@@ -73,7 +73,7 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(experiment: Experi
     (part,) = collocation.parts_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
     dynamics = part.segment.dynamics
-    mass = dynamics.mass_kg[0, ::3]
+    mass = dynamics.mass.row(0, theta)[::3]
     stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
     acceleration = stencil[grid + part.segment.sensors[0].late].reshape(len(grid), -1, 3)
     pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
@@ -89,7 +89,7 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     collocation = Collocation([experiment], Parameters.of(TRUTH | {"gamma_m_1_s": 0.0}))
     (part,) = collocation.parts_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
-    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass_kg[0, ::3]
+    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass.row(0, theta)[::3]
     at = x.reshape(len(x), -1, 3)
     second = (at[2:] - 2 * at[1:-1] + at[:-2]) / dynamics.step_s**2
     arm = at[1:-1] - [0.1, 0.2, -0.1]

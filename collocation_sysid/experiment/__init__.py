@@ -8,7 +8,7 @@ from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance
-from .pose_files import read_displacement, read_poses
+from .pose_files import displaced_axes, read_displacement, read_poses
 from .poses import PoseSequence
 from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
@@ -32,6 +32,7 @@ __all__ = [
     "Wrench",
     "align",
     "align_to_template",
+    "displaced_axes",
     "fit_poses",
     "held_dofs",
     "held_nodes",

@@ -206,9 +206,16 @@ class Experiment:
         return positions.reshape(len(positions), -1)[:, self.held_dofs]
 
     def node_mass_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
+        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg].
+
+        Of the body's densities as stated.
+        """
+        return self.body.node_mass + self.tied_mass_kg(t_s)
+
+    def tied_mass_kg(self, t_s: ArrayLike) -> Array:
+        """Return the mass of all point masses that each node carries at `t_s` (T,), (T, n) [kg]."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
-        mass = np.broadcast_to(self.body.node_mass, (len(times), n))
+        mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
             mass = mass + point.at_nodes(times, n)
         return mass
@@ -220,6 +227,15 @@ class Experiment:
         for force in self.forces:
             total = total + force.at_nodes(times, n)
         return total
+
+    @property
+    def knows_a_force(self) -> bool:
+        """Whether a known mass or force, or a measured one, sets the scale of all forces."""
+        if any(grasp.wrench is not None for grasp in self.grasps):
+            return True
+        tied = np.repeat(self.tied_mass_kg(self.t_s), 3, axis=1)
+        forces = self.node_forces_n(self.t_s).reshape(tied.shape)
+        return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
     def pattern(self) -> SymmetricPattern:

@@ -46,6 +46,9 @@ class Grasp:
     axes : str
         Along which axes of the world they are held, such as "z" for a platen on which the body
         slides; "xyz" by default.
+    zero : str
+        Along which axes the zero of the poses is known no better than the experiment's `nuisance`
+        says, as that of a test bench's crosshead; along none by default.
     wrench : Wrench, optional
         What it was measured to give the body.
     """
@@ -58,6 +61,7 @@ class Grasp:
     sigma_rad: float | None
     selection: Selection | None
     axes: str
+    zero: str
     wrench: Wrench | None
 
     def __init__(
@@ -70,14 +74,18 @@ class Grasp:
         sigma_rad: float | None = None,
         selection: Selection | None = None,
         axes: str = "xyz",
+        zero: str = "",
         wrench: Wrench | None = None,
     ) -> None:
         if not from_s <= until_s:
             raise InputError(
                 f"a grasp holds from {from_s:g} s until {until_s:g} s; expected from_s <= until_s"
             )
-        if axes not in AXES:
-            raise InputError(f"axes of a grasp is {axes!r}; expected one of {', '.join(AXES)}")
+        for name, given, known in (("axes", axes, AXES), ("zero", zero, ("", *AXES))):
+            if given not in known:
+                raise InputError(
+                    f"{name} of a grasp is {given!r}; expected one of {', '.join(AXES)}"
+                )
         held = some_nodes(nodes, "the grasp")
         for name, value in (("sigma_m", sigma_m), ("sigma_rad", sigma_rad)):
             if value is not None and not value >= 0:
@@ -91,6 +99,7 @@ class Grasp:
             sigma_rad=sigma_rad,
             selection=held if isinstance(held, Selection) else selection,
             axes=axes,
+            zero="".join(axis for axis in zero if axis in axes),
             wrench=wrench,
         )
 

@@ -31,6 +31,9 @@ class Nuisance:
         A small rigid motion, constant in time, by which the undeformed body is off in the grasp:
         x = U_t H X. It is taken as none where the start is not an equilibrium: the state that is
         given then tells where the body is.
+    displacement_zero_m : float or None
+        By how much displacements are off, constant in time, along each axis of a grasp whose zero
+        is not known.
     pose_shift_m, pose_turn_rad : float or None
         A small rigid motion, constant in time, by which grasps and body are off in the frame of
         the markers, such as that of cameras. It turns the body against gravity.
@@ -54,6 +57,7 @@ class Nuisance:
     gravity_rad: float | None = DEGREE
     hand_eye_m: float | None = 1e-3
     hand_eye_rad: float | None = 0.5 * DEGREE
+    displacement_zero_m: float | None = 1e-4
     pose_shift_m: float | None = None
     pose_turn_rad: float | None = None
     camera_offset_m: float | None = None

@@ -87,26 +87,40 @@ def read_displacement(path: str | Path) -> PoseSequence:
         If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
         does not increase; the line is named.
     """
-    table = read_grid(path, decode(read_bytes(path), path))
-    axes = [name for name in table.columns if name != "t_s"]
-    known = {f"{axis}_{unit}": (axis, unit) for unit in METRES_PER_UNIT for axis in "xyz"}
-    moved = [known[name][0] for name in axes if name in known]
-    bare = [name for name in axes if name in tuple("xyz")]
-    if table.columns.count("t_s") != 1 or not axes or len(set(moved)) != len(axes):
-        hint = f"; the column {bare[0]} names no unit: call it {bare[0]}_m or {bare[0]}_mm"
-        raise InputError(
-            f"the columns are {listed(table.columns)}; expected t_s and any of x_m, y_m, z_m (or "
-            f"_cm, _mm, _in), each axis once{hint if bare else ''}",
-            path,
-            "line 1",
-        )
+    table, axes = _shifts(path)
     positions_m = np.zeros((len(table.rows), 3))
     for name, values in zip(axes, _columns(table, axes).T, strict=True):
-        axis, unit = known[name]
+        axis, _, unit = name.partition("_")
         positions_m[:, "xyz".index(axis)] = values * METRES_PER_UNIT[unit]
     unturned = np.tile([0.0, 0.0, 0.0, 1.0], (len(positions_m), 1))
     lines = [f"line {line}" for line in table.lines]
     return _sequence(path, _columns(table, ["t_s"])[:, 0], positions_m, unturned, lines)
+
+
+def displaced_axes(path: str | Path) -> str:
+    """Return along which axes a file tells shifts, such as "z"."""
+    named = {name[0] for name in _shifts(path)[1]}
+    return "".join(axis for axis in "xyz" if axis in named)
+
+
+def _shifts(path: str | Path) -> tuple[Grid, list[str]]:
+    """A file of shifts, and its columns but the time."""
+    table = read_grid(path, decode(read_bytes(path), path))
+    axes = [name for name in table.columns if name != "t_s"]
+    known = {f"{axis}_{unit}" for unit in METRES_PER_UNIT for axis in "xyz"}
+    moved = [name[0] for name in axes if name in known]
+    bare = [name for name in axes if name in tuple("xyz")]
+    if table.columns.count("t_s") != 1 or not axes or len(set(moved)) != len(axes):
+        hints = [
+            f"; the column {name} names no unit: call it {name}_m or {name}_mm" for name in bare
+        ]
+        raise InputError(
+            f"the columns are {listed(table.columns)}; expected t_s and any of x_m, y_m, z_m (or "
+            f"_cm, _mm, _in), each axis once{''.join(hints[:1])}",
+            path,
+            "line 1",
+        )
+    return table, axes
 
 
 def _sequence(

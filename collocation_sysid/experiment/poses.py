@@ -121,6 +121,10 @@ class PoseSequence:
             quaternions_xyzw=(rotations * first._rotations[0]).as_quat(),
         )
 
+    def shifted(self, by_m: ArrayLike) -> PoseSequence:
+        """Return the poses with a constant (3,) added to their positions."""
+        return replace(self, positions_m=self.positions_m + np.asarray(by_m))
+
     def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return the poses at the times `t_s` (k,).
 

@@ -65,13 +65,19 @@ def refined(body: Body) -> Body:
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
         Region(
-            part.name, inside.ravel(), part.material, part.density_kg_m3, part.damping, part.prony
+            part.name,
+            inside.ravel(),
+            part.material,
+            part.density_kg_m3 if part.own_density else None,
+            part.damping,
+            part.prony,
         )
         for part, inside in zip(body.parts, cells, strict=True)
         if part.name
     ]
-    rest = body.parts[0]
-    return type(body)(
+    # A region without a density of its own has the body's, whether any cell is left for it or not.
+    rest = next((part for part in body.parts if not part.own_density), body.parts[0])
+    finer = type(body)(
         split_in_eight(body.mesh),
         rest.material,
         rest.density_kg_m3,
@@ -82,6 +88,7 @@ def refined(body: Body) -> Body:
         evaluator=body.evaluator,
         threads=body.threads,
     )
+    return finer.with_free_densities([part.name for part in body.parts if part.free_density])
 
 
 def refined_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:

@@ -414,11 +414,12 @@ class Collocation:
         for segment in self.segments:
             layout, first = segment.hessian_layout, segment.first
             indptr.append(used + layout.phi_indptr[1:])
-            of_x = layout.phi_indices < segment.variables
             # In z all φ stand after all x.
             first_phi = first.phi - self.nq + self.variables - self.nphi
-            shift = np.where(of_x, first.x, first_phi - segment.variables)
-            indices.append(layout.phi_indices + shift)
+            ends = np.array([self.nq, self.nq + segment.variables])
+            shifts = np.array([0, first.x - self.nq, first_phi - ends[1]])
+            kind = np.searchsorted(ends, layout.phi_indices, side="right")
+            indices.append(layout.phi_indices + shifts[kind])
             used += len(layout.phi_indices)
         return np.concatenate(indptr), np.concatenate(indices)
 
@@ -516,7 +517,7 @@ class Collocation:
         for part in self.parts(z):
             dynamics = part.setting.dynamics
             total = dynamics.force(part.x, part.setting.theta)
-            external = dynamics.evaluated.external_n
+            external = dynamics.evaluated.external_n(part.setting.theta)
             for force in (total - external, external):
                 largest = max(largest, float(np.abs(force[:, part.segment.free_dofs]).max()))
         return largest

@@ -13,7 +13,7 @@ from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
 from ..fem.memory import Carried
 from ..fem.pattern import SymmetricPattern
-from .forces import Forces, per_dof
+from .forces import Forces, Mass
 from .memory import History, Recursion, recursions_of
 from .schemes import QUASI_STATIC, Scheme, as_scheme
 
@@ -54,7 +54,7 @@ class Dynamics:
     tables : Tables
     t_s : (N,) grid times
     first_row : int
-    mass_kg : (N, 3n) of every dof in each row, point masses included
+    mass : Mass of every dof in each row
     forces : Forces at each row's evaluation
     taken : (N, 3n) bool
         Held dofs that are free at other times: while one is held, the grasp takes what force
@@ -74,7 +74,7 @@ class Dynamics:
     tables: Tables
     t_s: Array
     first_row: int
-    mass_kg: Array
+    mass: Mass
     forces: Forces
     taken: NDArray[np.bool_]
     start_velocity_m_s: Array
@@ -102,7 +102,7 @@ class Dynamics:
             tables=tables,
             t_s=t_s,
             first_row=first_row,
-            mass_kg=per_dof(experiment.node_mass_kg(t_s)),
+            mass=Mass.of(experiment, t_s),
             forces=Forces.of(experiment, evaluated_s),
             taken=_taken(experiment, t_s),
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
@@ -121,7 +121,7 @@ class Dynamics:
             self,
             tables=Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
             t_s=self.t_s[:rows],
-            mass_kg=self.mass_kg[:rows],
+            mass=self.mass.rows(slice(rows)),
             forces=self.forces.rows(slice(rows)),
             taken=self.taken[:rows],
         )
@@ -154,7 +154,7 @@ class Dynamics:
 
     @property
     def state_weights(self) -> Array:
-        """(N, reach + 1) p, and that of a given start: only its stress is evaluated there."""
+        """(N, reach + 1) p, and that of a given start, where only a stress is evaluated."""
         weights = self.tables.p.copy()
         weights[: self.first_row, 0] = 1.0
         return weights
@@ -206,7 +206,7 @@ class Dynamics:
 
     def residual(self, x: Array, theta: Array) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
-        return self.assemble_residual(x, self.force(x, theta))
+        return self.assemble_residual(x, theta, self.force(x, theta))
 
     @property
     def evaluated(self) -> Forces:
@@ -218,22 +218,23 @@ class Dynamics:
         carried = self.carried(self.history(x, theta))
         return self.evaluated.total(*self.evaluation_states(x), theta, carried)
 
-    def assemble_residual(self, x: Array, force: Array) -> Array:
+    def assemble_residual(self, x: Array, theta: Array, force: Array) -> Array:
         """The same from the forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
         total[self.first_row :] = force
-        return self.combine(self.tables.w, self.without_taken(total)) - self.inertia(x)
+        inertia = self.mass.at(theta) * self.acceleration(x)
+        return self.combine(self.tables.w, self.without_taken(total)) - inertia
 
     def without_taken(self, rows: Array) -> Array:
         """Forces (N, 3n, …) with those that a passing grasp takes set to zero, in place."""
         rows[self.taken] = 0
         return rows
 
-    def inertia(self, x: Array) -> Array:
-        """Mass times acceleration of every row, (N, 3n) [N]."""
+    def acceleration(self, x: Array) -> Array:
+        """Of every row, (N, 3n) [m/s²]."""
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
-        return acceleration * self.mass_kg
+        return acceleration
 
     def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
         """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""

@@ -1,4 +1,4 @@
-"""All forces on a body at some times: F(ξ, ν, t; θ) = f(ξ, ν; θ) + M g + what is applied.
+"""All forces on a body at some times: F(ξ, ν, t; θ) = f(ξ, ν; θ) + M(θ) g + what is applied.
 
 Whatever acts on the body of an experiment joins here, and nothing else adds forces: the internal
 ones f of its materials and dampings, see `fem.body`, the weight of its mass with what is tied to
@@ -16,7 +16,47 @@ from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Carried
+from ..fem.model import Theta
 from ..fem.pattern import SymmetricPattern
+
+
+@dataclass(frozen=True, eq=False)
+class Mass:
+    """What moves with every dof at T times: M(θ), the body's own and what is tied to it.
+
+    Attributes
+    ----------
+    body : Body
+    tied_kg : (T, 3n)
+    """
+
+    body: Body
+    tied_kg: Array
+
+    @classmethod
+    def of(cls, experiment: Experiment, t_s: ArrayLike) -> Mass:
+        """Of an experiment at the times `t_s` (T,)."""
+        tied = np.repeat(experiment.tied_mass_kg(t_s), 3, axis=1)
+        return cls(experiment.body, compact(tied))
+
+    def rows(self, rows: slice) -> Mass:
+        """The same at some of the times."""
+        return replace(self, tied_kg=self.tied_kg[rows])
+
+    def at(self, theta: Theta) -> Array:
+        """M (T, 3n) [kg]."""
+        return _sum_of_rows(self.body.mass_of_dofs(theta), self.tied_kg)
+
+    @property
+    def tied(self) -> Array | None:
+        """(3n,) or (T, 3n) what is tied; None where nothing is."""
+        if not len(self.tied_kg) or self.tied_kg.strides[0]:
+            return self.tied_kg
+        return self.tied_kg[0] if self.tied_kg[0].any() else None
+
+    def row(self, t: int, theta: Theta) -> Array:
+        """The same (3n,) at one of the times."""
+        return self.body.mass_of_dofs(theta) + self.tied_kg[t]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +70,8 @@ class Forces:
     body : Body
     pattern : SymmetricPattern
         Of the slopes.
-    mass_kg : (T, 3n)
-        What moves with every dof, which gravity pulls at and γ_m damps.
+    mass : Mass
+        What gravity pulls at and γ_m damps.
     gravity_m_s2 : (3,)
     applied_n : (T, 3n)
         Forces on the nodes, wherever these are.
@@ -39,7 +79,7 @@ class Forces:
 
     body: Body
     pattern: SymmetricPattern
-    mass_kg: Array
+    mass: Mass
     gravity_m_s2: Array
     applied_n: Array
 
@@ -50,7 +90,7 @@ class Forces:
         return cls(
             experiment.body,
             experiment.pattern,
-            per_dof(experiment.node_mass_kg(t_s)),
+            Mass.of(experiment, t_s),
             experiment.gravity_m_s2,
             compact(applied.reshape(len(applied), -1)),
         )
@@ -58,13 +98,12 @@ class Forces:
     @classmethod
     def on(cls, body: Body) -> Forces:
         """Those on a body that nothing acts on, at one time."""
-        return cls(
-            body, body.pattern, body.dof_mass[None], np.zeros(3), np.zeros((1, body.pattern.size))
-        )
+        nothing = np.zeros((1, body.pattern.size))
+        return cls(body, body.pattern, Mass(body, nothing), np.zeros(3), nothing)
 
     def rows(self, rows: slice) -> Forces:
         """The same at some of the times."""
-        return replace(self, mass_kg=self.mass_kg[rows], applied_n=self.applied_n[rows])
+        return replace(self, mass=self.mass.rows(rows), applied_n=self.applied_n[rows])
 
     def under_gravity(self, change_m_s2: Array) -> Forces:
         """The same with a constant (3,) added to gravity."""
@@ -78,19 +117,23 @@ class Forces:
 
     def towards(self, other: Forces, share: float) -> Forces:
         """The same with a share of the way to what acts at other times."""
-        mass_kg = self.mass_kg + share * (other.mass_kg - self.mass_kg)
+        tied_kg = self.mass.tied_kg + share * (other.mass.tied_kg - self.mass.tied_kg)
         applied_n = self.applied_n + share * (other.applied_n - self.applied_n)
-        return replace(self, mass_kg=mass_kg, applied_n=applied_n)
+        return replace(self, mass=replace(self.mass, tied_kg=tied_kg), applied_n=applied_n)
 
     @property
-    def external_n(self) -> Array:
+    def _gravity(self) -> Array:
+        """(3n,)."""
+        return np.tile(self.gravity_m_s2, self.body.pattern.size // 3)
+
+    def external_n(self, theta: Theta) -> Array:
         """(T, 3n) those that do not depend on the state."""
-        gravity = np.tile(self.gravity_m_s2, self.body.pattern.size // 3)
-        return self.mass_kg * gravity + self.applied_n
+        return self.mass.at(theta) * self._gravity + self.applied_n
 
     def total(self, xi: Array, nu: Array, theta: Array, carried: Carried | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
-        return self.body.force(xi, nu, theta, self.mass_kg, carried) + self.external_n
+        internal = self.body.force(xi, nu, theta, self.mass.tied, carried)
+        return internal + self.external_n(theta)
 
     def linearise(
         self,
@@ -101,8 +144,10 @@ class Forces:
         carried: Carried | None = None,
     ) -> Linearisation:
         """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
-        at = self.body.linearise(xi, nu, theta, out, self.mass_kg, carried)
-        np.add(at.force, self.external_n, out=at.force)
+        at = self.body.linearise(xi, nu, theta, out, self.mass.tied, carried)
+        np.add(at.force, self.external_n(theta), out=at.force)
+        for density, slope in self.body.mass_slopes.items():
+            at.by_theta[:, :, density] += slope * self._gravity
         return at
 
     @property
@@ -121,8 +166,11 @@ class Forces:
         stress_weights: Array | None = None,
     ) -> Curvature:
         """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
-        mass = self.mass_kg
-        return self.body.curvature(xi, nu, weights, theta, out, mass, carried, stress_weights)
+        tied = self.mass.tied
+        found = self.body.curvature(xi, nu, weights, theta, out, tied, carried, stress_weights)
+        for density, slope in self.body.mass_slopes.items():
+            found.theta[:, density] += weights @ (slope * self._gravity)
+        return found
 
     @property
     def curvature_width(self) -> int:
@@ -130,11 +178,13 @@ class Forces:
         return self.body.curvature_width
 
 
-def per_dof(of_nodes: Array) -> Array:
-    """(T, n) values of nodes as (T, 3n) values of their dofs."""
-    return compact(np.repeat(of_nodes, 3, axis=1))
-
-
 def compact(rows: Array) -> Array:
     """The same rows; where all are equal they take the memory of one."""
     return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
+
+
+def _sum_of_rows(one: Array, rows: Array) -> Array:
+    """(3n,) + (T, 3n), in the memory of one row where all rows are."""
+    if len(rows) and rows.strides[0] == 0:
+        return np.broadcast_to(one + rows[0], rows.shape)
+    return one + rows

@@ -66,6 +66,13 @@ class Grasping:
         rotated = np.zeros((*self._shifts.shape, len(self.nuisance.moving)))
         rotated[..., self._columns] = np.einsum("tgj,gjk->tgk", self._turns, slopes)
         positions = np.einsum("tgj,gj->tg", self._turns, moved) + self._shifts
+        for number, grasp in enumerate(self.experiment.grasps):
+            rows = np.flatnonzero(grasp.holds(self.t_s))
+            for axis, place in zip(grasp.zero, self.nuisance.zero(number), strict=False):
+                along = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
+                column = np.flatnonzero(self.nuisance.moving == place)
+                positions[np.ix_(rows, along)] += self.nuisance.scales[place] * phi[place]
+                rotated[np.ix_(rows, along, column)] = self.nuisance.scales[place]
         rotated[np.isnan(positions)] = 0.0
         return Held(self.dofs, positions, rotated)
 

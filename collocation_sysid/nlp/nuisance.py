@@ -12,6 +12,7 @@ shift of the pose      d (3) [m]
 tilt of gravity        two angles about axes across it [rad]
 turn in the grasp      a_h (3), likewise, about axes of the undeformed body
 shift in the grasp     d_h (3) [m]
+zero of a grasp        of each axis along which a displacement's zero is not known [m]
 tare of a sensor       of each component that it measures [N] or [N m], see `sensor`
 its clock              τ, how much later than its times say it measured [s]
 its lag                T of a first-order low-pass [s]
@@ -37,7 +38,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
-from ..experiment.grasp import held_nodes
+from ..experiment.grasp import Grasp, held_nodes
 from ..experiment.wrench import COMPONENTS, UNITS
 
 # Samples are read between neighbours, up to this many away from the chart's.
@@ -58,6 +59,8 @@ KINDS = (
     "grasp-turn",
     "grasp-shift",
 )
+# Those of a grasp's zero have its number behind them.
+OF_GRASP = "zero"
 # Those of a sensor have its number behind them: "tare 0".
 OF_SENSOR = ("tare", "sensor-time", "sensor-lag", "tool-mass", "tool-centre")
 
@@ -126,12 +129,24 @@ class NuisanceMap:
     @cached_property
     def moving(self) -> NDArray[np.int64]:
         """Positions in φ of what changes the motion: what turns gravity, or moves the grasps."""
-        return self.places("turn", "tilt", "grasp-turn", "grasp-shift")
+        zeros = {kind for kind in self.kinds if kind.startswith(OF_GRASP)}
+        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", *zeros)
 
     @cached_property
     def moves_grasps(self) -> bool:
-        """Whether the body may be off in its grasps."""
-        return len(self.of_grasps) > 0
+        """Whether the body may be off in its grasps, or these in their zero."""
+        return len(np.setdiff1d(self.moving, self.places("turn", "tilt"))) > 0
+
+    def zero(self, number: int) -> NDArray[np.int64]:
+        """Positions in φ of the zeros of a grasp, along its axes in turn."""
+        return self.places(f"{OF_GRASP} {number}")
+
+    def zero_m(self, number: int, grasp: Grasp, phi: Array) -> Array:
+        """(3,) by how much a grasp is off."""
+        found = np.zeros(3)
+        for axis, place in zip(grasp.zero, self.zero(number), strict=False):
+            found["xyz".index(axis)] = phi[place] * self.scales[place]
+        return found
 
     def limits(self, samples: int) -> tuple[Array, Array]:
         """Lowest and highest φ (k,), where samples are read about this many whole ones away."""
@@ -159,6 +174,8 @@ class NuisanceMap:
 
     def carried(self, points_m: Array, phi: Array) -> tuple[Array, Array]:
         """H X of points (m, 3), and its derivatives (m, 3, h) by φ of `of_grasps`."""
+        if not len(self.of_grasps):
+            return points_m, np.zeros((len(points_m), 3, 0))
         own = np.repeat(phi[self.of_grasps, None], len(points_m), axis=1)
         value, first = self._carried.map(len(points_m))(own, points_m.T)
         slopes = first.full().reshape(3, len(points_m), -1).transpose(1, 0, 2)
@@ -166,6 +183,8 @@ class NuisanceMap:
 
     def carried_curvature(self, points_m: Array, phi: Array) -> Array:
         """Second derivatives (m, 3, h, h) of H X by φ of `of_grasps`."""
+        if not len(self.of_grasps):
+            return np.zeros((len(points_m), 3, 0, 0))
         own, count = phi[self.of_grasps], len(points_m)
         second = self._carried_curvature.map(count)(
             np.repeat(own[:, None], count, axis=1), points_m.T
@@ -254,9 +273,13 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
     add("shift", "shift of the pose", "m", "x y z", wanted.pose_shift_m)
     if np.any(experiment.gravity_m_s2):
         add("tilt", "tilt of gravity", "rad", "first second", wanted.gravity_rad)
-    if experiment.grasps and experiment.start == "equilibrium":
+    # Nothing but what markers see tells how the body is off in its grasp.
+    if experiment.grasps and experiment.start == "equilibrium" and markers.names:
         add("grasp-turn", "turn in the grasp", "rad", "x y z", wanted.hand_eye_rad)
         add("grasp-shift", "shift in the grasp", "m", "x y z", wanted.hand_eye_m)
+    for k, grasp in enumerate(experiment.grasps):
+        which = f"zero of grasp {k + 1}"
+        add(f"{OF_GRASP} {k}", which, "m", " ".join(grasp.zero), wanted.displacement_zero_m)
     return entries + _sensor_entries(experiment)
 
 

@@ -274,7 +274,7 @@ class Segment:
         theta, last = self.constants.theta(self.parameters.guess_q), dynamics.rows - 1
         at_last = dynamics.forces.rows(slice(last, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest), theta)
-        last, pattern = Row.of(dynamics, last), self.pattern
+        last, pattern = Row.of(dynamics, last, theta), self.pattern
         block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
@@ -328,7 +328,10 @@ class Segment:
         grasps = self.experiment.grasps
         if self.nuisance.moves_grasps:
             motion = self.nuisance.in_grasp(phi)
-            grasps = tuple(replace(g, poses=g.poses.after(motion)) for g in grasps)
+            grasps = tuple(
+                replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
+                for k, g in enumerate(grasps)
+            )
         gravity = self.nuisance.gravity(phi)[0]
         return replace(self.experiment, gravity_m_s2=gravity, grasps=grasps)
 
@@ -404,24 +407,34 @@ class Segment:
         return blocks
 
     @cached_property
-    def _jacobian_constants(self) -> tuple[Index, Array, Index]:
-        """Positions and values of the inertia, and positions of the unit grasp entries."""
+    def _jacobian_constants(self) -> tuple[Index, list[tuple[Index, Array]], Index]:
+        """Positions of the inertia, its rows and coefficients, and positions of unit entries."""
         first = self.dynamics.first_row
         row_place = np.searchsorted(self.row_dofs, self.free_dofs)
-        mass = self.dynamics.mass_kg[:, self.free_dofs] * self.length_m / self.force_n
-        positions, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+        positions, inertia = [np.zeros(0, dtype=np.int64)], []
         for lag in range(self.dynamics.reach + 1):
             coefficient = self.dynamics.inertia_coefficient(lag)
             rows = np.arange(max(first, lag), self.grid_rows)
             rows = rows[coefficient[rows] != 0]
             places = self.jacobian.positions(rows - lag, lag, row_place, self.free_dofs)
             positions.append(places.ravel())
-            values.append((coefficient[rows, None] * mass[rows]).ravel())
+            inertia.append((rows, coefficient[rows, None]))
         grasps = [np.zeros(0, dtype=np.int64)]
         if self.grasps_have_rows:
             rows = np.arange(first, self.grid_rows)
             grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
-        return np.concatenate(positions), np.concatenate(values), np.concatenate(grasps)
+        return np.concatenate(positions), inertia, np.concatenate(grasps)
+
+    def _inertia(self, theta: Array) -> Array:
+        """Values of the inertia in ∂c/∂x."""
+        mass = self.dynamics.mass.at(theta)[:, self.free_dofs] * self.length_m / self.force_n
+        parts = [(of_row * mass[rows]).ravel() for rows, of_row in self._jacobian_constants[1]]
+        return np.concatenate([np.zeros(0), *parts])
+
+    @cached_property
+    def _known_inertia(self) -> Array | None:
+        """The same where it does not depend on θ."""
+        return None if self.body.mass_slopes else self._inertia(np.zeros(0))
 
     @cached_property
     def _passing(self) -> PassingGrasps:
@@ -452,33 +465,41 @@ class Segment:
         dynamics = setting.dynamics
         forces = dynamics.linearise(x, setting.theta, self.linearisation_rows)
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
-        positions, inertia, grasps = self._jacobian_constants
-        values[positions] += inertia
+        positions, _, grasps = self._jacobian_constants
+        known = self._known_inertia
+        values[positions] += self._inertia(setting.theta) if known is None else known
         skew = skew_values(self.pattern, forces.by_position_skew)
         if skew.size:
             self._skew_jacobian.fill(values, skew, skew, self.body.threads)
         self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
         values[grasps] = 1.0
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
-        weighed = dynamics.evaluated.mass_kg
+        weighed = dynamics.evaluated.mass.at(setting.theta)
         by_p[dynamics.first_row :] = setting.force_slopes(forces.by_theta, weighed)
-        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p)) / self.force_n
+        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p))
+        if self.body.mass_slopes:
+            by_p -= setting.inertia_slopes(dynamics.acceleration(x), slice(None))
+        by_p /= self.force_n
         dynamics.without_taken(by_p)
         by_p[:, self.held_dofs] = 0
         if setting.held.moves:
             by_p[:, setting.held.dofs, self.nq :] -= setting.held.by_phi / self.length_m
         by_p = by_p[dynamics.first_row :, self.row_dofs]
-        rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
+        rows = self._rows(x, dynamics.assemble_residual(x, setting.theta, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
-    def force_weights(self, multipliers: Array) -> Array:
-        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
+    def _row_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the rows in newtons."""
         dynamics = self.dynamics
         row_weights = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
         row_weights[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
         row_weights[:, self.held_dofs] = 0
-        dynamics.without_taken(row_weights)
+        return dynamics.without_taken(row_weights)
+
+    def force_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
+        dynamics, row_weights = self.dynamics, self._row_weights(multipliers)
         return dynamics.without_taken(dynamics.combine_transposed(dynamics.tables.w, row_weights))
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
@@ -598,13 +619,15 @@ class Segment:
         by_nu = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
         by_theta = dynamics.combine_transposed(dynamics.state_weights, by_xi)
         by_theta += dynamics.combine_transposed(dynamics.tables.q, by_nu)
+        by_theta -= (by_inertia := self._inertia_curvature(x, setting, multipliers))[0]
         of_band[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
         if layout.band is not None:
             values[: layout.x_entries] = 0
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
-        pull = (weights * dynamics.forces.mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
+        mass_kg = dynamics.forces.mass.at(setting.theta)
+        pull = (weights * mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
         by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
@@ -617,9 +640,12 @@ class Segment:
             by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
                 phi, of_goals
             )
+        if layout.tilt.size:
+            values[layout.tilt] = self._weight_curvature(weights, setting)
         by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
-        theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
+        theta_theta = curvature.theta_theta.sum(axis=0)
+        theta_gradient = curvature.theta.sum(axis=0) - by_inertia[1]
         by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
         return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
 
@@ -640,6 +666,34 @@ class Segment:
         return curvature
 
     @cached_property
+    def _tilts(self) -> Index:
+        """Positions in φ of what may turn gravity, where it pulls at a mass that is estimated."""
+        return self.nuisance.moving if self.body.mass_slopes else np.zeros(0, dtype=np.int64)
+
+    def _weight_curvature(self, weights: Array, setting: Setting) -> Array:
+        """Second derivatives of weights · M g by the φ that turn gravity, and q."""
+        by_q = np.zeros((3, self.nq))
+        for density, slope in self.body.mass_slopes.items():
+            pull = (weights.sum(axis=0) * slope).reshape(-1, 3).sum(axis=0)
+            by_q += np.outer(pull, setting.theta_q[density])
+        return setting.gravity_phi.T @ by_q
+
+    def _inertia_curvature(
+        self, x: Array, setting: Setting, multipliers: Array
+    ) -> tuple[Array | float, Array | float]:
+        """Of multipliers · M a: second derivatives by x and q, (N, 3n, nq), and the first by θ."""
+        slopes, dynamics = self.body.mass_slopes, self.dynamics
+        if not slopes:
+            return 0.0, 0.0
+        weights, of_theta = self._row_weights(multipliers), np.zeros(len(setting.theta))
+        pulled = dynamics.combine_transposed(dynamics.tables.s, weights) / dynamics.step_s**2
+        acceleration, of_x = dynamics.acceleration(x), 0.0
+        for density, slope in slopes.items():
+            of_theta[density] = np.einsum("ti,ti,i->", weights, acceleration, slope)
+            of_x = of_x + (pulled * slope)[..., None] * setting.theta_q[density]
+        return of_x, of_theta
+
+    @cached_property
     def _curvature_rows(self) -> Array:
         return np.zeros((self.grid_rows, self.dynamics.forces.curvature_width))
 
@@ -658,6 +712,7 @@ class Segment:
             columns,
             self.nuisance.size,
             self.length_m,
+            self._tilts,
         )
 
     # Structure --------------------------------------------------------------------------------

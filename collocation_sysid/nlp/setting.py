@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from .dynamics import Dynamics
 from .held import Held
 
@@ -39,6 +39,17 @@ class Setting:
         found = np.zeros((len(self.theta), count))
         found[:, first : first + self.theta_q.shape[1]] = self.theta_q
         return found
+
+    def inertia_slopes(self, acceleration: Array, dofs: Index | slice) -> Array | float:
+        """∂(M a)/∂(q, φ), (…, k, nq + m), at accelerations (…, k) of dofs."""
+        slopes = self.dynamics.body.mass_slopes
+        if not slopes:
+            return 0.0  # M is known
+        of_q = np.zeros((*acceleration.shape, self.theta_q.shape[1] + self.gravity_phi.shape[1]))
+        for density, slope in slopes.items():
+            along = (slope[dofs] * acceleration)[..., None] * self.theta_q[density]
+            of_q[..., : self.theta_q.shape[1]] += along
+        return of_q
 
     def force_slopes(self, by_theta: Array, weighed_kg: Array) -> Array:
         """∂F/∂(q, φ) of total forces, (…, 3n, nq + m).

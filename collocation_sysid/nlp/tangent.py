@@ -174,7 +174,7 @@ class BlockSolver:
         if known is not None:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
-        inertia = self.dynamics.inertia(x)
+        acceleration = self.dynamics.acceleration(x)
         given = GivenMotion.of(self, setting, x)
         memory = known.memory if known else None
         held = HeldForces.nothing(len(x), len(self.sensed), count)
@@ -185,9 +185,10 @@ class BlockSolver:
         for step in self._steps(x, setting, first=done, history=history):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros((x.shape[1], count))
-            residual = march.residual(step, inertia[step.t])
+            residual = march.residual(step, acceleration[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
+            right[:, 1:] -= march.inertia_slopes(acceleration[step.t])
             force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force, given)
@@ -210,9 +211,11 @@ class BlockSolver:
         march = _Forward(self, setting, (len(self.free), shape[1]), held=held)
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
         march.remember(history, setting.columns(shape[1], first=0))
+        acceleration = self.dynamics.acceleration(x)
         yield from np.zeros((self.dynamics.first_row, *shape))
         for step in self._steps(x, setting, history=history):
             row, right = np.zeros(shape), np.zeros(march.shape)
+            right -= march.inertia_slopes(acceleration[step.t])
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
                 row[given.held_dofs] = given.of_held[step.t]
@@ -249,7 +252,7 @@ class BlockSolver:
         Dofs that a passing grasp holds have zeros.
         """
         dynamics, reach = self.dynamics, self.dynamics.reach
-        rows = [Row.of(dynamics, t) for t in range(dynamics.rows)]
+        rows = [Row.of(dynamics, t, setting.theta) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
         history = dynamics.history(x, setting.theta)
@@ -258,7 +261,7 @@ class BlockSolver:
             t = step.t
             through_stress = weights.pulled()[self.free] if weights else 0.0
             lags = range(min(reach, t) + 1)
-            mass = dynamics.mass_kg[t, self.free]
+            mass = rows[t].mass_kg[self.free]
             later = [j for j in range(1, reach + 1) if t + j < dynamics.rows]
             known = self.without_taken(
                 t,
@@ -346,7 +349,7 @@ class BlockSolver:
                 carried = dynamics.carried(history, slice(start, stop))
                 at = forces.linearise(xi[here], nu[here], theta, carried=carried)
             with self.stopwatch.solving():
-                factors = self._factorise(at, slice(start, stop), rooms)
+                factors = self._factorise(at, slice(start, stop), theta, rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
@@ -360,12 +363,12 @@ class BlockSolver:
                 )
 
     def _factorise(
-        self, at: Linearisation, rows: slice, rooms: Sequence[Array | None] = ()
+        self, at: Linearisation, rows: slice, theta: Array, rooms: Sequence[Array | None] = ()
     ) -> list[Factor]:
         pattern, taken = self.pattern, self.dynamics.taken[rows]
 
         def matrix(k: int) -> tuple[Array, Array]:
-            row = Row.of(self.dynamics, rows.start + k)
+            row = Row.of(self.dynamics, rows.start + k, theta)
             values = row.block(at.by_position[k], at.by_velocity[k], pattern)
             skew = row.skew_block(at.by_position_skew[k])
             if taken[k].any():
@@ -515,12 +518,12 @@ class _Forward:
             # The start is given.
             self.slopes.advance(np.zeros((self.solver.pattern.size, theta_q.shape[1])))
 
-    def residual(self, step: _Step, inertia: Array) -> Array:
+    def residual(self, step: _Step, acceleration: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
-        solver, row = self.solver, Row.of(self.solver.dynamics, step.t)
+        solver, row = self.solver, Row.of(self.solver.dynamics, step.t, self.setting.theta)
         force = step.force[solver.free]
         solver.without_taken(step.t, force)
-        total = row.w[0] * force - inertia[solver.free]
+        total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
             total += weighted(row.w, self.past_forces, force.shape)
             self.past_forces.appendleft(force)
@@ -528,15 +531,19 @@ class _Forward:
 
     def force_slopes(self, step: _Step) -> Array:
         """∂F/∂p (3n, m)."""
-        weighed = self.setting.dynamics.forces.mass_kg[step.t]
+        weighed = self.setting.dynamics.forces.mass.row(step.t, self.setting.theta)
         return self.setting.force_slopes(step.by_theta, weighed)
+
+    def inertia_slopes(self, acceleration: Array) -> Array | float:
+        """∂(M a)/∂p on the free dofs."""
+        return self.setting.inertia_slopes(acceleration[self.solver.free], self.solver.free)
 
     def advance(
         self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None
     ) -> Array:
         """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
-        row = Row.of(solver.dynamics, t)
+        row = Row.of(solver.dynamics, t, self.setting.theta)
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)

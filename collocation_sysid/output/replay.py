@@ -73,11 +73,11 @@ class Replay:
     positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
     rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
     natural_hz : (k,) natural frequencies with the answer, ascending
-    static : bool
-        Whether every sample is an equilibrium of its own.
     wrenches : sequence of (S, 19)
         Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
         out, NaN where there are none.
+    static : bool
+        Whether every sample is an equilibrium of its own.
     """
 
     name: str
@@ -99,8 +99,8 @@ class Replay:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
-    static: bool = False
     wrenches: Sequence[Array] = ()
+    static: bool = False
 
     @classmethod
     def of(
@@ -137,8 +137,8 @@ class Replay:
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
             natural_hz,
-            experiment.static,
             wrenches,
+            experiment.static,
         )
 
     @property
@@ -196,9 +196,9 @@ class Replay:
         found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
         found |= {key: arrays[prefix + key] for key in needed}
         found |= {key: arrays.get(prefix + key) for key in optional}
-        found["static"] = bool(arrays.get(f"{prefix}static", False))
         keys = (f"{prefix}wrench_{k}" for k in count(1))
         found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
+        found["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(found)
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
         parts = [str(part) for part in arrays["part_names"]]
@@ -234,7 +234,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
         if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
             raise ValueError(f"{key} holds numbers that are not finite")
-        if kinds == "f" and np.nanmax(np.abs(array), initial=0.0) > LARGEST:
+        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
             raise ValueError(f"{key} holds numbers above {LARGEST:g}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:

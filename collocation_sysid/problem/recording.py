@@ -24,6 +24,7 @@ from ..experiment import (
     PoseSequence,
     Wrench,
     align,
+    displaced_axes,
     held_dofs,
     read_displacement,
     read_forces,
@@ -62,6 +63,7 @@ NUISANCES = {
     "gravity": {"gravity_rad": "prior_rad"},
     "hand_eye": {"hand_eye_m": "prior_m", "hand_eye_rad": "prior_rad"},
     "pose": {"pose_shift_m": "prior_m", "pose_turn_rad": "prior_rad"},
+    "displacement_zero": {"displacement_zero_m": "prior_m"},
     "camera_offsets": {"camera_offset_m": "prior_m"},
     "tare": {"tare": "prior_sigmas"},
     "sensor_time": {"sensor_time_s": "prior_s"},
@@ -206,6 +208,8 @@ class RecordingReader:
     def _recorded(self) -> MarkerTable | None:
         """All measured tracks that are used, in the body's frame; None to simulate without."""
         markers = self.section.markers
+        if not self.section.marked:
+            return None
         if markers.file is None and not self.simulation:
             raise InputError("missing; expected a file of marker tracks", None, "markers.file")
         if not markers.file or (self.simulation and not (self.folder / markers.file).exists()):
@@ -233,8 +237,16 @@ class RecordingReader:
                 include={"axes", "from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
             ),
             selection=selection(grasp.nodes),
+            zero=self._zero(k, grasp),
             wrench=grasp.wrench and self._wrench(grasp.wrench, self._grasp_key(k, "wrench"), t_s),
         )
+
+    def _zero(self, k: int, grasp: GraspSection) -> str:
+        """The axes of its displacement."""
+        if grasp.displacement is None:
+            return ""
+        file = existing_file(self.folder, grasp.displacement, self._grasp_key(k, "displacement"))
+        return displaced_axes(file)
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
         """What is measured within the experiment's time; zeros to simulate without a file."""
@@ -272,9 +284,12 @@ class RecordingReader:
 
     def _table(self, poses: list[PoseSequence]) -> MarkerTable:
         """The measured tracks; to simulate without them, zeros at the poses' times."""
+        if not self.section.marked:
+            times = self._times(poses)
+            return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
         if self._recorded is not None:
             return self._fitted(self._recorded)
-        section, markers = self.section, self.section.markers
+        markers = self.section.markers
         names = tuple(markers.names or markers.reference_m)
         lacking = [name for name in names if name not in markers.reference_m]
         if lacking or not names:
@@ -285,8 +300,13 @@ class RecordingReader:
                 None,
                 "markers.reference_m",
             )
+        times = self._times(poses)
+        return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
+
+    def _times(self, poses: list[PoseSequence]) -> Array:
+        """Those of the poses, where nothing else has any."""
         times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
-        fewest = 1 if section.kind == "static" else 3
+        fewest = 1 if self.section.kind == "static" else 3
         if len(times) < fewest:
             raise InputError(
                 f"neither markers.file nor poses with at least {fewest} times are there; "
@@ -294,7 +314,7 @@ class RecordingReader:
                 None,
                 "grasp",
             )
-        return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
+        return times
 
     def _fitted(self, table: MarkerTable) -> MarkerTable:
         """The tracks asked for, without the gripper's markers and those of weight 0."""
@@ -363,7 +383,7 @@ class RecordingReader:
             max_distance_m=spec.max_distance_m,
         )
         experiment = build(markers)
-        if not self.simulation:
+        if not self.simulation and names:
             refuse_other_scale(experiment, usual_constants(self.parameters))
         return experiment
 

@@ -426,6 +426,11 @@ class NuisanceSection(Section):
         description="A constant rigid correction of grasps and body in the cameras' frame: "
         "prior_rad, prior_m.",
     )
+    displacement_zero: OffOrLength | None = Field(
+        None,
+        description="A constant offset of each displacement along each of its axes: prior_m, "
+        "0.1 mm by default.",
+    )
     camera_offsets: OffOrLength | None = Field(
         None, description="A constant offset of every marker in the cameras' frame: prior_m."
     )
@@ -477,7 +482,10 @@ class ExperimentSection(Section):
     grasp: Grasps = Field(
         default_factory=list, description="A table of nodes and poses, or a list of them."
     )
-    markers: MarkersSection
+    markers: MarkersSection = Field(
+        default_factory=lambda: MarkersSection.model_construct(),
+        description="Tracked points; none are needed where the wrench of a grasp is measured.",
+    )
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     start_rule: Literal["standard", "paper"] = "standard"
     loaded_since_s: NotNegative | None = Field(
@@ -509,6 +517,11 @@ class ExperimentSection(Section):
         description='What is estimated of this recording alone, as a table; or "none".',
     )
     validation: Flag = Field(False, description="Not fitted, only predicted.")
+
+    @property
+    def marked(self) -> bool:
+        """Whether there are markers."""
+        return "markers" in self.model_fields_set
 
     @property
     def grasps(self) -> list[GraspSection]:

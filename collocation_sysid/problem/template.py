@@ -32,6 +32,7 @@ element = "tet4"               # or tet10 if it bends or is slender; tet10-p0, p
 [parameters]                   # {{}} is estimated, a number alone is fixed
 young_pa    = {{}}               # no guess is needed; {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
 poisson     = {{ lower = 0.05, upper = 0.45 }}
+# density_kg_m3 = {{ guess = 100.0 }}   # with a known force or mass on the body
 # lambda_pa and mu_pa, or kappa_pa and mu_pa, may stand in place of young_pa and poisson
 gamma_r_s   = {{}}
 gamma_m_1_s = {{}}

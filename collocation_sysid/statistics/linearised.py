@@ -42,12 +42,12 @@ class FitBlock:
     sigma_m : (M,) standard deviations given
     misfit : (T, M, 3), optional
         Residuals as they are, where Huber's loss has shortened those in `residual`.
-    static : bool
-        Whether samples are equilibria, of which no frequency can be told.
     components : (T, M, 3) bool, optional
         Coordinates that are there, where not all three of a sample need be.
     of_sensor : bool
         Of a sensor, not of markers.
+    static : bool
+        Whether samples are equilibria, of which no frequency can be told.
     """
 
     name: str
@@ -58,9 +58,9 @@ class FitBlock:
     slope: Array
     sigma_m: Array
     misfit: Array | None = None
-    static: bool = False
     components: Mask | None = None
     of_sensor: bool = False
+    static: bool = False
 
     @cached_property
     def seen(self) -> Mask:
@@ -170,10 +170,11 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """
     p, blocks = collocation.parameters_of(z), []
     for part, response in zip(collocation.parts(z), responses(collocation, z), strict=True):
+        static = part.segment.experiment.static
         for block in (_of_markers(part, response), *_of_sensors(part, response)):
             slope = np.zeros((*block.residual.shape, len(p)))
             slope[..., part.segment.places] = block.slope
-            block = replace(block, slope=slope, misfit=block.residual)
+            block = replace(block, slope=slope, misfit=block.residual, static=static)
             blocks.append(block if collocation.huber is None else _reweighted(block, collocation))
     prior_residual, prior_slope = collocation.prior(p)
     lower, upper = collocation.bounds_p
