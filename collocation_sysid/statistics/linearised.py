@@ -223,7 +223,7 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
                 part.segment.experiment.name,
                 sensor.wrench.t_s,
                 (f"force{which}", f"torque{which}"),
-                seen.any(axis=2),
+                np.asarray(seen.any(axis=2)),
                 residual,
                 slope,
                 sensor.wrench.sigmas[[0, 3]],
