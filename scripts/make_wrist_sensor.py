@@ -1,8 +1,8 @@
 """Make problems/wrist_sensor: a foam block of unknown density swung by a hand with a force sensor.
 
 The data come from Newmark at 1 ms on the analytic motion, so neither the integrator nor the
-interpolation of the poses is the one the problem is solved with: 0.5 mm noise on the markers at
-100 Hz, 0.02 N and 1 mN m on the wrench at 500 Hz.
+interpolation of the poses is the one the problem is solved with: 1 mm noise on the markers at
+100 Hz, 0.05 N and 2 mN m on the wrench at 500 Hz.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TRUTH = {
     "gamma_m_1_s": 0.5,
     "density_kg_m3": 120.0,
 }
-NOISE_M, NOISE_N, NOISE_NM = 5e-4, 0.02, 1e-3
+NOISE_M, NOISE_N, NOISE_NM = 1e-3, 0.05, 2e-3
 SWING = Swing(
     duration_s=0.6,
     amplitude_m=(0.05, 0.04, 0.03),
