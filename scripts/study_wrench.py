@@ -54,12 +54,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     exact, rng = recording(), np.random.default_rng(arguments.seed)
-    held, errors = dict.fromkeys(COUNTED, 0), {name: [] for name in COUNTED}
+    held: dict[str, int] = {name: 0 for name in COUNTED}
+    errors: dict[str, list[float]] = {name: [] for name in COUNTED}
     for twin in range(1, arguments.twins + 1):
         uncertainty = fitted(noisy(exact, rng))
         for name in COUNTED:
             estimate = uncertainty.estimates[name]
-            assert estimate.ci95 is not None, name
+            assert estimate.ci95 is not None
+            assert estimate.std_error is not None
             held[name] += estimate.ci95[0] <= TRUTH[name] <= estimate.ci95[1]
             errors[name].append(estimate.std_error / TRUTH[name])
         if twin % 20 == 0 or twin == arguments.twins:

@@ -294,9 +294,10 @@ def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
             if deviation:
                 entries.append((f"{kind} {number}", f"{what} [{unit}]", deviation))
 
-        for k in np.flatnonzero(wrench.measured) if wanted.tare else ():
+        tare = wanted.tare or 0.0
+        for k in np.flatnonzero(wrench.measured):
             what = f"tare{which} of {COMPONENTS[k]}"
-            add("tare", what, UNITS[k], wanted.tare * float(wrench.sigmas[k]))
+            add("tare", what, UNITS[k], tare * float(wrench.sigmas[k]))
         if not experiment.static:
             add("sensor-time", f"time shift of the sensor{which}", "s", wanted.sensor_time_s)
             add("sensor-lag", f"lag of the sensor{which}", "s", wanted.sensor_lag_s)

@@ -213,7 +213,7 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
     sensors, found = part.segment.sensors, []
     if not sensors:
         return found
-    forced = part.sensing.along(part.x, response.held, response.moved)
+    forced = part.sensing.along(part.x, response.held, response.moved, first=0)
     linear = part.sensing.linearised(forced, part.segment.moving)
     for k, (sensor, (residual, slope)) in enumerate(zip(sensors, linear, strict=True)):
         which = "" if len(sensors) == 1 else f" {k + 1}"
@@ -223,7 +223,7 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
                 part.segment.experiment.name,
                 sensor.wrench.t_s,
                 (f"force{which}", f"torque{which}"),
-                seen.any(axis=2),
+                np.asarray(seen.any(axis=2)),
                 residual,
                 slope,
                 sensor.wrench.sigmas[[0, 3]],
