@@ -227,7 +227,8 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             continue
         wanted = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
         here = array.shape
-        if array.dtype.kind not in kinds or array.ndim != len(letters) or 0 in here[:-1]:
+        empty = any(not size for x, size in zip(letters, here, strict=False) if x not in "Mk")
+        if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
             raise ValueError(f"{key} is {array.dtype} of shape {here}")
         if any(size not in (None, found) for size, found in zip(wanted, here, strict=True)):
             raise ValueError(f"{key} has shape {here}, which does not go with the others")

@@ -1387,16 +1387,17 @@ for i, name in enumerate(block.marker_names):
 # truth is within the error bars. But these are wider. How far the body sags is no longer seen, as
 # nobody knows where the markers were before; only how it swings is.
 #
-# The cure is a ruler, and to say how good it is: with `reference_sigma_m = 0.001` the places that
-# it gives are a prior, good to 1 mm, and still estimated. That brings the error bars back most of
-# the way, and a ruler that was read wrongly no longer falsifies them.
+# The cure is to measure better than the fit does by itself. It finds the places to some tenths of
+# a millimetre, so a ruler that is good to 1 mm adds nothing (try it). A caliper does: with
+# `reference_sigma_m = 0.0001` its places are a prior, good to 0.1 mm and still estimated. The error
+# bars come back, and a place that was read a little wrongly no longer falsifies the answer.
 
 # %% jupyter={"source_hidden": true}
 first, last = MY_PROBLEM.index("[experiment.markers.ref"), MY_PROBLEM.index("[transcription]")
 no_ruler = MY_PROBLEM[:first] + MY_PROBLEM[last:]
 spread = {}
-good_to_1_mm = MY_PROBLEM.replace("sigma_m =", "reference_sigma_m = 0.001\nsigma_m =", 1)
-cases = {"with a ruler": MY_PROBLEM, "without": no_ruler, "good to 1 mm": good_to_1_mm}
+caliper = MY_PROBLEM.replace("sigma_m =", "reference_sigma_m = 0.0001\nsigma_m =", 1)
+cases = {"exact places": MY_PROBLEM, "no places": no_ruler, "a caliper's": caliper}
 for name, text in cases.items():
     (mine / "problem.toml").write_text(text)
     loaded = cs.Problem.read(mine / "problem.toml")
@@ -1406,6 +1407,6 @@ for name, text in cases.items():
     print(f"{name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)
     assert 1e3 * found.rms_m < 1.05 * noise_mm
-assert (spread["without"] > spread["with a ruler"]).all()
-assert (spread["good to 1 mm"] < spread["without"]).all()
+assert (spread["no places"] > spread["exact places"]).all()
+assert (spread["a caliper's"] < spread["no places"]).all()
 desk.cleanup()
