@@ -94,7 +94,7 @@ class _Stepper:
         return state
 
     def _solver(self, time_s: float) -> Solver:
-        return self.solvers.holding(self.experiment.grasped(time_s)[0][0])
+        return self.solvers.holding(self.experiment.held(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
         return np.repeat(self.experiment.node_mass_kg(time_s)[0], 3)
