@@ -15,7 +15,7 @@ solve: $(CORE) ## identify the foam cylinder's parameters
 	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
 
 test: $(DEV) ## run the tests
-	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 check: $(DEV) ## lint, formatting and types
 	@$(BIN)/ruff check
