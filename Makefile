@@ -17,7 +17,7 @@ solve: $(CORE) ## identify the foam cylinder's parameters
 	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
 
 test: $(DEV) ## run the tests
-	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 test-dependencies: ## run the tests with the lowest dependencies, and with the newest
 	@mkdir -p build && $(PYTHON) scripts/lowest_dependencies.py > build/lowest.txt && : > build/newest.txt

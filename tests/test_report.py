@@ -176,7 +176,7 @@ def test_a_comparison_has_a_page_too(comparison: Path):
     assert outcome.code == 0, outcome.err
     found = Elements((comparison / "report.html").read_text())
     assert len(found.images) == len(list(comparison.glob("*.png"))) > 0
-    for words in ("Methods", "reduced-space", "shooting", "within 1 %", "Runs"):
+    for words in ("Success", "reduced-space", "shooting", "within 1 %", "Runs"):
         assert words in found.text
     assert not found.outside
 

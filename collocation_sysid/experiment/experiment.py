@@ -173,7 +173,7 @@ class Experiment:
     @cached_property
     def held_dofs(self) -> Index:
         """Dofs, 3 node + axis, that are grasped throughout, sorted."""
-        held, _ = self.grasped(self.t_s)
+        held = self.held(self.t_s)
         return np.flatnonzero(held.all(axis=0))
 
     @cached_property
@@ -191,14 +191,22 @@ class Experiment:
             NaN where a node is not held.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        held = self.held(times)
         positions = np.full(held.shape, np.nan)
         for grasp in self.grasps:
             here = np.flatnonzero(grasp.holds(times))
-            place = np.ix_(here, grasp.nodes, grasp.columns)
             carried = grasp.carry(self.body.nodes_m, times[here])
-            held[place], positions[place] = True, carried[..., grasp.columns]
+            positions[np.ix_(here, grasp.nodes, grasp.columns)] = carried[..., grasp.columns]
         return held, positions
+
+    def held(self, t_s: ArrayLike) -> NDArray[np.bool_]:
+        """Return which coordinates of the nodes are held at the times `t_s` (T,), (T, n, 3)."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        for grasp in self.grasps:
+            here = np.flatnonzero(grasp.holds(times))
+            held[np.ix_(here, grasp.nodes, grasp.columns)] = True
+        return held
 
     def held_positions(self, t_s: ArrayLike) -> Array:
         """Return where `held_dofs` are carried at `t_s` (T,), as (T, held) metres."""
@@ -370,7 +378,7 @@ class Experiment:
             self._refuse_free_motions()
 
     def _refuse_free_motions(self) -> None:
-        held = self.grasped(self.t_s[:1])[0][0]
+        held = self.held(self.t_s[:1])[0]
         free = free_motions(self.body.nodes_m, held)
         if free:
             raise InputError(

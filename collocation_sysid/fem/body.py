@@ -483,15 +483,28 @@ class Body(Model):
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
-        x = self._states(positions)[0].reshape(-1, len(self.nodes_m), 3)
-        gradients = self.geometry[..., :-1].reshape(len(self.cells), -1, self.element.nodes, 3)
-        f = np.einsum("teai,eqaj->ijteq", x[:, self.cells], gradients)
-        a, b = f[1], f[2]
-        return (
-            f[0, 0] * (a[1] * b[2] - a[2] * b[1])
-            + f[0, 1] * (a[2] * b[0] - a[0] * b[2])
-            + f[0, 2] * (a[0] * b[1] - a[1] * b[0])
+        nodes, (count, points) = len(self.nodes_m), self.geometry.shape[:2]
+        x = self._states(positions)[0].reshape(-1, nodes, 3)
+        by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
+        slopes = (self._shape_slopes @ by_node).reshape(3, count * points, 3, len(x))
+        a, b, c = slopes.transpose(0, 2, 1, 3)
+        ratios = (
+            a[0] * (b[1] * c[2] - b[2] * c[1])
+            + a[1] * (b[2] * c[0] - b[0] * c[2])
+            + a[2] * (b[0] * c[1] - b[1] * c[0])
         )
+        return ratios.reshape(count, points, -1).transpose(2, 0, 1)
+
+    @cached_property
+    def _shape_slopes(self) -> sp.csr_array:
+        """Slopes along each axis, at every quadrature point, of what has values at the nodes."""
+        count, points = self.geometry.shape[:2]
+        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
+        values = np.moveaxis(gradients, 3, 0)
+        columns = np.broadcast_to(self.cells[:, None], values.shape)
+        starts = np.arange(0, values.size + 1, self.element.nodes)
+        shape = (3 * count * points, len(self.nodes_m))
+        return sp.csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
 
     # Assembly -------------------------------------------------------------------------------
 

@@ -265,6 +265,6 @@ class Dynamics:
 
 
 def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
-    held = experiment.grasped(t_s)[0].reshape(len(t_s), -1)
+    held = experiment.held(t_s).reshape(len(t_s), -1)
     held[:, experiment.held_dofs] = False
     return held

@@ -116,7 +116,7 @@ class _Stepper:
         return Forces.of(self.experiment, load_s).total(state.x, state.v, self.theta, now)[0]
 
     def _solver(self, time_s: float) -> Solver:
-        return self.solvers.holding(self.experiment.grasped(time_s)[0][0])
+        return self.solvers.holding(self.experiment.held(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
         return Mass.of(self.experiment, time_s).row(0, self.theta)

@@ -294,8 +294,8 @@ class Overstress:
         by_q = np.zeros((segment.nq, *self.shape))
         recursions = setting.dynamics.recursions(setting.theta)
         for r, mu in zip(recursions, self.weights(multipliers), strict=True):
-            slopes = theta_q[[r.branch.share, r.branch.tau]].T @ r.d_by[:, 1:]
-            by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", slopes, mu[1:])
+            fading = theta_q[[r.branch.share, r.branch.tau]].T @ r.d_by[:, 1:]
+            by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", fading, mu[1:])
         place, own, _, _ = self._slopes
         scale = segment.length_m * self.unit_pa[own]
         # f_H is linear in x and in H, so that its slope by both is that by H at the weights.

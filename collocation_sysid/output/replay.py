@@ -128,7 +128,7 @@ class Replay:
             body.part_of_cells[body.mesh.surface_cells],
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            experiment.grasped(experiment.t_s)[0].any(axis=2),
+            experiment.held(experiment.t_s).any(axis=2),
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
             given_m if places_m is None else places_m,
@@ -227,7 +227,8 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             continue
         wanted = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
         here = array.shape
-        if array.dtype.kind not in kinds or array.ndim != len(letters) or 0 in here[:-1]:
+        empty = any(not size for x, size in zip(letters, here, strict=False) if x not in "Mk")
+        if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
             raise ValueError(f"{key} is {array.dtype} of shape {here}")
         if any(size not in (None, found) for size, found in zip(wanted, here, strict=True)):
             raise ValueError(f"{key} has shape {here}, which does not go with the others")
