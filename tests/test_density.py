@@ -14,7 +14,7 @@ from problems_small import (
     measured_with,
     quadratic_bar,
 )
-from wrenches_small import sensing
+from wrenches_small import sensing, with_wrenches
 
 from collocation_sysid.experiment import Experiment, PointMass
 from collocation_sysid.fem.body import Body
@@ -168,8 +168,7 @@ def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
 
 def test_gradients_where_a_wrench_tells_the_density(rng):
     cube = with_core(sensing(hung_cube(8)))
-    wrench = replace(cube.grasps[0].wrench, values=0.01 * rng.standard_normal((9, 6)))
-    cube = replace(cube, grasps=[replace(cube.grasps[0], wrench=wrench)])
+    cube = with_wrenches(cube, [0.01 * rng.standard_normal((9, 6))])
     collocation = Collocation([noisy_with(cube, TRUTH)], parameters())
     p = collocation.guess_p
     z = simulated(collocation, p)

@@ -92,6 +92,7 @@ class _Step:
     """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, and G's skew part."""
 
     t: int
+    row: Row
     force: Array
     by_position: Array
     by_velocity: Array
@@ -188,7 +189,8 @@ class BlockSolver:
             residual = march.residual(step, acceleration[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
-            right[:, 1:] -= march.inertia_slopes(acceleration[step.t])
+            if self.body.mass_slopes:
+                right[:, 1:] -= march.inertia_slopes(acceleration[step.t])
             force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force, given)
@@ -215,7 +217,8 @@ class BlockSolver:
         yield from np.zeros((self.dynamics.first_row, *shape))
         for step in self._steps(x, setting, history=history):
             row, right = np.zeros(shape), np.zeros(march.shape)
-            right -= march.inertia_slopes(acceleration[step.t])
+            if self.body.mass_slopes:
+                right -= march.inertia_slopes(acceleration[step.t])
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
                 row[given.held_dofs] = given.of_held[step.t]
@@ -349,11 +352,13 @@ class BlockSolver:
                 carried = dynamics.carried(history, slice(start, stop))
                 at = forces.linearise(xi[here], nu[here], theta, carried=carried)
             with self.stopwatch.solving():
-                factors = self._factorise(at, slice(start, stop), theta, rooms)
+                rows = [Row.of(dynamics, t, theta) for t in range(start, stop)]
+                factors = self._factorise(at, slice(start, stop), rows, rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
                     start + k,
+                    rows[k],
                     at.force[k],
                     at.by_position[k],
                     at.by_velocity[k],
@@ -363,14 +368,13 @@ class BlockSolver:
                 )
 
     def _factorise(
-        self, at: Linearisation, rows: slice, theta: Array, rooms: Sequence[Array | None] = ()
+        self, at: Linearisation, here: slice, rows: list[Row], rooms: Sequence[Array | None] = ()
     ) -> list[Factor]:
-        pattern, taken = self.pattern, self.dynamics.taken[rows]
+        pattern, taken = self.pattern, self.dynamics.taken[here]
 
         def matrix(k: int) -> tuple[Array, Array]:
-            row = Row.of(self.dynamics, rows.start + k, theta)
-            values = row.block(at.by_position[k], at.by_velocity[k], pattern)
-            skew = row.skew_block(at.by_position_skew[k])
+            values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
+            skew = rows[k].skew_block(at.by_position_skew[k])
             if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
                 gone = taken[k][pattern.rows] | taken[k][pattern.columns]
@@ -387,7 +391,7 @@ class BlockSolver:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
                 f"motion cannot be solved: {error}",
-                float(self.dynamics.t_s[rows.start]),
+                float(self.dynamics.t_s[here.start]),
             ) from error
 
 
@@ -520,7 +524,7 @@ class _Forward:
 
     def residual(self, step: _Step, acceleration: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
-        solver, row = self.solver, Row.of(self.solver.dynamics, step.t, self.setting.theta)
+        solver, row = self.solver, step.row
         force = step.force[solver.free]
         solver.without_taken(step.t, force)
         total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
@@ -543,7 +547,7 @@ class _Forward:
     ) -> Array:
         """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
-        row = Row.of(solver.dynamics, t, self.setting.theta)
+        row = step.row
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)
