@@ -1,4 +1,4 @@
-"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V that faces enclose."""
+"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V behind faces of a body."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..fem.selection import Selection
+from ..fem.selection import Selection, rows_of_faces
 from ..fem.volume import Volume
 from .course import Course
 
 if TYPE_CHECKING:
     from ..fem.body import Body
+
+# Points of a plane are this near to it, of the body's size.
+PLANE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,9 @@ class Pressure:
         if isinstance(self.faces, Selection):
             rows = self.faces.resolve_faces(mesh)
         else:
-            rows = _rows_of(self.faces, mesh.surface, self.name)
+            rows = np.unique(rows_of_faces(self.faces, mesh.surface))
+            if rows[0] < 0:
+                raise InputError(f"{self.name}: not all faces are on the boundary of the body")
         # Seen from the cavity, the outside of the material is the inside.
         wall = body.nodes.on_faces(mesh.surface[rows][:, ::-1])
         volume = Volume(wall, len(body.nodes_m))
@@ -115,28 +120,40 @@ class Pressure:
         stated = self.course.at(t_s)
         return -np.column_stack([stated, np.ones(len(stated))])
 
-    def refuse_free_rim(self, held: NDArray[np.bool_]) -> None:
-        """Refuse an open patch whose rim moves freely; `held` (n,) are nodes held throughout.
+    def bounded(self, held: NDArray[np.bool_], places_m: Array) -> Pressure:
+        """The same, with a volume that the rim's motion does not change, where the rim is held.
+
+        The volume of an open patch is that of the cones over it from an apex. It has the pressure's
+        work where its rim is held, or slides in planes, such as those of symmetry: then the apex
+        must lie in these.
+
+        Parameters
+        ----------
+        held : (n, 3) bool, coordinates that grasps hold throughout
+        places_m : (T, n, 3) where they hold them, NaN elsewhere
 
         Raises
         ------
         InputError
-            Naming the pressure.
+            If the rim moves otherwise.
         """
-        rim = self.measure.rim if self.measure else ()
-        free = int((~held[rim]).sum())
+        volume = self.measure
+        if volume is None or not volume.rim.size:
+            return self
+        loose = volume.rim[~held[volume.rim].all(axis=(1, 2))]
+        slides = np.asarray(np.logical_and.reduce(held[loose], axis=1))  # (k, 3)
+        free = int((~slides.any(axis=1)).sum())
+        apex, size_m = np.zeros(3), np.nanmax(np.abs(places_m), initial=0.0)
+        for axis in range(3):
+            plane = places_m[:, loose[slides[:, axis]], axis]
+            if plane.size and np.ptp(plane) > PLANE * size_m:
+                free += plane.shape[1]
+            elif plane.size:
+                apex[axis] = plane.mean()
         if free:
             raise InputError(
-                f"{self.name}: the faces are not closed, and {free} of the {len(rim)} nodes on "
-                "their rim are free; expected the whole wall of a cavity, or a rim that is held: "
-                "the force on other patches has no energy"
+                f"{self.name}: the faces are not closed, and {free} of the {len(volume.rim)} edges "
+                "of their rim move; expected the whole wall of a cavity, or a rim that is held or "
+                "slides in one plane across an axis: the force on other patches has no energy"
             )
-
-
-def _rows_of(faces: Index, surface: Index, name: str) -> Index:
-    """Rows of the surface (F, 3) that faces (k, 3) are."""
-    there = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
-    rows = {there.get(tuple(face), -1) for face in np.sort(faces, axis=1).tolist()}
-    if -1 in rows or not rows:
-        raise InputError(f"{name}: not all faces are triangles of the body's boundary")
-    return np.array(sorted(rows), dtype=np.int64)
+        return replace(self, measure=Volume(volume.faces, volume.node_count, apex))
