@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..fem.selection import Selection, rows_of_faces
+from ..fem.refinement import faces_in_four
+from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.volume import Volume
+from .actuator import Placed, measured
 from .course import Course
 
 if TYPE_CHECKING:
@@ -38,13 +40,8 @@ class Pressure:
     t_s : (m,) array, optional
         Times of the rows, which must reach over the recording.
     name : str
-    factor, offset_pa : float
-        How the pressure in the body differs: factor · pressure + offset.
-
-    Attributes
-    ----------
-    measure : Volume or None
-        Of what is enclosed, once it is on a body.
+    factor, lost_pa : float
+        How the pressure in the body differs: factor · pressure − lost.
     """
 
     faces: Selection | Index
@@ -52,9 +49,11 @@ class Pressure:
     t_s: Array | None
     name: str
     factor: float
-    offset_pa: float
-    measure: Volume | None
+    lost_pa: float
+    placed: Placed[Volume] | None
     course: Course = field(init=False, repr=False)
+
+    unit: ClassVar[str] = "Pa"
 
     def __init__(
         self,
@@ -64,8 +63,8 @@ class Pressure:
         name: str = "pressure",
         *,
         factor: float = 1.0,
-        offset_pa: float = 0.0,
-        measure: Volume | None = None,
+        lost_pa: float = 0.0,
+        placed: Placed[Volume] | None = None,
     ) -> None:
         pressure = Course(pressure_pa, t_s, f"pressure_pa of {name}")
         if not isinstance(faces, Selection):
@@ -82,8 +81,8 @@ class Pressure:
             course=pressure,
             name=name,
             factor=factor,
-            offset_pa=offset_pa,
-            measure=measure,
+            lost_pa=lost_pa,
+            placed=placed,
         )
 
     def on(self, body: Body) -> Pressure:
@@ -94,6 +93,8 @@ class Pressure:
         InputError
             If they are not on its boundary, or enclose the body instead of a cavity.
         """
+        if self.placed is not None and self.placed.body is body:
+            return self
         mesh = body.mesh
         if isinstance(self.faces, Selection):
             rows = self.faces.resolve_faces(mesh)
@@ -109,16 +110,37 @@ class Pressure:
                 f"{self.name}: the faces surround the body from outside; expected the wall of a "
                 "cavity in it, or an open patch whose rim is held"
             )
-        return replace(self, measure=volume)
+        return replace(self, placed=Placed(body, volume))
+
+    def refined(self, body: Body, finer: Body) -> Pressure:
+        """The same on a body whose mesh is that of `body`, split in eight."""
+        if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
+            return replace(self, placed=None)
+        corners = self.on(body).measure.faces[:, :3]
+        return replace(self, faces=faces_in_four(corners, body.mesh), placed=None)
+
+    @property
+    def measure(self) -> Volume:
+        """The volume of what is enclosed, on a body."""
+        return measured(self.placed, self.name)
+
+    @property
+    def off(self) -> tuple[float, float]:
+        """Factor, and what is lost."""
+        return self.factor, self.lost_pa
+
+    def off_by(self, factor: float, lost: float) -> Pressure:
+        """The same with another factor, and another pressure lost."""
+        return replace(self, factor=factor, lost_pa=lost)
 
     def amplitude(self, t_s: Array) -> Array:
         """The negative of the pressure at the times `t_s` (T,) [Pa]."""
-        return -(self.factor * self.course.at(t_s) + self.offset_pa)
+        return self.lost_pa - self.factor * self.course.at(t_s)
 
     def slopes(self, t_s: Array) -> Array:
-        """Its derivatives (T, 2) by factor and offset_pa."""
+        """Its derivatives (T, 2) by factor and lost_pa."""
         stated = self.course.at(t_s)
-        return -np.column_stack([stated, np.ones(len(stated))])
+        return np.column_stack([-stated, np.ones(len(stated))])
 
     def bounded(self, held: NDArray[np.bool_], places_m: Array) -> Pressure:
         """The same, with a volume that the rim's motion does not change, where the rim is held.
@@ -137,8 +159,8 @@ class Pressure:
         InputError
             If the rim moves otherwise.
         """
-        volume = self.measure
-        if volume is None or not volume.rim.size:
+        placed, volume = self.placed, self.measure
+        if placed is None or not volume.rim.size:
             return self
         loose = volume.rim[~held[volume.rim].all(axis=(1, 2))]
         slides = np.asarray(np.logical_and.reduce(held[loose], axis=1))  # (k, 3)
@@ -156,4 +178,4 @@ class Pressure:
                 "of their rim move; expected the whole wall of a cavity, or a rim that is held or "
                 "slides in one plane across an axis: the force on other patches has no energy"
             )
-        return replace(self, measure=Volume(volume.faces, volume.node_count, apex))
+        return replace(self, placed=Placed(placed.body, volume.from_apex(apex)))

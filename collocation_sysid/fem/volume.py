@@ -38,7 +38,13 @@ class Volume:
 
     def __init__(self, faces: Index, node_count: int, apex_m: Array | None = None) -> None:
         self.faces, self.node_count = faces, node_count
-        self._apex = np.tile(np.zeros(3) if apex_m is None else apex_m, node_count)
+        self.apex_m = np.zeros(3) if apex_m is None else apex_m
+        self._apex = np.tile(self.apex_m, node_count)
+
+    def from_apex(self, apex_m: Array) -> Volume:
+        """The same of cones from another point."""
+        same = (apex_m == self.apex_m).all()
+        return self if same else Volume(self.faces, self.node_count, apex_m)
 
     @cached_property
     def _terms(self) -> tuple[Index, Index, Index, Array]:
