@@ -258,7 +258,8 @@ def _nuisance(finished: Run) -> list[Text]:
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
         name = part.segment.experiment.name
-        said = _places(finished.places[name]) + _lengths(part) + _clock(part) + _of_sensors(part)
+        said = _places(finished.places[name]) + _lengths(part) + _clock(part)
+        said += _of_sensors(part) + _drives(part)
         if said:
             lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
     return lines
@@ -327,6 +328,21 @@ def _of_sensors(part: Part) -> list[str]:
             own = unit or of.rpartition("[")[2].rstrip("]")
             size = _short(factor * abs(values[worst]))
             said.append(f"{what} {size} {own} (prior {_short(factor * prior)})")
+    return said
+
+
+def _drives(part: Part) -> list[str]:
+    """What tensions and pressures are off by."""
+    nuisance, said = part.segment.nuisance, []
+    for k in nuisance.of_drives:
+        prior = float(nuisance.scales[k])
+        value = float(part.phi[k]) * prior
+        what = nuisance.names[k].partition(": ")[2].partition(" [")[0]
+        unit = nuisance.names[k].rpartition("[")[2].rstrip("]")
+        if nuisance.kinds[k] == "factor":
+            said.append(f"{what} by {_short(1e2 * value)} % (prior {_short(1e2 * prior)})")
+        else:
+            said.append(f"{what} {_short(value)} {unit} (prior {_short(prior)})")
     return said
 
 

@@ -15,6 +15,7 @@ from problems_small import (
     bar_let_go,
     cube_with_gaps,
     cube_with_nuisance,
+    driven_bar,
     hung_cube,
     measured,
 )
@@ -155,6 +156,11 @@ def test_derivatives_in_other_parametrisations(parameters: Parameters, rng):
 def test_derivatives_of_several_experiments(rng):
     experiments = [swung(), swung("undeformed", steps=7), bar_in_two_hands(3), cube_with_gaps(2)]
     assert_derivatives(Collocation(experiments, GUESS, "bdf2"), rng)
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
+def test_derivatives_of_a_body_that_tendons_and_pressures_drive(scheme: str, rng):
+    assert_derivatives(Collocation([measured(driven_bar(4)), swung()], GUESS, scheme), rng)
 
 
 @pytest.mark.parametrize("explicit_grasps", [False, True])

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
+from ..fem.pattern import Joined
+from .actuator import Actuator
 from .arrays import read_only_floats
 from .clock import STEP_TOLERANCE, first_time_fault, sample_interval_s
 from .freedom import free_motions
@@ -19,6 +21,8 @@ from .grasp import Grasp, held_dofs
 from .loads import Force, PointMass
 from .markers import Markers
 from .nuisance import Nuisance
+from .pressure import Pressure
+from .tendon import Tendon
 from .wrench_files import within
 
 if TYPE_CHECKING:
@@ -71,6 +75,10 @@ class Experiment:
         Tied to the body.
     forces : sequence of Force
         On the nodes besides gravity.
+    tendons : sequence of Tendon
+        Put on the body by their points.
+    pressures : sequence of Pressure
+        On faces of the body's boundary.
     nuisance : Nuisance
         What else is to be estimated about this recording alone: by default what a careful
         laboratory does not know better; `Nuisance.none` for ideal data.
@@ -96,6 +104,8 @@ class Experiment:
     validation: bool
     masses: tuple[PointMass, ...]
     forces: tuple[Force, ...]
+    tendons: tuple[Tendon, ...]
+    pressures: tuple[Pressure, ...]
     nuisance: Nuisance
 
     def __init__(
@@ -116,6 +126,8 @@ class Experiment:
         validation: bool = False,
         masses: Iterable[PointMass] = (),
         forces: Iterable[Force] = (),
+        tendons: Iterable[Tendon] = (),
+        pressures: Iterable[Pressure] = (),
         nuisance: Nuisance = AS_IN_A_LABORATORY,
     ) -> None:
         n = len(body.nodes_m)
@@ -137,6 +149,8 @@ class Experiment:
                 validation=validation,
                 masses=tuple(mass.on(body) for mass in masses),
                 forces=tuple(force.on(body) for force in forces),
+                tendons=tuple(tendon.on(body) for tendon in tendons),
+                pressures=tuple(pressure.on(body) for pressure in pressures),
                 nuisance=nuisance,
             )
             self._check_kind()
@@ -144,6 +158,7 @@ class Experiment:
             vars(self)["markers"] = self.markers.on(body, self._carried_back)
             self._check_nodes()
             self._check_start()
+            self._check_actuators()
         except InputError as error:
             raise error.located(where=f"experiment '{name}'") from error
 
@@ -241,14 +256,27 @@ class Experiment:
         """Whether a known mass or force, or a measured one, sets the scale of all forces."""
         if any(grasp.wrench is not None for grasp in self.grasps):
             return True
+        if any(actuator.amplitude(self.t_s).any() for actuator in self.actuators):
+            return True
         tied = np.repeat(self.tied_mass_kg(self.t_s), 3, axis=1)
         forces = self.node_forces_n(self.t_s).reshape(tied.shape)
         return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """Its tendons, then its pressures."""
+        return (*self.tendons, *self.pressures)
+
+    @property
+    def joined(self) -> Joined:
+        """The mesh graph of its body, and the couplings of each of the actuators."""
+        couplings = (actuator.measure.couplings for actuator in self.actuators)
+        return Joined.of((self.body.pattern, *couplings))
+
+    @property
     def pattern(self) -> SymmetricPattern:
         """Sparsity of the slopes of the forces on its body."""
-        return self.body.pattern
+        return self.joined.pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
@@ -350,6 +378,21 @@ class Experiment:
                 f"the markers were placed on a body of {self.markers.placement.node_count} nodes, "
                 f"but this one has {n}"
             )
+
+    def _check_actuators(self) -> None:
+        names = [actuator.name for actuator in self.actuators]
+        if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+            raise InputError(
+                f"two tendons or pressures are called {twice[0]!r}; expected different names"
+            )
+        for actuator in self.actuators:
+            actuator.course.refuse_short(self.t_s, actuator.name)
+        if not self.pressures:
+            return
+        held, places_m = self.grasped(self.t_s)
+        throughout = np.asarray(held.all(axis=0))
+        bounded = tuple(pressure.bounded(throughout, places_m) for pressure in self.pressures)
+        vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
         for key, choices in (("start", Start), ("start_rule", StartRule)):

@@ -114,6 +114,10 @@ class Dynamics:
         """The same with a constant (3,) added to gravity."""
         return replace(self, forces=self.forces.under_gravity(change_m_s2))
 
+    def driven(self, values: Array) -> Dynamics:
+        """The same with tensions and pressures that are off by values (A, 2)."""
+        return replace(self, forces=self.forces.driven(values))
+
     def first_rows(self, rows: int) -> Dynamics:
         """The same on the first grid times only."""
         t = self.tables

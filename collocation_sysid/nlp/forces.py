@@ -2,7 +2,8 @@
 
 Whatever acts on the body of an experiment joins here, and nothing else adds forces: the internal
 ones f of its materials and dampings, see `fem.body`, the weight of its mass with what is tied to
-it, and the forces on its nodes. Slopes are on the experiment's pattern.
+it, the forces on its nodes, and tendons and pressures, see `drives`. Slopes are on the
+experiment's pattern.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Carried
 from ..fem.model import Theta
 from ..fem.pattern import SymmetricPattern
+from .drives import Drives
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,20 +70,19 @@ class Forces:
     Attributes
     ----------
     body : Body
-    pattern : SymmetricPattern
-        Of the slopes.
     mass : Mass
         What gravity pulls at and γ_m damps.
     gravity_m_s2 : (3,)
     applied_n : (T, 3n)
         Forces on the nodes, wherever these are.
+    drives : Drives
     """
 
     body: Body
-    pattern: SymmetricPattern
     mass: Mass
     gravity_m_s2: Array
     applied_n: Array
+    drives: Drives
 
     @classmethod
     def of(cls, experiment: Experiment, t_s: ArrayLike) -> Forces:
@@ -89,37 +90,60 @@ class Forces:
         applied = experiment.node_forces_n(t_s)
         return cls(
             experiment.body,
-            experiment.pattern,
             Mass.of(experiment, t_s),
             experiment.gravity_m_s2,
             compact(applied.reshape(len(applied), -1)),
+            Drives.of(experiment, t_s),
         )
 
     @classmethod
     def on(cls, body: Body) -> Forces:
         """Those on a body that nothing acts on, at one time."""
         nothing = np.zeros((1, body.pattern.size))
-        return cls(body, body.pattern, Mass(body, nothing), np.zeros(3), nothing)
+        return cls(body, Mass(body, nothing), np.zeros(3), nothing, Drives.none(body))
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Of the slopes."""
+        return self.drives.joined.pattern
 
     def rows(self, rows: slice) -> Forces:
         """The same at some of the times."""
-        return replace(self, mass=self.mass.rows(rows), applied_n=self.applied_n[rows])
+        return replace(
+            self,
+            mass=self.mass.rows(rows),
+            applied_n=self.applied_n[rows],
+            drives=self.drives.rows(rows),
+        )
 
     def under_gravity(self, change_m_s2: Array) -> Forces:
         """The same with a constant (3,) added to gravity."""
         return replace(self, gravity_m_s2=self.gravity_m_s2 + change_m_s2)
 
     def scaled(self, share: float) -> Forces:
-        """The same with a share of the loads."""
+        """The same with a share of the loads, those of tendons and pressures too."""
         return replace(
-            self, gravity_m_s2=share * self.gravity_m_s2, applied_n=share * self.applied_n
+            self,
+            gravity_m_s2=share * self.gravity_m_s2,
+            applied_n=share * self.applied_n,
+            drives=replace(self.drives, share=share * self.drives.share),
         )
 
     def towards(self, other: Forces, share: float) -> Forces:
         """The same with a share of the way to what acts at other times."""
         tied_kg = self.mass.tied_kg + share * (other.mass.tied_kg - self.mass.tied_kg)
         applied_n = self.applied_n + share * (other.applied_n - self.applied_n)
-        return replace(self, mass=replace(self.mass, tied_kg=tied_kg), applied_n=applied_n)
+        drives = self.drives.towards(other.drives, share)
+        mass = replace(self.mass, tied_kg=tied_kg)
+        return replace(self, mass=mass, applied_n=applied_n, drives=drives)
+
+    def undriven(self) -> Forces:
+        """The same without tensions and pressures."""
+        return replace(self, drives=Drives.none(self.body))
+
+    def driven(self, values: Array) -> Forces:
+        """The same with tensions and pressures that are off by values (A, 2), see `Drives`."""
+        return replace(self, drives=self.drives.off_by(values))
 
     @property
     def _gravity(self) -> Array:
@@ -127,13 +151,13 @@ class Forces:
         return np.tile(self.gravity_m_s2, self.body.pattern.size // 3)
 
     def external_n(self, theta: Theta) -> Array:
-        """(T, 3n) those that do not depend on the state."""
+        """(T, 3n) those that do not depend on the state: weight, and forces on nodes."""
         return self.mass.at(theta) * self._gravity + self.applied_n
 
     def total(self, xi: Array, nu: Array, theta: Array, carried: Carried | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
         internal = self.body.force(xi, nu, theta, self.mass.tied, carried)
-        return internal + self.external_n(theta)
+        return internal + self.external_n(theta) + self.drives.force(xi)
 
     def linearise(
         self,
@@ -143,12 +167,15 @@ class Forces:
         out: Array | None = None,
         carried: Carried | None = None,
     ) -> Linearisation:
-        """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
+        """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`).
+
+        Slopes by θ have two more columns for each of the drives.
+        """
         at = self.body.linearise(xi, nu, theta, out, self.mass.tied, carried)
         np.add(at.force, self.external_n(theta), out=at.force)
         for density, slope in self.body.mass_slopes.items():
             at.by_theta[:, :, density] += slope * self._gravity
-        return at
+        return self.drives.added_to(at, xi)
 
     @property
     def linearisation_width(self) -> int:
@@ -170,7 +197,7 @@ class Forces:
         found = self.body.curvature(xi, nu, weights, theta, out, tied, carried, stress_weights)
         for density, slope in self.body.mass_slopes.items():
             found.theta[:, density] += weights @ (slope * self._gravity)
-        return found
+        return self.drives.bent(found, xi, weights)
 
     @property
     def curvature_width(self) -> int:

@@ -23,6 +23,7 @@ class HessianLayout:
     loss, scale : place of each entry of the loss, and its factor in scaled variables
     phi : place of each entry (i <= j) of φ by φ, row after row
     tilt : (k, nq) places of the entries of some φ by q
+    driven : (variables k,) places of the entries of other φ by x, those of one x together
     diagonal : places of the diagonal of x
     """
 
@@ -35,6 +36,7 @@ class HessianLayout:
     scale: Array
     phi: Index
     tilt: Index
+    driven: Index
     diagonal: Index
 
     @property
@@ -59,6 +61,7 @@ class HessianLayout:
         nphi: int,
         length_m: float,
         tilts: Index,
+        drives: Index,
     ) -> HessianLayout:
         """Merge the band in the columns of x with the loss's entries.
 
@@ -68,7 +71,7 @@ class HessianLayout:
         rows, columns : entries of the loss by (x, φ), upper triangle, sorted by column
         nphi : number of φ
         length_m : unit of the scaled x
-        tilts : (k,) which φ have entries by q
+        tilts, drives : (k,) which φ have entries by q, and by all x
         """
         of_x = columns < variables
         band_columns = np.repeat(np.arange(variables), np.diff(band.indptr))
@@ -86,9 +89,9 @@ class HessianLayout:
         tall = height + nphi
         of_phi = (nq + columns[~of_x]) * tall + nq + rows[~of_x]
         of_tilts = (height + tilts[:, None]) * tall + np.arange(nq)
-        phi_codes = np.unique(
-            np.concatenate([of_phi, dense[:, 1] * tall + dense[:, 0], of_tilts.ravel()])
-        )
+        of_drives = ((height + drives) * tall + nq + np.arange(variables)[:, None]).ravel()
+        of_pairs = dense[:, 1] * tall + dense[:, 0]
+        phi_codes = np.unique(np.concatenate([of_phi, of_pairs, of_tilts.ravel(), of_drives]))
         loss[~of_x] = len(merged) + np.searchsorted(phi_codes, of_phi)
         first, second = (index + height for index in np.triu_indices(nphi))
         placed = None if merged is codes else np.searchsorted(merged, codes)
@@ -102,6 +105,7 @@ class HessianLayout:
             scale=length_m ** ((rows < variables).astype(float) + (columns < variables)),
             phi=len(merged) + np.searchsorted(phi_codes, second * tall + first),
             tilt=len(merged) + np.searchsorted(phi_codes, of_tilts),
+            driven=len(merged) + np.searchsorted(phi_codes, of_drives),
             diagonal=diagonal if placed is None else placed[diagonal],
         )
 

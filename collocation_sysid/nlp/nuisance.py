@@ -17,6 +17,8 @@ tare of a sensor       of each component that it measures [N] or [N m], see `sen
 its clock              τ, how much later than its times say it measured [s]
 its lag                T of a first-order low-pass [s]
 its tool               mass [kg], and centre (3) about the sensor's point [m]
+factor                 f less one, of each tension, and of each pressure
+lost                   b of each tension [N], and of each pressure [Pa]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
@@ -25,10 +27,13 @@ nothing but what the markers read, and the direction of gravity, which becomes R
 
 In the grasp the undeformed body is off by H X = R(a_h) (X − c_h) + c_h + d_h, c_h being the middle
 of the grasped nodes: they are held at U_t H X.
+
+A tension T is max(0, f T − b) at the body, a pressure p is f p − b.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,7 +41,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Index
+from ..experiment.actuator import Actuator
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp, held_nodes
 from ..experiment.wrench import COMPONENTS, UNITS
@@ -58,6 +64,8 @@ KINDS = (
     "tilt",
     "grasp-turn",
     "grasp-shift",
+    "factor",
+    "lost",
 )
 # Those of a grasp's zero have its number behind them.
 OF_GRASP = "zero"
@@ -80,6 +88,8 @@ class NuisanceMap:
     gravity_m_s2 : (3,) as stated
     pivot_m : (3,) c
     grasp_pivot_m : (3,) c_h
+    stated_off : (A, 2) f and b of tensions and pressures as stated
+    driving : (A, 2) which φ their estimates are, −1 where they have none
     """
 
     names: tuple[str, ...]
@@ -91,6 +101,8 @@ class NuisanceMap:
     gravity_m_s2: Array
     pivot_m: Array
     grasp_pivot_m: Array
+    stated_off: Array
+    driving: Index
 
     @classmethod
     def of(cls, experiment: Experiment) -> NuisanceMap:
@@ -115,6 +127,8 @@ class NuisanceMap:
             np.array(experiment.gravity_m_s2),
             experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
             body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
+            np.array([a.off for a in experiment.actuators]).reshape(-1, 2),
+            _driving(experiment, labels),
         )
 
     @property
@@ -128,9 +142,22 @@ class NuisanceMap:
 
     @cached_property
     def moving(self) -> NDArray[np.int64]:
-        """Positions in φ of what changes the motion: what turns gravity, or moves the grasps."""
+        """Positions in φ of what changes the motion: gravity, the grasps, or what drives it."""
         zeros = {kind for kind in self.kinds if kind.startswith(OF_GRASP)}
-        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", *zeros)
+        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", "factor", "lost", *zeros)
+
+    @cached_property
+    def of_drives(self) -> NDArray[np.int64]:
+        """Positions in φ of what tensions and pressures may be off by."""
+        return self.places("factor", "lost")
+
+    def drives(self, phi: Array) -> tuple[Array, Array]:
+        """F and b (A, 2) of tensions and pressures, and their derivatives (2 A, k) by φ."""
+        slopes = np.zeros((self.driving.size, self.size))
+        estimated = np.flatnonzero(self.driving.ravel() >= 0)
+        places = self.driving.ravel()[estimated]
+        slopes[estimated, places] = self.scales[places]
+        return self.stated_off + (slopes @ phi).reshape(-1, 2), slopes
 
     @cached_property
     def moves_grasps(self) -> bool:
@@ -280,6 +307,12 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
     for k, grasp in enumerate(experiment.grasps):
         which = f"zero of grasp {k + 1}"
         add(f"{OF_GRASP} {k}", which, "m", " ".join(grasp.zero), wanted.displacement_zero_m)
+    for actuator in experiment.actuators:
+        factor, lost = wanted.off(actuator)
+        if factor:
+            entries.append(("factor", _factor_of(actuator.name), factor))
+        if lost:
+            entries.append(("lost", _lost_of(actuator), lost))
     return entries + _sensor_entries(experiment)
 
 
@@ -305,6 +338,24 @@ def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
         for axis in "xyz" if wanted.tool_kg else "":
             add("tool-centre", f"centre of the tool{which}, {axis}", "m", wanted.tool_m)
     return entries
+
+
+def _factor_of(name: str) -> str:
+    return f"{name}, more than stated [1]"
+
+
+def _lost_of(actuator: Actuator) -> str:
+    return f"{actuator.name}, lost [{actuator.unit}]"
+
+
+def _driving(experiment: Experiment, labels: Sequence[str]) -> Index:
+    """(A, 2) places among the labels of what each actuator may be off by, or −1."""
+    place = {label: k for k, label in enumerate(labels)}
+    found = [
+        (place.get(_factor_of(a.name), -1), place.get(_lost_of(a), -1))
+        for a in experiment.actuators
+    ]
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
 def rotation(turn: ca.SX) -> ca.SX:

@@ -312,17 +312,23 @@ class Segment:
         theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
         gravity_phi_phi = np.zeros((3, 0, 0))
-        moving = self.nuisance.moving
+        moving, drives = self.nuisance.moving, self.nuisance.drives(phi)
         if len(moving):
+            dynamics = dynamics.driven(drives[0])
             gravity, first, second = self.nuisance.gravity(phi)
             dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
         held = self.grasping.at(phi)
-        return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi, held)
+        drive_phi = drives[1][:, moving]
+        return Setting(
+            theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi, drive_phi, held
+        )
 
     def corrected(self, phi: Array) -> Experiment:
-        """The experiment in the body's frame: gravity turned, and the body moved in its grasps."""
+        """The experiment in the body's frame: gravity turned, the body moved in its grasps, and
+        tensions and pressures as they are.
+        """
         if not len(self.nuisance.moving):
             return self.experiment
         grasps = self.experiment.grasps
@@ -333,7 +339,18 @@ class Segment:
                 for k, g in enumerate(grasps)
             )
         gravity = self.nuisance.gravity(phi)[0]
-        return replace(self.experiment, gravity_m_s2=gravity, grasps=grasps)
+        off = iter(self.nuisance.drives(phi)[0])
+        tendons, pressures = (
+            tuple(actuator.off_by(*next(off)) for actuator in actuators)
+            for actuators in (self.experiment.tendons, self.experiment.pressures)
+        )
+        return replace(
+            self.experiment,
+            gravity_m_s2=gravity,
+            grasps=grasps,
+            tendons=tendons,
+            pressures=pressures,
+        )
 
     def grasped(self, x: Array, phi: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
@@ -615,7 +632,7 @@ class Segment:
         skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
-        by_xi = curvature.position_theta @ setting.theta_q
+        by_xi = setting.by_q(curvature.position_theta)
         by_nu = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
         by_theta = dynamics.combine_transposed(dynamics.state_weights, by_xi)
         by_theta += dynamics.combine_transposed(dynamics.tables.q, by_nu)
@@ -626,6 +643,10 @@ class Segment:
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
+        if layout.driven.size:
+            of_drives = setting.by_drive(curvature.position_theta)[..., self._driving]
+            of_x = dynamics.combine_transposed(dynamics.state_weights, of_drives)
+            values[layout.driven] += self.length_m * of_x.ravel()
         mass_kg = dynamics.forces.mass.at(setting.theta)
         pull = (weights * mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
         by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
@@ -670,6 +691,11 @@ class Segment:
         """Positions in φ of what may turn gravity, where it pulls at a mass that is estimated."""
         return self.nuisance.moving if self.body.mass_slopes else np.zeros(0, dtype=np.int64)
 
+    @cached_property
+    def _driving(self) -> Index:
+        """Among the φ that move the body, those of tensions and pressures."""
+        return np.flatnonzero(np.isin(self.nuisance.moving, self.nuisance.of_drives))
+
     def _weight_curvature(self, weights: Array, setting: Setting) -> Array:
         """Second derivatives of weights · M g by the φ that turn gravity, and q."""
         by_q = np.zeros((3, self.nq))
@@ -713,6 +739,7 @@ class Segment:
             self.nuisance.size,
             self.length_m,
             self._tilts,
+            self.nuisance.of_drives,
         )
 
     # Structure --------------------------------------------------------------------------------

@@ -22,6 +22,8 @@ class Setting:
     dynamics : Dynamics under that gravity
     gravity_phi, gravity_phi_phi : (3, m) and (3, m, m) derivatives of gravity by the φ that move
         the body
+    drive_phi : (2 A, m)
+        Derivatives of what tensions and pressures are off by, see `Drives`.
     held : Held
         Where the grasps are.
     """
@@ -32,6 +34,7 @@ class Setting:
     dynamics: Dynamics
     gravity_phi: Array
     gravity_phi_phi: Array
+    drive_phi: Array
     held: Held
 
     def columns(self, count: int, first: int = 1) -> Array:
@@ -56,11 +59,20 @@ class Setting:
 
         Parameters
         ----------
-        by_theta : (…, 3n, k) of the internal forces
+        by_theta : (…, 3n, k + 2 A)
         weighed_kg : (…, 3n) what gravity pulls at
         """
-        of_q = by_theta @ self.theta_q
+        of_q = self.by_q(by_theta)
         if not self.gravity_phi.shape[1]:
             return of_q
         pull = np.tile(self.gravity_phi, (by_theta.shape[-2] // 3, 1))
-        return np.concatenate([of_q, weighed_kg[..., None] * pull], axis=-1)
+        of_phi = weighed_kg[..., None] * pull + self.by_drive(by_theta)
+        return np.concatenate([of_q, of_phi], axis=-1)
+
+    def by_q(self, by_theta: Array) -> Array:
+        """(…, nq) derivatives by q from those by θ and what drives are off by, (…, k + 2 A)."""
+        return by_theta[..., : len(self.theta)] @ self.theta_q
+
+    def by_drive(self, by_theta: Array) -> Array:
+        """(…, m) the same by the φ of drives."""
+        return by_theta[..., len(self.theta) :] @ self.drive_phi

@@ -44,6 +44,7 @@ LAYOUT = {
     "rolled_out_positions_m": ("f", "Tn3"),
     "rolled_out_m": ("f", "TM3"),
     "natural_hz": ("f", "k"),
+    "tendons_m": ("f", "p3"),
 }
 # Arrays that may hold NaN or infinity, and the largest length, time or frequency of any.
 GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
@@ -78,6 +79,7 @@ class Replay:
         out, NaN where there are none.
     static : bool
         Whether every sample is an equilibrium of its own.
+    tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
     """
 
     name: str
@@ -101,6 +103,7 @@ class Replay:
     natural_hz: Array | None = None
     wrenches: Sequence[Array] = ()
     static: bool = False
+    tendons_m: Array | None = None
 
     @classmethod
     def of(
@@ -139,6 +142,7 @@ class Replay:
             natural_hz,
             wrenches,
             experiment.static,
+            _apart([tendon.points_m for tendon in experiment.tendons]),
         )
 
     @property
@@ -162,6 +166,7 @@ class Replay:
             "held": self.held,
             "up": self.up,
             "natural_hz": self.natural_hz,
+            "tendons_m": self.tendons_m,
             "static": np.array(True) if self.static else None,
         } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
         shared: dict[str, Any] = {
@@ -191,6 +196,7 @@ class Replay:
             "rolled_out_positions_m",
             "rolled_out_m",
             "natural_hz",
+            "tendons_m",
         )
         found: dict[str, Any] = {key: arrays[key] for key in SHARED}
         found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
@@ -208,6 +214,13 @@ class Replay:
         if numbers.min() < 0 or numbers.max() >= len(parts):
             raise ValueError("surface_parts names parts that are not there")
         return cls(name=name, marker_names=names, part_names=parts, **found)
+
+
+def _apart(lines_m: Sequence[Array]) -> Array | None:
+    """Polylines (P, 3) in one (p, 3), a row of NaN after each; None where there are none."""
+    if not lines_m:
+        return None
+    return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])
 
 
 def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:

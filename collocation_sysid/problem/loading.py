@@ -82,6 +82,8 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
         names += [grasp.poses or grasp.displacement for grasp in section.grasps]
         names += [grasp.wrench.file for grasp in section.grasps if grasp.wrench is not None]
         names += [force.file for force in section.force]
+        names += [tendon.tension for tendon in section.tendon]
+        names += [pressure.pressure for pressure in section.pressure]
     return tuple(folder / name for name in names if name is not None)
 
 

@@ -81,6 +81,14 @@ sigma_m = 0.001                # standard deviation of a coordinate
 # nodes = {{ indices = [12, 13] }}
 # force_n = [0.0, 0.0, 0.5]    # or file = "force.csv": t_s,fx_n,fy_n,fz_n
 
+# [[experiment.tendon]]        # a tendon through points of the undeformed body, base to end
+# points_m = [[0.0, 0.01, 0.2], [0.0, 0.01, 0.1], [0.0, 0.01, 0.0]]
+# tension = "tension.csv"      # t_s,tension_n; or tension_n = 3.1
+
+# [[experiment.pressure]]      # a pressure in a cavity
+# faces = {{ name = "cavity" }}  # a group of triangles, or {{ ball_m = [[0, 0, 0.1], 0.03] }}
+# pressure = "pressure.csv"    # t_s,pressure_pa; or pressure_pa = 5e3
+
 [transcription]
 scheme = "midpoint"            # or "bdf2", "backward-euler"
 substeps = 1                   # grid steps between samples

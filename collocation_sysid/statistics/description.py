@@ -83,8 +83,11 @@ class Comparison:
 
     @classmethod
     def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Comparison | None:
-        """That of an experiment, see `doubts`; None where the body has no modes to tell by."""
-        given = Described.of(experiment)
+        """That of an experiment, see `doubts`; None where the body has no modes to tell by.
+
+        Nor where tendons or pressures drive it, which is beyond a sway under gravity.
+        """
+        given = None if experiment.actuators else Described.of(experiment)
         if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
             return None
         try:
