@@ -599,7 +599,7 @@ def _show(content: RenderableType) -> None:
 
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
-    heed_interrupts()
+    restore = heed_interrupts()
     try:
         app(prog_name="collocation-sysid")
     except InputError as error:
@@ -609,6 +609,8 @@ def main() -> None:
         _refuse("error", reason, EXIT_BAD_INPUT)
     except SimulationError as error:
         _refuse("simulation failed", error, EXIT_NOT_CONVERGED)
+    finally:
+        restore()
 
 
 def _refuse(kind: str, error: Exception, code: int) -> NoReturn:
