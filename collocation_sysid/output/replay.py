@@ -131,7 +131,7 @@ class Replay:
             body.part_of_cells[body.mesh.surface_cells],
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            experiment.held(experiment.t_s).any(axis=2),
+            np.asarray(experiment.held(experiment.t_s).any(axis=2)),
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
             given_m if places_m is None else places_m,
