@@ -102,7 +102,7 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     part = marched(collocation, some_parameters(collocation))
     segment, setting, x = part.segment, part.setting, disturbed(part)
     gradient = rng.standard_normal(x.shape)
-    y = BlockSolver(segment).backward(x, setting.theta, gradient)
+    y = BlockSolver(segment).backward(x, setting, gradient)
     step = BlockSolver(segment).forward(x, setting).step
     residual = setting.dynamics.residual(x, setting.theta)
     residual[:, segment.held_dofs] = 0

@@ -117,7 +117,7 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     goals = setting.held.positions_m  # what is grasped is where it should be: no step of its own
     x[:, setting.held.dofs] = np.where(np.isnan(goals), x[:, setting.held.dofs], goals)
     gradient = rng.standard_normal(x.shape)
-    y = BlockSolver(segment).backward(x, setting.theta, gradient)
+    y = BlockSolver(segment).backward(x, setting, gradient)
     (found,) = forward(collocation, [x])
     residual, free = segment.residual_n(x, setting), segment.free_dofs
     left = np.sum(gradient[:, free] * found.step[:, free])

@@ -15,7 +15,7 @@ from ..errors import InputError
 from .arrays import read_only_floats
 from .clock import STEP_TOLERANCE, sample_interval_s
 from .grasp import Grasp, held_nodes
-from .loads import Force, PointMass
+from .loads import Change, Force, PointMass, ramp
 from .markers import Markers
 from .nuisance import Nuisance
 
@@ -195,15 +195,35 @@ class Experiment:
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         mass = np.broadcast_to(self.body.node_mass, (len(times), n))
         for point in self.masses:
-            mass = mass + point.at_nodes(times, n)
+            mass = mass + np.outer(self.share(point, times), point.at_nodes(n))
         return mass
+
+    def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
+        """Return how much of a load is there at `t_s` (T,), from 0 to 1.
+
+        It joins and leaves between a sample before and a sample after its times, see `loads.ramp`;
+        all is there from the first sample on where it joins by then.
+        """
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        joined, left = (self._changed(load, change, times) for change in get_args(Change))
+        return joined - left
+
+    def _changed(self, load: PointMass | Force, change: Change, times: Array) -> Array:
+        at_s = getattr(load, change)
+        if self.changes(load, change):
+            return ramp((times - at_s) / self.timestep_s)
+        return np.full(len(times), float(at_s <= self.t_s[0]))
+
+    def changes(self, load: PointMass | Force, change: Change) -> bool:
+        """Whether a load joins, or leaves, within the recording."""
+        return bool(self.t_s[0] < getattr(load, change) < self.t_s[-1])
 
     def node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the forces besides gravity on the nodes at `t_s` (T,), (T, n, 3)."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
-            total = total + force.at_nodes(times, n)
+            total = total + self.share(force, times)[:, None, None] * force.at_nodes(times, n)
         return total
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:

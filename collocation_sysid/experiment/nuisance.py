@@ -31,6 +31,9 @@ class Nuisance:
         A small rigid motion, constant in time, by which the undeformed body is off in the grasp:
         x = U_t H X. It is taken as none where the start is not an equilibrium: the state that is
         given then tells where the body is.
+    joining_s : float or None
+        How much later than stated point masses and forces join or leave, each that does within the
+        recording.
     pose_shift_m, pose_turn_rad : float or None
         A small rigid motion, constant in time, by which grasps and body are off in the frame of
         the markers, such as that of cameras. It turns the body against gravity.
@@ -43,6 +46,7 @@ class Nuisance:
     gravity_rad: float | None = DEGREE
     hand_eye_m: float | None = 1e-3
     hand_eye_rad: float | None = 0.5 * DEGREE
+    joining_s: float | None = 1e-2
     pose_shift_m: float | None = None
     pose_turn_rad: float | None = None
     camera_offset_m: float | None = None

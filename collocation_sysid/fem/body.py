@@ -299,9 +299,7 @@ class Body(Model):
         """
         x, v = self._states(positions, velocities)
         mass = self.dof_mass if dof_mass is None else dof_mass
-        return (
-            self._evaluate("force", [x, v], theta, carried=carried) - self._drag(theta) * mass * v
-        )
+        return self._evaluate("force", [x, v], theta, carried=carried) - self.drag(theta) * mass * v
 
     def linearise(
         self,
@@ -326,11 +324,11 @@ class Body(Model):
             rows, np.cumsum([size, entries, entries, width]), axis=1
         )
         moving = self.dof_mass if dof_mass is None else dof_mass
-        drag = self._drag(theta)
+        drag = self.drag(theta)
         force -= drag * moving * v
         by_velocity[:, self.pattern.diagonal] -= drag * moving
         by_theta = by_theta.reshape(len(x), size, -1)
-        for column, share in self._drag_shares.items():
+        for column, share in self.drag_shares.items():
             by_theta[:, :, column] = -share * moving * v
         self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew)
@@ -370,7 +368,7 @@ class Body(Model):
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
         moving = self.dof_mass if dof_mass is None else dof_mass
-        for column, share in self._drag_shares.items():
+        for column, share in self.drag_shares.items():
             v_theta[:, :, column] = -share * moving * w
             by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
         theta_theta = theta_theta.reshape(len(x), k, k)
@@ -384,7 +382,7 @@ class Body(Model):
         return 2 * k * self.pattern.size + entries + k * (k + 1)
 
     @cached_property
-    def _drag_shares(self) -> dict[int, Array]:
+    def drag_shares(self) -> dict[int, Array]:
         """Place of each part's γ_m in θ, and the (3n,) shares of the mass at a dof it damps.
 
         Mass that is tied to a node is damped as the part's own there.
@@ -394,9 +392,9 @@ class Body(Model):
             for end, mass in zip(self.starts[1:], self._part_masses, strict=True)
         }
 
-    def _drag(self, theta: Theta) -> Array:
+    def drag(self, theta: Theta) -> Array:
         """(3n,) γ_m of every dof."""
-        return np.sum([theta[k] * share for k, share in self._drag_shares.items()], axis=0)
+        return np.sum([theta[k] * share for k, share in self.drag_shares.items()], axis=0)
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""

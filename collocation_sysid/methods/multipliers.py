@@ -27,7 +27,7 @@ def constraint_multipliers(
         segment = part.segment
         gradient = collocation.loss_scale * segment.observation.gradient(part.x, part.phi)[0]
         solver = BlockSolver(segment, stopwatch=stopwatch)
-        y = segment.force_n * solver.backward(part.x, part.setting.theta, gradient)
+        y = segment.force_n * solver.backward(part.x, part.setting, gradient)
         found.append(segment.of_rows(y))
     multipliers = np.concatenate(found)
     if any(segment.grasp_rows.any() for segment in collocation.segments):

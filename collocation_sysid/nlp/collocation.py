@@ -390,10 +390,11 @@ class Collocation:
         for segment in self.segments:
             layout, first = segment.hessian_layout, segment.first
             indptr.append(used + layout.phi_indptr[1:])
-            of_x = layout.phi_indices < segment.variables
+            last_x = self.nq + segment.variables
             # In z all φ stand after all x.
             first_phi = first.phi - self.nq + self.variables - self.nphi
-            shift = np.where(of_x, first.x, first_phi - segment.variables)
+            shift = np.where(layout.phi_indices < last_x, first.x - self.nq, first_phi - last_x)
+            shift[layout.phi_indices < self.nq] = 0
             indices.append(layout.phi_indices + shift)
             used += len(layout.phi_indices)
         return np.concatenate(indptr), np.concatenate(indices)

@@ -51,13 +51,14 @@ class Dynamics:
     tables : Tables
     t_s : (N,) grid times
     first_row : int
-    mass_kg : (N, 3n) of every dof in each row, point masses included
+    mass_kg : (N, 3n) of every dof in each row, point masses included: the mean over its evaluations
     weighed_kg : (N, 3n) the same at each row's evaluation, where gravity and γ_m act
     external_force_n : (N, 3n) gravity and other forces at each row's evaluation
     taken : (N, 3n) bool
         Held dofs that are free at other times: while one is held, the grasp takes what force
         there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
         first step, from the velocity it has.
+    evaluated_s : (N,) times of the evaluations
     start_velocity_m_s : (3n,)
     loaded_since_s : float
         How long the body has been in its start shape; infinite where its memory has relaxed.
@@ -71,6 +72,7 @@ class Dynamics:
     weighed_kg: Array
     external_force_n: Array
     taken: NDArray[np.bool_]
+    evaluated_s: Array
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
 
@@ -93,10 +95,11 @@ class Dynamics:
             tables=tables,
             t_s=t_s,
             first_row=first_row,
-            mass_kg=_per_dof(experiment.node_mass_kg(t_s)),
+            mass_kg=_of_rows(tables, weighed),
             weighed_kg=weighed,
             external_force_n=_compact(weight + forces),
             taken=_taken(experiment, t_s),
+            evaluated_s=evaluated_s,
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
         )
@@ -105,6 +108,20 @@ class Dynamics:
         """The same with a constant (3,) added to gravity."""
         pull = self.weighed_kg * np.tile(change_m_s2, self.body.pattern.size // 3)
         return replace(self, external_force_n=_compact(self.external_force_n + pull))
+
+    def with_loads(self, weighed_kg: Array, force_n: Array) -> Dynamics:
+        """The same with mass, and its weight and other forces, added at the evaluations."""
+        weighed = self.weighed_kg + weighed_kg
+        return replace(
+            self,
+            mass_kg=_of_rows(self.tables, weighed),
+            weighed_kg=weighed,
+            external_force_n=self.external_force_n + force_n,
+        )
+
+    def of_rows(self, at_evaluations: Array) -> Array:
+        """What a row has of mass (N, …) that is there at the evaluations."""
+        return _of_rows(self.tables, at_evaluations)
 
     def first_rows(self, rows: int) -> Dynamics:
         """The same on the first grid times only."""
@@ -117,6 +134,7 @@ class Dynamics:
             weighed_kg=self.weighed_kg[:rows],
             external_force_n=self.external_force_n[:rows],
             taken=self.taken[:rows],
+            evaluated_s=self.evaluated_s[:rows],
         )
 
     @property
@@ -162,13 +180,7 @@ class Dynamics:
 
     def combine(self, table: Array, rows: Array) -> Array:
         """Σ_i table[t, i] rows[t − i] for every t; `rows` is (N, …)."""
-        result = np.zeros_like(rows)
-        shape = (-1,) + (1,) * (rows.ndim - 1)
-        for lag in range(min(table.shape[1], len(rows))):
-            column = table[lag:, lag].reshape(shape)
-            if np.any(column):
-                result[lag:] += column * rows[: len(rows) - lag]
-        return result
+        return _combine(table, rows)
 
     def combine_transposed(self, table: Array, rows: Array) -> Array:
         """Σ_i table[k + i, i] rows[k + i] for every k, the transpose of `combine`."""
@@ -203,9 +215,13 @@ class Dynamics:
 
     def inertia(self, x: Array) -> Array:
         """Mass times acceleration of every row, (N, 3n) [N]."""
+        return self.acceleration(x) * self.mass_kg
+
+    def acceleration(self, x: Array) -> Array:
+        """Acceleration of every row, (N, 3n) [m/s²]."""
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
-        return acceleration * self.mass_kg
+        return acceleration
 
     def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
         """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
@@ -239,6 +255,25 @@ class Dynamics:
 def _per_dof(of_nodes: Array) -> Array:
     """(T, n) values of nodes as (T, 3n) values of their dofs."""
     return _compact(np.repeat(of_nodes, 3, axis=1))
+
+
+def _combine(table: Array, rows: Array) -> Array:
+    result = np.zeros_like(rows)
+    shape = (-1,) + (1,) * (rows.ndim - 1)
+    for lag in range(min(table.shape[1], len(rows))):
+        column = table[lag:, lag].reshape(shape)
+        if np.any(column):
+            result[lag:] += column * rows[: len(rows) - lag]
+    return result
+
+
+def _of_rows(tables: Tables, at_evaluations: Array) -> Array:
+    # As a row weighs forces: then gravity alone accelerates all mass alike, also what just joins.
+    if (at_evaluations == at_evaluations[:1]).all():
+        return at_evaluations
+    total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))
+    mean = _combine(tables.w, at_evaluations) / np.where(total == 0, 1.0, total)
+    return np.where(total == 0, at_evaluations, mean)
 
 
 def _compact(rows: Array) -> Array:

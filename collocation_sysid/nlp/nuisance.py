@@ -12,6 +12,7 @@ shift of the pose      d (3) [m]
 tilt of gravity        two angles about axes across it [rad]
 turn in the grasp      a_h (3), likewise, about axes of the undeformed body
 shift in the grasp     d_h (3) [m]
+joining                how much later than stated a point mass or force joins, or leaves [s]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
@@ -24,8 +25,9 @@ of the grasped nodes: they are held at U_t H X.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
@@ -34,11 +36,17 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import held_nodes
+from ..experiment.loads import Change, Force, PointMass
+
+Load = TypeVar("Load", PointMass, Force)
 
 # Samples are read between neighbours, up to this many away from the chart's.
 LARGEST_SHIFT_SAMPLES = 2.0
 # A time shift may be this share of the recording.
 LARGEST_SHIFT_SHARE = 0.25
+# A load joins within this many standard deviations of its prior, further than any that is right,
+# and within the recording: not quite at its ends, where it would join at once or never.
+LARGEST_DELAY, NARROWER = 4.0, 1 - 1e-9
 # A place may move this many edges of the mesh in a step.
 EDGES_A_STEP = 2.0
 KINDS = (
@@ -50,7 +58,22 @@ KINDS = (
     "tilt",
     "grasp-turn",
     "grasp-shift",
+    "joining",
 )
+# The time at which a load joins may move this many samples in a step.
+SAMPLES_A_STEP = 2.0
+
+
+class Timed(NamedTuple):
+    """A load that joins or leaves at an estimated time."""
+
+    load: PointMass | Force
+    change: Change
+
+    @property
+    def stated_s(self) -> float:
+        """The time stated."""
+        return getattr(self.load, self.change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +91,8 @@ class NuisanceMap:
     gravity_m_s2 : (3,) as stated
     pivot_m : (3,) c
     grasp_pivot_m : (3,) c_h
+    timed : of each φ of the kind "joining", what joins or leaves
+    recorded_s : first and last time of the recording
     """
 
     names: tuple[str, ...]
@@ -79,6 +104,8 @@ class NuisanceMap:
     gravity_m_s2: Array
     pivot_m: Array
     grasp_pivot_m: Array
+    timed: tuple[Timed, ...]
+    recorded_s: tuple[float, float]
 
     @classmethod
     def of(cls, experiment: Experiment) -> NuisanceMap:
@@ -92,6 +119,9 @@ class NuisanceMap:
         reach = np.where(linear, 1e3, 1.0)
         of_place = np.array([kind == "place" for kind in kinds], dtype=bool)
         reach[of_place] = np.minimum(1e3, EDGES_A_STEP * edge_m / scales[of_place])
+        of_joining = np.array([kind == "joining" for kind in kinds], dtype=bool)
+        joining_s = SAMPLES_A_STEP * experiment.timestep_s
+        reach[of_joining] = np.minimum(1.0, joining_s / scales[of_joining])
         held = held_nodes(experiment.grasps)
         return cls(
             tuple(f"{experiment.name}: {label}" for label in labels),
@@ -103,6 +133,8 @@ class NuisanceMap:
             np.array(experiment.gravity_m_s2),
             experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
             body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
+            tuple(timed for _, timed in _timed(experiment)),
+            (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
 
     @property
@@ -116,8 +148,8 @@ class NuisanceMap:
 
     @cached_property
     def moving(self) -> NDArray[np.int64]:
-        """Positions in φ of what changes the motion: what turns gravity, or moves the grasps."""
-        return self.places("turn", "tilt", "grasp-turn", "grasp-shift")
+        """Positions in φ of what changes the motion: gravity, grasps, and when loads join."""
+        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", "joining")
 
     @cached_property
     def moves_grasps(self) -> bool:
@@ -133,7 +165,27 @@ class NuisanceMap:
             furthest = max(around, LARGEST_SHIFT_SHARE * self.duration_s)
             low[k] = max(about - around, -furthest) / unit
             high[k] = min(about + around, furthest) / unit
+        for k, timed in zip(self.places("joining"), self.timed, strict=True):
+            way = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
+            low[k], high[k] = np.clip(NARROWER * way, -LARGEST_DELAY, LARGEST_DELAY)
         return low, high
+
+    def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
+        """The experiment with its loads joining and leaving when φ says."""
+        if not self.timed:
+            return experiment
+        late_s = (phi * self.scales)[self.places("joining")]
+
+        def moved(load: Load) -> Load:
+            times = {
+                timed.change: timed.stated_s + float(late)
+                for timed, late in zip(self.timed, late_s, strict=True)
+                if timed.load is load
+            }
+            return replace(load, **times) if times else load
+
+        masses, forces = map(moved, experiment.masses), map(moved, experiment.forces)
+        return replace(experiment, masses=masses, forces=forces)
 
     @cached_property
     def of_grasps(self) -> NDArray[np.int64]:
@@ -240,7 +292,22 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
     if experiment.grasps and experiment.start == "equilibrium":
         add("grasp-turn", "turn in the grasp", "rad", "x y z", wanted.hand_eye_rad)
         add("grasp-shift", "shift in the grasp", "m", "x y z", wanted.hand_eye_m)
+    entries += [("joining", label, wanted.joining_s) for label, _ in _timed(experiment)]
     return entries
+
+
+def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
+    """What joins or leaves at a time that is to be estimated, and its label."""
+    if not experiment.nuisance.joining_s:
+        return []
+    said: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
+    return [
+        (f"{said[change]} of {kind} {number} [s]", Timed(load, change))
+        for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
+        for number, load in enumerate(loads, start=1)
+        for change in get_args(Change)
+        if experiment.changes(load, change)
+    ]
 
 
 def rotation(turn: ca.SX) -> ca.SX:

@@ -23,6 +23,7 @@ from .charts import Chart
 from .dynamics import Dynamics
 from .held import Grasping, Held
 from .hessian_layout import HessianLayout
+from .joining import Joinings
 from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
@@ -292,26 +293,38 @@ class Segment:
         """The physical parameters at (q, φ)."""
         theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
-        gravity_phi_phi = np.zeros((3, 0, 0))
-        moving = self.nuisance.moving
+        gravity_phi_phi, change = np.zeros((3, 0, 0)), np.zeros(3)
+        moving, joining = self.nuisance.moving, self.joinings.at(phi)
+        if joining:
+            dynamics = dynamics.with_loads(
+                sum(np.outer(load.share[0], load.mass_kg) for load in joining),
+                sum(load.share[0, :, None] * load.force_n for load in joining),
+            )
         if len(moving):
             gravity, first, second = self.nuisance.gravity(phi)
-            dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
+            change = gravity - self.nuisance.gravity_m_s2
+            dynamics = dynamics.under_gravity(change)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
         held = self.grasping.at(phi)
-        return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi, held)
+        slopes = gravity_phi, gravity_phi_phi
+        return Setting(theta, theta_q, theta_qq, dynamics, change, *slopes, held, joining)
+
+    @cached_property
+    def joinings(self) -> Joinings:
+        """Loads that join or leave at estimated times."""
+        return Joinings(self.experiment, self.nuisance, self.dynamics)
 
     def corrected(self, phi: Array) -> Experiment:
-        """The experiment in the body's frame: gravity turned, and the body moved in its grasps."""
+        """The experiment in the body's frame, as φ has gravity, grasps, and when loads join."""
         if not len(self.nuisance.moving):
             return self.experiment
         grasps = self.experiment.grasps
         if self.nuisance.moves_grasps:
             motion = self.nuisance.in_grasp(phi)
             grasps = tuple(replace(g, poses=g.poses.after(motion)) for g in grasps)
-        gravity = self.nuisance.gravity(phi)[0]
-        return replace(self.experiment, gravity_m_s2=gravity, grasps=grasps)
+        gravity, timed = self.nuisance.gravity(phi)[0], self.nuisance.with_times
+        return timed(replace(self.experiment, gravity_m_s2=gravity, grasps=grasps), phi)
 
     def grasped(self, x: Array, phi: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
@@ -384,25 +397,42 @@ class Segment:
             blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
         return blocks
 
+    def _inertia_rows(self, lag: int) -> Index:
+        """Grid times whose rows have inertia at a lag."""
+        rows = np.arange(max(self.dynamics.first_row, lag), self.grid_rows)
+        return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
+
     @cached_property
-    def _jacobian_constants(self) -> tuple[Index, Array, Index]:
-        """Positions and values of the inertia, and positions of the unit grasp entries."""
-        first = self.dynamics.first_row
+    def _jacobian_constants(self) -> tuple[Index, Index]:
+        """Positions of the inertia, and of the unit grasp entries."""
         row_place = np.searchsorted(self.row_dofs, self.free_dofs)
-        mass = self.dynamics.mass_kg[:, self.free_dofs] * self.length_m / self.force_n
-        positions, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+        positions = [np.zeros(0, dtype=np.int64)]
         for lag in range(self.dynamics.reach + 1):
-            coefficient = self.dynamics.inertia_coefficient(lag)
-            rows = np.arange(max(first, lag), self.grid_rows)
-            rows = rows[coefficient[rows] != 0]
-            places = self.jacobian.positions(rows - lag, lag, row_place, self.free_dofs)
+            columns = self._inertia_rows(lag) - lag
+            places = self.jacobian.positions(columns, lag, row_place, self.free_dofs)
             positions.append(places.ravel())
-            values.append((coefficient[rows, None] * mass[rows]).ravel())
         grasps = [np.zeros(0, dtype=np.int64)]
         if self.grasps_have_rows:
-            rows = np.arange(first, self.grid_rows)
+            rows = np.arange(self.dynamics.first_row, self.grid_rows)
             grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
-        return np.concatenate(positions), np.concatenate(values), np.concatenate(grasps)
+        return np.concatenate(positions), np.concatenate(grasps)
+
+    def _inertia_values(self, dynamics: Dynamics) -> Array:
+        """∂c/∂x of the inertia, in the order of its positions."""
+        stated = dynamics.mass_kg is self.dynamics.mass_kg
+        return self._stated_inertia if stated else self._inertia_of(dynamics.mass_kg)
+
+    @cached_property
+    def _stated_inertia(self) -> Array:
+        return self._inertia_of(self.dynamics.mass_kg)
+
+    def _inertia_of(self, mass_kg: Array) -> Array:
+        mass = mass_kg[:, self.free_dofs] * self.length_m / self.force_n
+        values = [np.zeros(0)]
+        for lag in range(self.dynamics.reach + 1):
+            rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
+            values.append((coefficient[rows, None] * mass[rows]).ravel())
+        return np.concatenate(values)
 
     @cached_property
     def _passing(self) -> PassingGrasps:
@@ -433,17 +463,21 @@ class Segment:
         dynamics = setting.dynamics
         forces = dynamics.linearise(x, setting.theta, self.linearisation_rows)
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
-        positions, inertia, grasps = self._jacobian_constants
-        values[positions] += inertia
+        positions, grasps = self._jacobian_constants
+        values[positions] += self._inertia_values(dynamics)
         skew = skew_values(self.body.pattern, forces.by_position_skew)
         if skew.size:
             self._skew_jacobian.fill(values, skew, skew, self.body.threads)
         self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
         values[grasps] = 1.0
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
-        weighed = dynamics.weighed_kg[dynamics.first_row :]
-        by_p[dynamics.first_row :] = setting.force_slopes(forces.by_theta, weighed)
-        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p)) / self.force_n
+        rows = slice(dynamics.first_row, self.grid_rows)
+        nu = dynamics.evaluation_states(x)[1]
+        by_p[rows] = setting.force_slopes(rows, forces.by_theta, nu)
+        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p))
+        if setting.joining:
+            by_p += setting.inertia_slopes(slice(None), dynamics.acceleration(x))
+        by_p /= self.force_n
         dynamics.without_taken(by_p)
         by_p[:, self.held_dofs] = 0
         if setting.held.moves:
@@ -452,14 +486,17 @@ class Segment:
         rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
-    def _force_weights(self, multipliers: Array) -> Array:
-        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
-        dynamics = self.dynamics
+    def _row_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the violations of the equations of motion."""
         row_weights = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
-        row_weights[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
+        row_weights[self.dynamics.first_row :, self.row_dofs] = by_time / self.force_n
         row_weights[:, self.held_dofs] = 0
-        dynamics.without_taken(row_weights)
+        return self.dynamics.without_taken(row_weights)
+
+    def _force_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
+        dynamics, row_weights = self.dynamics, self._row_weights(multipliers)
         return dynamics.without_taken(dynamics.combine_transposed(dynamics.tables.w, row_weights))
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
@@ -559,7 +596,8 @@ class Segment:
         dynamics, band = setting.dynamics, self.hessian
         first = dynamics.first_row
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
-        weights = self._force_weights(multipliers)[first:]
+        force_weights = self._force_weights(multipliers)
+        weights = force_weights[first:]
         curvature = self.body.curvature(
             *dynamics.evaluation_states(x),
             weights,
@@ -599,11 +637,39 @@ class Segment:
             by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
                 phi, of_goals
             )
+        by_phi += self._add_joining(x, setting, force_weights, multipliers, values)
         by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
         theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
         by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
         return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
+
+    def _add_joining(
+        self, x: Array, setting: Setting, force_weights: Array, multipliers: Array, values: Array
+    ) -> Array:
+        """Second derivatives by when loads join: (k, k) by φ, and into `values` by q and x."""
+        by_phi = np.zeros((len(self.nuisance.moving),) * 2)
+        row_weights, coupled = self._row_weights(multipliers), []
+        for load in setting.joining:
+            by_q, by_x, own = setting.curvature(load, x, force_weights, row_weights)
+            coupled += [by_q, self.length_m * by_x[:, load.dofs].ravel()]
+            by_phi[load.column] += own
+            by_phi[:, load.column] += np.where(np.arange(len(own)) == load.column, 0.0, own)
+        if coupled:
+            values[self.hessian_layout.coupled] += np.concatenate(coupled)
+        whole = np.zeros((self.nuisance.size, self.nuisance.size))
+        whole[np.ix_(self.nuisance.moving, self.nuisance.moving)] = by_phi
+        return whole
+
+    @property
+    def _coupled(self) -> tuple[Index, Index]:
+        """Rows (q, then x) and columns (φ) of what `_add_joining` writes."""
+        rows, columns = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        for load in self.joinings.at(np.zeros(self.nuisance.size)):
+            of_x = np.add.outer(np.arange(self.grid_rows) * self.dofs, load.dofs).ravel()
+            rows.append(np.concatenate([np.arange(self.nq), self.nq + of_x]))
+            columns.append(np.full(len(rows[-1]), self.nuisance.moving[load.column]))
+        return np.concatenate(rows), np.concatenate(columns)
 
     @cached_property
     def _curvature_rows(self) -> Array:
@@ -624,6 +690,7 @@ class Segment:
             columns,
             self.nuisance.size,
             self.length_m,
+            self._coupled,
         )
 
     # Structure --------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
+from .dynamics import Dynamics
 from .factorisation import NONE, Choice, Factor, Factoriser, Room
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
@@ -84,7 +85,7 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, and G's skew part."""
+    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, G's skew part, ν."""
 
     t: int
     force: Array
@@ -93,6 +94,7 @@ class _Step:
     by_theta: Array
     factor: Factor
     skew: Array
+    velocity: Array
 
 
 class BlockSolver:
@@ -167,17 +169,18 @@ class BlockSolver:
         if known is not None:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
-        inertia = self.dynamics.inertia(x)
+        inertia = self._at(setting).inertia(x)
         given = GivenMotion.of(self, setting, x)
         memory = known.memory if known else None
-        march = _Forward(self, setting, (len(self.free), count), memory)
+        march = _Forward(self, setting, (len(self.free), count), memory, x)
         march.remember(history, theta_q, done)
-        for step in self._steps(x, setting.theta, first=done, history=history):
+        for step in self._steps(x, setting, first=done, history=history):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros(march.shape)
             residual = march.residual(step, inertia[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
+            right[:, 1:] = march.inertia_slopes(step)
             force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force, given)
@@ -194,12 +197,12 @@ class BlockSolver:
             Where a timestep's equations are singular or not finite.
         """
         shape = (x.shape[1], len(self.segment.moving))
-        march = _Forward(self, setting, (len(self.free), shape[1]))
+        march = _Forward(self, setting, (len(self.free), shape[1]), x=x)
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
         march.remember(history, setting.columns(shape[1], first=0))
         yield from np.zeros((self.dynamics.first_row, *shape))
-        for step in self._steps(x, setting.theta, history=history):
-            row, right = np.zeros(shape), np.zeros(march.shape)
+        for step in self._steps(x, setting, history=history):
+            row, right = np.zeros(shape), march.inertia_slopes(step)
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
                 row[given.held_dofs] = given.of_held[step.t]
@@ -219,25 +222,25 @@ class BlockSolver:
         history = self.dynamics.history(x, setting.theta)
         march.remember(history, np.zeros((len(setting.theta), count)))
         yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
-        for step in self._steps(x, setting.theta, history=history):
+        for step in self._steps(x, setting, history=history):
             row, nothing = np.zeros((x.shape[1], count)), np.zeros((2, *march.shape))
             row[self.free] = march.advance(step, nothing[0], nothing[1], given)
             row[given.held_dofs] = given.of_held[step.t]
             yield row
 
     @one_blas_thread()
-    def backward(self, x: Array, theta: Array, gradient: Array) -> Array:
+    def backward(self, x: Array, setting: Setting, gradient: Array) -> Array:
         """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].
 
         Dofs that a passing grasp holds have zeros.
         """
-        dynamics, reach = self.dynamics, self.dynamics.reach
+        dynamics, reach = self._at(setting), self.dynamics.reach
         rows = [Row.of(dynamics, t) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
-        history = dynamics.history(x, theta)
+        history = dynamics.history(x, setting.theta)
         weights = Weights(history) if history else None
-        for step in self._steps(x, theta, backward=True, history=history):
+        for step in self._steps(x, setting, backward=True, history=history):
             t = step.t
             through_stress = weights.pulled()[self.free] if weights else 0.0
             lags = range(min(reach, t) + 1)
@@ -316,16 +319,20 @@ class BlockSolver:
             self._held.data += self._held_signs * skew[self._held_source]
         return self._held @ columns
 
+    def _at(self, setting: Setting) -> Dynamics:
+        """The equations of motion of the rows at a setting."""
+        return setting.dynamics.first_rows(self.dynamics.rows)
+
     def _steps(
         self,
         x: Array,
-        theta: Array,
+        setting: Setting,
         backward: bool = False,
         first: int = 0,
         history: History | None = None,
     ) -> Iterator[_Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
-        dynamics, body = self.dynamics, self.body
+        dynamics, body, theta = self._at(setting), self.body, setting.theta
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room() for _ in range(self.chunk if self._needs_rooms else 0)]
@@ -337,7 +344,7 @@ class BlockSolver:
                 carried = dynamics.carried(history, slice(start, stop))
                 at = body.linearise(xi[here], nu[here], theta, dof_mass=damped, carried=carried)
             with self.stopwatch.solving():
-                factors = self._factorise(at, slice(start, stop), rooms)
+                factors = self._factorise(dynamics, at, slice(start, stop), rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
@@ -348,15 +355,16 @@ class BlockSolver:
                     at.by_theta[k],
                     factors[k],
                     at.by_position_skew[k],
+                    nu[start - dynamics.first_row + k],
                 )
 
     def _factorise(
-        self, at: Linearisation, rows: slice, rooms: Sequence[Room] = ()
+        self, dynamics: Dynamics, at: Linearisation, rows: slice, rooms: Sequence[Room] = ()
     ) -> list[Factor]:
-        pattern, taken = self.body.pattern, self.dynamics.taken[rows]
+        pattern, taken = self.body.pattern, dynamics.taken[rows]
 
         def matrix(k: int) -> tuple[Array, Array]:
-            row = Row.of(self.dynamics, rows.start + k)
+            row = Row.of(dynamics, rows.start + k)
             values = row.block(at.by_position[k], at.by_velocity[k], pattern)
             skew = row.skew_block(at.by_position_skew[k])
             if taken[k].any():
@@ -375,7 +383,7 @@ class BlockSolver:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
                 f"motion cannot be solved: {error}",
-                float(self.dynamics.t_s[rows.start]),
+                float(dynamics.t_s[rows.start]),
             ) from error
 
 
@@ -465,9 +473,13 @@ class _Forward:
         setting: Setting,
         shape: tuple[int, int],
         memory: Memory | None = None,
+        x: Array | None = None,
     ) -> None:
         self.solver = solver
         self.setting = setting
+        self.dynamics = solver._at(setting)
+        timed = x is not None and setting.joining
+        self._acceleration = self.dynamics.acceleration(x) if timed else None
         self.shape = shape
         reach = solver.dynamics.reach
         nothing = (np.zeros(shape),) * reach
@@ -499,8 +511,8 @@ class _Forward:
 
     def residual(self, step: _Step, inertia: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
-        solver, row = self.solver, Row.of(self.solver.dynamics, step.t)
-        force = (step.force + self.setting.dynamics.external_force_n[step.t])[solver.free]
+        solver, row = self.solver, Row.of(self.dynamics, step.t)
+        force = (step.force + self.dynamics.external_force_n[step.t])[solver.free]
         solver.without_taken(step.t, force)
         total = row.w[0] * force - inertia[solver.free]
         if self.weighs_past:
@@ -510,15 +522,22 @@ class _Forward:
 
     def force_slopes(self, step: _Step) -> Array:
         """∂F/∂p on the free dofs."""
-        weighed = self.setting.dynamics.weighed_kg[step.t]
-        return self.setting.force_slopes(step.by_theta, weighed)[self.solver.free]
+        slopes = self.setting.force_slopes(step.t, step.by_theta, step.velocity)
+        return slopes[self.solver.free]
+
+    def inertia_slopes(self, step: _Step) -> Array:
+        """∂c/∂p on the free dofs through the mass that moves."""
+        free, moving = self.solver.free, len(self.solver.segment.moving)
+        if self._acceleration is None:
+            return np.zeros((len(free), moving))
+        return self.setting.inertia_slopes(step.t, self._acceleration[step.t])[free]
 
     def advance(
         self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None
     ) -> Array:
         """Y_t from R_t and F_R, each (free, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
-        row = Row.of(solver.dynamics, t)
+        row = Row.of(self.dynamics, t)
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)
