@@ -17,6 +17,7 @@ tare of a sensor       of each component that it measures [N] or [N m], see `sen
 its clock              τ, how much later than its times say it measured [s]
 its lag                T of a first-order low-pass [s]
 its tool               mass [kg], and centre (3) about the sensor's point [m]
+joining                how much later than stated a point mass or force joins, or leaves [s]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
@@ -29,8 +30,9 @@ of the grasped nodes: they are held at U_t H X.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
@@ -39,7 +41,10 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp, held_nodes
+from ..experiment.loads import Change, Force, PointMass
 from ..experiment.wrench import COMPONENTS, UNITS
+
+Load = TypeVar("Load", PointMass, Force)
 
 # Samples are read between neighbours, up to this many away from the chart's.
 LARGEST_SHIFT_SAMPLES = 2.0
@@ -47,6 +52,9 @@ LARGEST_SHIFT_SAMPLES = 2.0
 LARGEST_SHIFT_SHARE = 0.25
 # The clock and the lag of a sensor may be this many deviations of their priors.
 SENSOR_DEVIATIONS = 3.0
+# A load joins within this many standard deviations of its prior, further than any that is right,
+# and within the recording: not quite at its ends, where it would join at once or never.
+LARGEST_DELAY, NARROWER = 4.0, 1 - 1e-9
 # A place may move this many edges of the mesh in a step.
 EDGES_A_STEP = 2.0
 KINDS = (
@@ -58,11 +66,26 @@ KINDS = (
     "tilt",
     "grasp-turn",
     "grasp-shift",
+    "joining",
 )
 # Those of a grasp's zero have its number behind them.
 OF_GRASP = "zero"
 # Those of a sensor have its number behind them: "tare 0".
 OF_SENSOR = ("tare", "sensor-time", "sensor-lag", "tool-mass", "tool-centre")
+# The time at which a load joins may move this many samples in a step.
+SAMPLES_A_STEP = 2.0
+
+
+class Timed(NamedTuple):
+    """A load that joins or leaves at an estimated time."""
+
+    load: PointMass | Force
+    change: Change
+
+    @property
+    def stated_s(self) -> float:
+        """The time stated."""
+        return getattr(self.load, self.change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +103,8 @@ class NuisanceMap:
     gravity_m_s2 : (3,) as stated
     pivot_m : (3,) c
     grasp_pivot_m : (3,) c_h
+    timed : of each φ of the kind "joining", what joins or leaves
+    recorded_s : first and last time of the recording
     """
 
     names: tuple[str, ...]
@@ -91,6 +116,8 @@ class NuisanceMap:
     gravity_m_s2: Array
     pivot_m: Array
     grasp_pivot_m: Array
+    timed: tuple[Timed, ...]
+    recorded_s: tuple[float, float]
 
     @classmethod
     def of(cls, experiment: Experiment) -> NuisanceMap:
@@ -104,6 +131,9 @@ class NuisanceMap:
         reach = np.where(linear, 1e3, 1.0).astype(float)
         of_place = np.array([kind == "place" for kind in kinds], dtype=bool)
         reach[of_place] = np.minimum(1e3, EDGES_A_STEP * edge_m / scales[of_place])
+        of_joining = np.array([kind == "joining" for kind in kinds], dtype=bool)
+        joining_s = SAMPLES_A_STEP * experiment.timestep_s
+        reach[of_joining] = np.minimum(1.0, joining_s / scales[of_joining])
         held = held_nodes(experiment.grasps)
         return cls(
             tuple(f"{experiment.name}: {label}" for label in labels),
@@ -115,6 +145,8 @@ class NuisanceMap:
             np.array(experiment.gravity_m_s2),
             experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
             body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
+            tuple(timed for _, timed in _timed(experiment)),
+            (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
 
     @property
@@ -128,9 +160,9 @@ class NuisanceMap:
 
     @cached_property
     def moving(self) -> NDArray[np.int64]:
-        """Positions in φ of what changes the motion: what turns gravity, or moves the grasps."""
+        """Positions in φ of what changes the motion: gravity, grasps, and when loads join."""
         zeros = {kind for kind in self.kinds if kind.startswith(OF_GRASP)}
-        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", *zeros)
+        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", *zeros, "joining")
 
     @cached_property
     def moves_grasps(self) -> bool:
@@ -161,7 +193,27 @@ class NuisanceMap:
             if kind.startswith(("sensor-time", "sensor-lag", "tool-mass")):
                 low[k] = -SENSOR_DEVIATIONS if kind.startswith("sensor-time") else 0.0
                 high[k] = np.inf if kind.startswith("tool-mass") else SENSOR_DEVIATIONS
+        for k, timed in zip(self.places("joining"), self.timed, strict=True):
+            way = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
+            low[k], high[k] = np.clip(NARROWER * way, -LARGEST_DELAY, LARGEST_DELAY)
         return low, high
+
+    def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
+        """The experiment with its loads joining and leaving when φ says."""
+        if not self.timed:
+            return experiment
+        late_s = (phi * self.scales)[self.places("joining")]
+
+        def moved(load: Load) -> Load:
+            times = {
+                timed.change: timed.stated_s + float(late)
+                for timed, late in zip(self.timed, late_s, strict=True)
+                if timed.load is load
+            }
+            return replace(load, **times) if times else load
+
+        masses, forces = map(moved, experiment.masses), map(moved, experiment.forces)
+        return replace(experiment, masses=masses, forces=forces)
 
     def of_sensor(self, kind: str, number: int) -> NDArray[np.int64]:
         """Positions in φ of what is not known of a sensor."""
@@ -280,6 +332,7 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
     for k, grasp in enumerate(experiment.grasps):
         which = f"zero of grasp {k + 1}"
         add(f"{OF_GRASP} {k}", which, "m", " ".join(grasp.zero), wanted.displacement_zero_m)
+    entries += [("joining", label, wanted.joining_s) for label, _ in _timed(experiment)]
     return entries + _sensor_entries(experiment)
 
 
@@ -305,6 +358,20 @@ def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
         for axis in "xyz" if wanted.tool_kg else "":
             add("tool-centre", f"centre of the tool{which}, {axis}", "m", wanted.tool_m)
     return entries
+
+
+def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
+    """What joins or leaves at a time that is to be estimated, and its label."""
+    if not experiment.nuisance.joining_s:
+        return []
+    said: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
+    return [
+        (f"{said[change]} of {kind} {number} [s]", Timed(load, change))
+        for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
+        for number, load in enumerate(loads, start=1)
+        for change in get_args(Change)
+        if experiment.changes(load, change)
+    ]
 
 
 def rotation(turn: ca.SX) -> ca.SX:
