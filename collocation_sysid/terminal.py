@@ -259,7 +259,7 @@ def _nuisance(finished: Run) -> list[Text]:
     for part in collocation.parts(finished.solution.z):
         name = part.segment.experiment.name
         said = _places(finished.places[name]) + _lengths(part) + _clock(part)
-        said += _of_sensors(part) + _drives(part)
+        said += _of_sensors(part) + _drives(part) + _joining(part, finished)
         if said:
             lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
     return lines
@@ -343,6 +343,23 @@ def _drives(part: Part) -> list[str]:
             said.append(f"{what} by {_short(1e2 * value)} % (prior {_short(1e2 * prior)})")
         else:
             said.append(f"{what} {_short(value)} {unit} (prior {_short(prior)})")
+    return said
+
+
+def _joining(part: Part, finished: Run) -> list[str]:
+    """When loads join and leave, in words."""
+    nuisance, said = part.segment.nuisance, []
+    known = finished.uncertainty.nuisance if finished.uncertainty else {}
+    for k, timed in zip(nuisance.places("joining"), nuisance.timed, strict=True):
+        name, prior = nuisance.names[k], 1e3 * float(nuisance.scales[k])
+        late, deviation = prior * float(part.phi[k]), prior * known.get(name, np.nan)
+        what = name.removeprefix(f"{part.segment.experiment.name}: ").removesuffix(" [s]")
+        when = "later" if late > 0 else "earlier"
+        error = "" if np.isnan(deviation) else f" ± {_short(deviation)}"
+        said.append(
+            f"{what} {_short(abs(late))}{error} ms {when} than {timed.stated_s:g} s "
+            f"(prior {_short(prior)})"
+        )
     return said
 
 

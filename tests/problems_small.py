@@ -167,6 +167,22 @@ def bar_let_go(steps: int = 10) -> Experiment:
     )
 
 
+def bar_loaded(steps: int = 10) -> Experiment:
+    """A bar that a mass joins and leaves, and a force pulls for a while, at unknown times."""
+    bar = bar_in_two_hands(steps)
+    still, moving = bar.grasps
+    end, dt = moving.nodes, bar.timestep_s
+    pulling = Force(end[1:], [[0.01, 0.02, 0.01]], from_s=1.3 * dt, until_s=3.9 * dt)
+    return replace(
+        bar,
+        name="bar loaded",
+        grasps=(still,),
+        masses=(PointMass(end[:2], 0.003, 1.6 * dt, until_s=4.2 * dt), PointMass(end, 0.001)),
+        forces=(pulling,),
+        nuisance=Nuisance.none(gravity_rad=0.03, joining_s=0.004),
+    )
+
+
 def cube_with_nuisance(steps: int = 10) -> Experiment:
     """The hung cube with everything estimated that an experiment may not know of itself."""
     nuisance = Nuisance(

@@ -15,10 +15,10 @@ from ..errors import InputError
 from ..fem.pattern import Joined
 from .actuator import Actuator
 from .arrays import read_only_floats
-from .clock import STEP_TOLERANCE, first_time_fault, sample_interval_s
+from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
 from .freedom import free_motions
 from .grasp import Grasp, held_dofs
-from .loads import Force, PointMass
+from .loads import Change, Force, PointMass, ramp
 from .markers import Markers
 from .nuisance import Nuisance
 from .pressure import Pressure
@@ -240,15 +240,39 @@ class Experiment:
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
-            mass = mass + point.at_nodes(times, n)
+            mass = mass + np.outer(self.share(point, times), point.at_nodes(n))
         return mass
+
+    def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
+        """Return how much of a load is there at `t_s` (T,), from 0 to 1.
+
+        It joins and leaves between a sample before and a sample after its times, see `loads.ramp`;
+        all is there from the first sample on where it joins by then. Where the experiment is
+        static it joins and leaves at once.
+        """
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        joined, left = (self._changed(load, change, times) for change in get_args(Change))
+        return joined - left
+
+    def _changed(self, load: PointMass | Force, change: Change, times: Array) -> Array:
+        at_s = getattr(load, change)
+        if self.static:
+            return (times >= at_s - TIME_TOLERANCE_S).astype(np.float64)
+        if self.changes(load, change):
+            return ramp((times - at_s) / self.timestep_s)
+        return np.full(len(times), float(at_s <= self.t_s[0]))
+
+    def changes(self, load: PointMass | Force, change: Change) -> bool:
+        """Whether a load joins, or leaves, within the recording of a motion."""
+        within = self.t_s[0] < getattr(load, change) < self.t_s[-1]
+        return bool(within) and not self.static
 
     def node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the forces besides gravity on the nodes at `t_s` (T,), (T, n, 3)."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
-            total = total + force.at_nodes(times, n)
+            total = total + self.share(force, times)[:, None, None] * force.at_nodes(times, n)
         return total
 
     @property

@@ -36,6 +36,9 @@ class Nuisance:
     displacement_zero_m : float or None
         By how much displacements are off, constant in time, along each axis of a grasp whose zero
         is not known.
+    joining_s : float or None
+        How much later than stated point masses and forces join or leave, each that does within the
+        recording.
     pose_shift_m, pose_turn_rad : float or None
         A small rigid motion, constant in time, by which grasps and body are off in the frame of
         the markers, such as that of cameras. It turns the body against gravity.
@@ -64,6 +67,7 @@ class Nuisance:
     hand_eye_m: float | None = 1e-3
     hand_eye_rad: float | None = 0.5 * DEGREE
     displacement_zero_m: float | None = 1e-4
+    joining_s: float | None = 1e-2
     pose_shift_m: float | None = None
     pose_turn_rad: float | None = None
     camera_offset_m: float | None = None

@@ -454,6 +454,15 @@ class Body(Model):
         starts = zip(self.parts, self.starts, strict=False)
         return [start + part.of_gamma_m for part, start in starts]
 
+    @cached_property
+    def tied_shares(self) -> dict[int, Array]:
+        """Place of each part's γ_m in θ, and its share (3n,) in what is tied to a dof."""
+        return dict(zip(self._gamma_places, self._tied_shares, strict=True))
+
+    def tied_drag(self, theta: Theta) -> Array:
+        """(3n,) γ_m of what is tied to every dof [1/s]."""
+        return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
+
     def _damped(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Place of each part's γ_m in θ, and the mass (3n,) or (T, 3n) that it damps.
 

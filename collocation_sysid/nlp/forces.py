@@ -56,8 +56,8 @@ class Mass:
             return self.tied_kg
         return self.tied_kg[0] if self.tied_kg[0].any() else None
 
-    def row(self, t: int, theta: Theta) -> Array:
-        """The same (3n,) at one of the times."""
+    def row(self, t: int | slice, theta: Theta) -> Array:
+        """The same (3n,) at one of the times, or (…, 3n) at some."""
         return self.body.mass_of_dofs(theta) + self.tied_kg[t]
 
 
@@ -119,6 +119,11 @@ class Forces:
     def under_gravity(self, change_m_s2: Array) -> Forces:
         """The same with a constant (3,) added to gravity."""
         return replace(self, gravity_m_s2=self.gravity_m_s2 + change_m_s2)
+
+    def joined_by(self, tied_kg: Array, applied_n: Array) -> Forces:
+        """The same with more mass tied to it, and more forces on its nodes, (T, 3n) both."""
+        mass = replace(self.mass, tied_kg=self.mass.tied_kg + tied_kg)
+        return replace(self, mass=mass, applied_n=self.applied_n + applied_n)
 
     def scaled(self, share: float) -> Forces:
         """The same with a share of the loads, those of tendons and pressures too."""

@@ -18,12 +18,12 @@ class HessianLayout:
     Attributes
     ----------
     x_indptr, x_indices : columns of x; rows 0 … nq − 1 are q, then x
-    phi_indptr, phi_indices : columns of φ; rows likewise, φ after the last x
+    phi_indptr, phi_indices : columns of φ; rows 0 … nq − 1 are q, then x, then φ
     band : place of each entry of the dynamics' band; None where the band is all there is
     loss, scale : place of each entry of the loss, and its factor in scaled variables
     phi : place of each entry (i <= j) of φ by φ, row after row
-    tilt : (k, nq) places of the entries of some φ by q
-    driven : (variables k,) places of the entries of other φ by x, those of one x together
+    coupled : place of each entry of φ by q and x that the dynamics has
+    driven : (variables k,) places of the entries of other φ by all x, those of one x together
     diagonal : places of the diagonal of x
     """
 
@@ -35,7 +35,7 @@ class HessianLayout:
     loss: Index
     scale: Array
     phi: Index
-    tilt: Index
+    coupled: Index
     driven: Index
     diagonal: Index
 
@@ -60,7 +60,7 @@ class HessianLayout:
         columns: Index,
         nphi: int,
         length_m: float,
-        tilts: Index,
+        coupled: tuple[Index, Index],
         drives: Index,
     ) -> HessianLayout:
         """Merge the band in the columns of x with the loss's entries.
@@ -71,7 +71,8 @@ class HessianLayout:
         rows, columns : entries of the loss by (x, φ), upper triangle, sorted by column
         nphi : number of φ
         length_m : unit of the scaled x
-        tilts, drives : (k,) which φ have entries by q, and by all x
+        coupled : rows and columns of the dynamics' entries of φ by (q, x), columns from the first φ
+        drives : (k,) which φ have entries by all x
         """
         of_x = columns < variables
         band_columns = np.repeat(np.arange(variables), np.diff(band.indptr))
@@ -85,26 +86,26 @@ class HessianLayout:
         loss[of_x] = np.searchsorted(merged, wanted)
 
         triangle = [(i, j) for j in range(nphi) for i in range(j + 1)]
-        dense = np.array(triangle, dtype=np.int64).reshape(-1, 2) + height
+        dense = np.array(triangle, dtype=np.int64).reshape(-1, 2)
         tall = height + nphi
-        of_phi = (nq + columns[~of_x]) * tall + nq + rows[~of_x]
-        of_tilts = (height + tilts[:, None]) * tall + np.arange(nq)
-        of_drives = ((height + drives) * tall + nq + np.arange(variables)[:, None]).ravel()
-        of_pairs = dense[:, 1] * tall + dense[:, 0]
-        phi_codes = np.unique(np.concatenate([of_phi, of_pairs, of_tilts.ravel(), of_drives]))
+        of_phi = (columns[~of_x] - variables) * tall + nq + rows[~of_x]
+        of_dynamics = coupled[1] * tall + coupled[0]
+        of_drives = (drives * tall + nq + np.arange(variables)[:, None]).ravel()
+        among_phi = dense[:, 1] * tall + height + dense[:, 0]
+        phi_codes = np.unique(np.concatenate([of_phi, of_dynamics, of_drives, among_phi]))
         loss[~of_x] = len(merged) + np.searchsorted(phi_codes, of_phi)
-        first, second = (index + height for index in np.triu_indices(nphi))
+        first, second = np.triu_indices(nphi)
         placed = None if merged is codes else np.searchsorted(merged, codes)
         return cls(
             x_indptr=x_indptr,
             x_indices=merged % height,
-            phi_indptr=np.searchsorted(phi_codes, (height + np.arange(nphi + 1)) * tall),
+            phi_indptr=np.searchsorted(phi_codes, np.arange(nphi + 1) * tall),
             phi_indices=phi_codes % tall,
             band=placed,
             loss=loss,
             scale=length_m ** ((rows < variables).astype(float) + (columns < variables)),
-            phi=len(merged) + np.searchsorted(phi_codes, second * tall + first),
-            tilt=len(merged) + np.searchsorted(phi_codes, of_tilts),
+            phi=len(merged) + np.searchsorted(phi_codes, second * tall + height + first),
+            coupled=len(merged) + np.searchsorted(phi_codes, of_dynamics),
             driven=len(merged) + np.searchsorted(phi_codes, of_drives),
             diagonal=diagonal if placed is None else placed[diagonal],
         )

@@ -122,13 +122,11 @@ class _Stepper:
         return Mass.of(self.experiment, time_s).row(0, self.theta)
 
     def _after_a_change(self, state: _State, goal_s: float) -> _State:
-        """The state with the accelerations after nodes are let go or a mass has joined."""
+        """The state with the accelerations after nodes are let go."""
         before, after = self._solver(state.t_s), self._solver(goal_s)
-        joined = self._mass(goal_s) != self._mass(state.t_s)
-        if before is after and not joined.any():
+        if before is after:
             return state
-        jumps = np.union1d(np.setdiff1d(after.free, before.free), np.flatnonzero(joined))
-        return self._balanced(state, goal_s, np.intersect1d(jumps, after.free))
+        return self._balanced(state, goal_s, np.setdiff1d(after.free, before.free))
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""

@@ -23,6 +23,7 @@ from .charts import Chart
 from .dynamics import Dynamics
 from .held import Grasping, Held
 from .hessian_layout import HessianLayout
+from .joining import Joinings
 from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
@@ -312,7 +313,13 @@ class Segment:
         theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
         gravity_phi_phi = np.zeros((3, 0, 0))
-        moving, drives = self.nuisance.moving, self.nuisance.drives(phi)
+        moving, joining = self.nuisance.moving, self.joinings.at(phi)
+        drives = self.nuisance.drives(phi)
+        if joining:
+            dynamics = dynamics.with_loads(
+                sum(np.outer(load.share[0], load.mass_kg) for load in joining),
+                sum(load.share[0, :, None] * load.force_n for load in joining),
+            )
         if len(moving):
             dynamics = dynamics.driven(drives[0])
             gravity, first, second = self.nuisance.gravity(phi)
@@ -320,15 +327,16 @@ class Segment:
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
         held = self.grasping.at(phi)
-        drive_phi = drives[1][:, moving]
-        return Setting(
-            theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi, drive_phi, held
-        )
+        slopes = gravity_phi, gravity_phi_phi, drives[1][:, moving]
+        return Setting(theta, theta_q, theta_qq, dynamics, *slopes, held, joining)
+
+    @cached_property
+    def joinings(self) -> Joinings:
+        """Loads that join or leave at estimated times."""
+        return Joinings(self.experiment, self.nuisance, self.dynamics)
 
     def corrected(self, phi: Array) -> Experiment:
-        """The experiment in the body's frame: gravity turned, the body moved in its grasps, and
-        tensions and pressures as they are.
-        """
+        """The experiment in the body's frame, as φ has gravity, grasps, loads and drives."""
         if not len(self.nuisance.moving):
             return self.experiment
         grasps = self.experiment.grasps
@@ -338,19 +346,20 @@ class Segment:
                 replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
                 for k, g in enumerate(grasps)
             )
-        gravity = self.nuisance.gravity(phi)[0]
+        gravity, timed = self.nuisance.gravity(phi)[0], self.nuisance.with_times
         off = iter(self.nuisance.drives(phi)[0])
         tendons, pressures = (
             tuple(actuator.off_by(*next(off)) for actuator in actuators)
             for actuators in (self.experiment.tendons, self.experiment.pressures)
         )
-        return replace(
+        changed = replace(
             self.experiment,
             gravity_m_s2=gravity,
             grasps=grasps,
             tendons=tendons,
             pressures=pressures,
         )
+        return timed(changed, phi)
 
     def grasped(self, x: Array, phi: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
@@ -423,35 +432,39 @@ class Segment:
             blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
         return blocks
 
+    def _inertia_rows(self, lag: int) -> Index:
+        """Grid times whose rows have inertia at a lag."""
+        rows = np.arange(max(self.dynamics.first_row, lag), self.grid_rows)
+        return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
+
     @cached_property
-    def _jacobian_constants(self) -> tuple[Index, list[tuple[Index, Array]], Index]:
-        """Positions of the inertia, its rows and coefficients, and positions of unit entries."""
-        first = self.dynamics.first_row
+    def _jacobian_constants(self) -> tuple[Index, Index]:
+        """Positions of the inertia, and of the unit grasp entries."""
         row_place = np.searchsorted(self.row_dofs, self.free_dofs)
-        positions, inertia = [np.zeros(0, dtype=np.int64)], []
+        positions = [np.zeros(0, dtype=np.int64)]
         for lag in range(self.dynamics.reach + 1):
-            coefficient = self.dynamics.inertia_coefficient(lag)
-            rows = np.arange(max(first, lag), self.grid_rows)
-            rows = rows[coefficient[rows] != 0]
-            places = self.jacobian.positions(rows - lag, lag, row_place, self.free_dofs)
+            columns = self._inertia_rows(lag) - lag
+            places = self.jacobian.positions(columns, lag, row_place, self.free_dofs)
             positions.append(places.ravel())
-            inertia.append((rows, coefficient[rows, None]))
         grasps = [np.zeros(0, dtype=np.int64)]
         if self.grasps_have_rows:
-            rows = np.arange(first, self.grid_rows)
+            rows = np.arange(self.dynamics.first_row, self.grid_rows)
             grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
-        return np.concatenate(positions), inertia, np.concatenate(grasps)
+        return np.concatenate(positions), np.concatenate(grasps)
 
-    def _inertia(self, theta: Array) -> Array:
-        """Values of the inertia in ∂c/∂x."""
-        mass = self.dynamics.mass.at(theta)[:, self.free_dofs] * self.length_m / self.force_n
-        parts = [(of_row * mass[rows]).ravel() for rows, of_row in self._jacobian_constants[1]]
-        return np.concatenate([np.zeros(0), *parts])
+    def _inertia(self, dynamics: Dynamics, theta: Array) -> Array:
+        """∂c/∂x of the inertia, in the order of its positions."""
+        mass = dynamics.mass.at(theta)[:, self.free_dofs] * self.length_m / self.force_n
+        values = [np.zeros(0)]
+        for lag in range(self.dynamics.reach + 1):
+            rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
+            values.append((coefficient[rows, None] * mass[rows]).ravel())
+        return np.concatenate(values)
 
     @cached_property
-    def _known_inertia(self) -> Array | None:
-        """The same where it does not depend on θ."""
-        return None if self.body.mass_slopes else self._inertia(np.zeros(0))
+    def _known_inertia(self) -> Array:
+        """The same where it does not depend on (q, φ)."""
+        return self._inertia(self.dynamics, np.zeros(0))
 
     @cached_property
     def _passing(self) -> PassingGrasps:
@@ -482,20 +495,23 @@ class Segment:
         dynamics = setting.dynamics
         forces = dynamics.linearise(x, setting.theta, self.linearisation_rows)
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
-        positions, _, grasps = self._jacobian_constants
-        known = self._known_inertia
-        values[positions] += self._inertia(setting.theta) if known is None else known
+        positions, grasps = self._jacobian_constants
+        if setting.mass_moves:
+            values[positions] += self._inertia(dynamics, setting.theta)
+        else:
+            values[positions] += self._known_inertia
         skew = skew_values(self.pattern, forces.by_position_skew)
         if skew.size:
             self._skew_jacobian.fill(values, skew, skew, self.body.threads)
         self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
         values[grasps] = 1.0
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
-        weighed = dynamics.evaluated.mass.at(setting.theta)
-        by_p[dynamics.first_row :] = setting.force_slopes(forces.by_theta, weighed)
+        rows, nu = slice(dynamics.first_row, None), dynamics.evaluation_states(x)[1]
+        by_p[rows] = setting.force_slopes(rows, forces.by_theta, nu)
         by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p))
-        if self.body.mass_slopes:
-            by_p -= setting.inertia_slopes(dynamics.acceleration(x), slice(None))
+        if setting.mass_moves:
+            whole = slice(None)
+            by_p -= setting.inertia_slopes(whole, dynamics.acceleration(x), whole)
         by_p /= self.force_n
         dynamics.without_taken(by_p)
         by_p[:, self.held_dofs] = 0
@@ -661,8 +677,7 @@ class Segment:
             by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
                 phi, of_goals
             )
-        if layout.tilt.size:
-            values[layout.tilt] = self._weight_curvature(weights, setting)
+        by_phi += self._add_coupling(x, setting, weights, multipliers, values)
         by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
         theta_theta = curvature.theta_theta.sum(axis=0)
@@ -688,8 +703,9 @@ class Segment:
 
     @cached_property
     def _tilts(self) -> Index:
-        """Positions in φ of what may turn gravity, where it pulls at a mass that is estimated."""
-        return self.nuisance.moving if self.body.mass_slopes else np.zeros(0, dtype=np.int64)
+        """Columns, of those that move the body, that turn gravity where it pulls at an own ρ."""
+        turning = np.isin(self.nuisance.moving, self.nuisance.places("turn", "tilt"))
+        return np.flatnonzero(turning & bool(self.body.mass_slopes))
 
     @cached_property
     def _driving(self) -> Index:
@@ -697,12 +713,12 @@ class Segment:
         return np.flatnonzero(np.isin(self.nuisance.moving, self.nuisance.of_drives))
 
     def _weight_curvature(self, weights: Array, setting: Setting) -> Array:
-        """Second derivatives of weights · M g by the φ that turn gravity, and q."""
+        """Second derivatives (m, nq) of weights · M g by the φ that turn gravity, and q."""
         by_q = np.zeros((3, self.nq))
         for density, slope in self.body.mass_slopes.items():
             pull = (weights.sum(axis=0) * slope).reshape(-1, 3).sum(axis=0)
             by_q += np.outer(pull, setting.theta_q[density])
-        return setting.gravity_phi.T @ by_q
+        return setting.gravity_phi[:, self._tilts].T @ by_q
 
     def _inertia_curvature(
         self, x: Array, setting: Setting, multipliers: Array
@@ -718,6 +734,38 @@ class Segment:
             of_theta[density] = np.einsum("ti,ti,i->", weights, acceleration, slope)
             of_x = of_x + (pulled * slope)[..., None] * setting.theta_q[density]
         return of_x, of_theta
+
+    def _add_coupling(
+        self, x: Array, setting: Setting, force_weights: Array, multipliers: Array, values: Array
+    ) -> Array:
+        """Second derivatives by what turns gravity, and by when loads join, and by q and x.
+
+        They go into `values`; those (k, k) of the loads by φ are returned.
+        """
+        by_phi = np.zeros((len(self.nuisance.moving),) * 2)
+        row_weights = self._row_weights(multipliers)
+        coupled = [self._weight_curvature(force_weights, setting).ravel()]
+        for load in setting.joining:
+            by_q, by_x, own = setting.curvature(load, x, force_weights, row_weights)
+            coupled += [by_q, self.length_m * by_x[:, load.dofs].ravel()]
+            by_phi[load.column] += own
+            by_phi[:, load.column] += np.where(np.arange(len(own)) == load.column, 0.0, own)
+        values[self.hessian_layout.coupled] += np.concatenate(coupled)
+        whole = np.zeros((self.nuisance.size, self.nuisance.size))
+        whole[np.ix_(self.nuisance.moving, self.nuisance.moving)] = by_phi
+        return whole
+
+    @property
+    def _coupled(self) -> tuple[Index, Index]:
+        """Rows (q, then x) and columns (φ) of what `_add_coupling` writes."""
+        of_q, moving = np.arange(self.nq), self.nuisance.moving
+        rows = [np.tile(of_q, len(self._tilts))]
+        columns = [np.repeat(moving[self._tilts], self.nq)]
+        for load in self.joinings.at(np.zeros(self.nuisance.size)):
+            of_x = np.add.outer(np.arange(self.grid_rows) * self.dofs, load.dofs).ravel()
+            rows.append(np.concatenate([of_q, self.nq + of_x]))
+            columns.append(np.full(len(rows[-1]), moving[load.column]))
+        return np.concatenate(rows), np.concatenate(columns)
 
     @cached_property
     def _curvature_rows(self) -> Array:
@@ -738,7 +786,7 @@ class Segment:
             columns,
             self.nuisance.size,
             self.length_m,
-            self._tilts,
+            self._coupled,
             self.nuisance.of_drives,
         )
 

@@ -80,7 +80,8 @@ class Sensing:
         reaction = reactions(dynamics, mass_kg, held.force, acceleration)
         by = reaction_slopes(dynamics, mass_kg, held.slopes, moved)
         if first is not None:
-            by[..., first:] += self.setting.inertia_slopes(acceleration, dofs)
+            rows = slice(len(x))
+            by[..., first:] += self.setting.inertia_slopes(rows, acceleration, dofs)
         return Forced(reaction, x[:, dofs], by, moved)
 
     # Residuals --------------------------------------------------------------------------------
@@ -168,10 +169,12 @@ class Sensing:
         first, whole = dynamics.first_row, np.zeros_like(x)
         whole[:, dofs] = -dynamics.combine_transposed(t.w, weights)
         at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
-        slopes = setting.force_slopes(at.by_theta, dynamics.evaluated.mass.at(setting.theta))
+        nu = dynamics.evaluation_states(x)[1]
+        slopes = setting.force_slopes(slice(first, None), at.by_theta, nu)
         by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
-        if segment.body.mass_slopes:
-            own = setting.inertia_slopes(dynamics.acceleration(x)[:, dofs], dofs)
+        if setting.mass_moves:
+            acceleration = dynamics.acceleration(x)[:, dofs]
+            own = setting.inertia_slopes(slice(None), acceleration, dofs)
             by_p += np.einsum("tg,tgp->p", weights, own)
         rows = HeldRows(dynamics.pattern, dofs)
         state, rate = np.zeros_like(x), np.zeros_like(x)

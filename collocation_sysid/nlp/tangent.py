@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
+from .dynamics import Dynamics
 from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
@@ -89,7 +90,7 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, and G's skew part."""
+    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, G's skew part, ν."""
 
     t: int
     row: Row
@@ -99,6 +100,7 @@ class _Step:
     by_theta: Array
     factor: Factor
     skew: Array
+    velocity: Array
 
 
 class BlockSolver:
@@ -189,8 +191,8 @@ class BlockSolver:
             residual = march.residual(step, acceleration[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
-            if self.body.mass_slopes:
-                right[:, 1:] -= march.inertia_slopes(acceleration[step.t])
+            if setting.mass_moves:
+                right[:, 1:] -= march.inertia_slopes(step, acceleration[step.t])
             force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force, given)
@@ -217,8 +219,8 @@ class BlockSolver:
         yield from np.zeros((self.dynamics.first_row, *shape))
         for step in self._steps(x, setting, history=history):
             row, right = np.zeros(shape), np.zeros(march.shape)
-            if self.body.mass_slopes:
-                right -= march.inertia_slopes(acceleration[step.t])
+            if setting.mass_moves:
+                right -= march.inertia_slopes(step, acceleration[step.t])
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
                 row[given.held_dofs] = given.of_held[step.t]
@@ -254,11 +256,11 @@ class BlockSolver:
 
         Dofs that a passing grasp holds have zeros.
         """
-        dynamics, reach = self.dynamics, self.dynamics.reach
+        dynamics, reach = self.dynamics_at(setting), self.dynamics.reach
         rows = [Row.of(dynamics, t, setting.theta) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
-        history = dynamics.history(x, setting.theta)
+        history = self.dynamics.history(x, setting.theta)
         weights = Weights(history) if history else None
         for step in self._steps(x, setting, backward=True, history=history):
             t = step.t
@@ -331,6 +333,10 @@ class BlockSolver:
         self._held.data = _entries(lower, skew, self._held_source)
         return self._held @ columns
 
+    def dynamics_at(self, setting: Setting) -> Dynamics:
+        """The equations of motion of the rows at a setting."""
+        return setting.dynamics.first_rows(self.dynamics.rows)
+
     def _steps(
         self,
         x: Array,
@@ -340,7 +346,7 @@ class BlockSolver:
         history: History | None = None,
     ) -> Iterator[_Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
-        dynamics, theta = self.dynamics, setting.theta
+        dynamics, theta = self.dynamics_at(setting), setting.theta
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
@@ -353,7 +359,7 @@ class BlockSolver:
                 at = forces.linearise(xi[here], nu[here], theta, carried=carried)
             with self.stopwatch.solving():
                 rows = [Row.of(dynamics, t, theta) for t in range(start, stop)]
-                factors = self._factorise(at, slice(start, stop), rows, rooms)
+                factors = self._factorise(dynamics, at, slice(start, stop), rows, rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
@@ -365,12 +371,18 @@ class BlockSolver:
                     at.by_theta[k],
                     factors[k],
                     at.by_position_skew[k],
+                    nu[start - dynamics.first_row + k],
                 )
 
     def _factorise(
-        self, at: Linearisation, here: slice, rows: list[Row], rooms: Sequence[Array | None] = ()
+        self,
+        dynamics: Dynamics,
+        at: Linearisation,
+        here: slice,
+        rows: list[Row],
+        rooms: Sequence[Array | None] = (),
     ) -> list[Factor]:
-        pattern, taken = self.pattern, self.dynamics.taken[here]
+        pattern, taken = self.pattern, dynamics.taken[here]
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
@@ -391,7 +403,7 @@ class BlockSolver:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
                 f"motion cannot be solved: {error}",
-                float(self.dynamics.t_s[here.start]),
+                float(dynamics.t_s[here.start]),
             ) from error
 
 
@@ -493,6 +505,7 @@ class _Forward:
         self.solver = solver
         self.held = held if len(solver.sensed) else None
         self.setting = setting
+        self.dynamics = solver.dynamics_at(setting)
         self.shape = shape
         reach = solver.dynamics.reach
         nothing = (np.zeros(shape),) * reach
@@ -535,12 +548,12 @@ class _Forward:
 
     def force_slopes(self, step: _Step) -> Array:
         """∂F/∂p (3n, m)."""
-        weighed = self.setting.dynamics.forces.mass.row(step.t, self.setting.theta)
-        return self.setting.force_slopes(step.by_theta, weighed)
+        return self.setting.force_slopes(step.t, step.by_theta, step.velocity)
 
-    def inertia_slopes(self, acceleration: Array) -> Array | float:
+    def inertia_slopes(self, step: _Step, acceleration: Array) -> Array | float:
         """∂(M a)/∂p on the free dofs."""
-        return self.setting.inertia_slopes(acceleration[self.solver.free], self.solver.free)
+        free = self.solver.free
+        return self.setting.inertia_slopes(step.t, acceleration[free], free)
 
     def advance(
         self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None

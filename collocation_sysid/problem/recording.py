@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from ..experiment import (
     read_tension,
     read_wrench,
 )
+from ..experiment.loads import Change
 from ..experiment.wrench_files import within
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
@@ -59,6 +60,8 @@ from .tracking import gripper_markers, into_body_frame, poses_from_markers, read
 A = TypeVar("A", Tendon, Pressure)
 Build = Callable[[Markers], Experiment]
 
+TIMES = get_args(Change)
+
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
 
@@ -69,6 +72,7 @@ NUISANCES = {
     "time_shift": {"time_shift_s": "prior_s"},
     "gravity": {"gravity_rad": "prior_rad"},
     "hand_eye": {"hand_eye_m": "prior_m", "hand_eye_rad": "prior_rad"},
+    "joining": {"joining_s": "prior_s"},
     "pose": {"pose_shift_m": "prior_m", "pose_turn_rad": "prior_rad"},
     "displacement_zero": {"displacement_zero_m": "prior_m"},
     "camera_offsets": {"camera_offset_m": "prior_m"},
@@ -280,16 +284,17 @@ class RecordingReader:
 
     def _mass(self, k: int, mass: MassSection) -> PointMass:
         nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")
-        given = mass.model_dump(include={"mass_kg", "from_s"}, exclude_none=True)
+        given = mass.model_dump(include={"mass_kg", *TIMES}, exclude_none=True)
         return PointMass(nodes, **given, selection=selection(mass.nodes))
 
     def _force(self, k: int, force: ForceSection) -> Force:
         nodes, chosen = self._nodes(force.nodes, f"force.{k}.nodes"), selection(force.nodes)
+        times = force.model_dump(include={*TIMES}, exclude_none=True)
         if force.force_n is not None:
-            return Force(nodes, np.array(force.force_n), selection=chosen)
+            return Force(nodes, np.array(force.force_n), selection=chosen, **times)
         assert force.file is not None  # by the schema
         t_s, force_n = read_forces(existing_file(self.folder, force.file, f"force.{k}.file"))
-        return Force(nodes, force_n, t_s, chosen)
+        return Force(nodes, force_n, t_s, chosen, **times)
 
     def _tendon(self, k: int, tendon: TendonSection) -> Tendon:
         t_s, tension_n = None, tendon.tension_n

@@ -300,7 +300,12 @@ class MassSection(Section):
 
     nodes: Nodes = Field(description="Nodes that carry it in equal parts, selected as in a grasp.")
     mass_kg: Positive
-    from_s: Finite | None = Field(None, description="When it joins the body; always by default.")
+    from_s: Finite | None = Field(
+        None,
+        description="When it joins the body, as well as nuisance.joining knows; always there by "
+        "default.",
+    )
+    until_s: Finite | None = Field(None, description="When it leaves the body, likewise.")
 
 
 class ForceSection(Section):
@@ -311,6 +316,11 @@ class ForceSection(Section):
     )
     force_n: Vector | None = Field(None, description="Constant force [x, y, z].")
     file: Text | None = Field(None, description="CSV with the columns t_s, fx_n, fy_n, fz_n.")
+    from_s: Finite | None = Field(
+        None,
+        description="When it begins to act, as well as nuisance.joining knows; always by default.",
+    )
+    until_s: Finite | None = Field(None, description="When it ends, likewise.")
 
     @model_validator(mode="after")
     def _one(self) -> ForceSection:
@@ -469,7 +479,7 @@ OffOrPressure = Annotated[
 class NuisanceSection(Section):
     """What is estimated of this recording alone, each with a prior around zero.
 
-    The first four are estimated unless they are "none", and where a wrench is measured tare and
+    The first five are estimated unless they are "none", and where a wrench is measured tare and
     sensor_time.
     """
 
@@ -490,6 +500,11 @@ class NuisanceSection(Section):
         None,
         description="A constant motion of the body in its grasps: prior_rad, prior_m; 0.5 degrees "
         "and 1 mm by default.",
+    )
+    joining: OffOrTime | None = Field(
+        None,
+        description="How much later than stated each point mass or force joins or leaves, where it "
+        "does so within the recording: prior_s, 10 ms by default.",
     )
     pose: OffOrPose | None = Field(
         None,

@@ -68,6 +68,7 @@ sigma_m = 0.001                # standard deviation of a coordinate
 # marker_offsets = {{ prior_m = 0.001 }}      # of reference_m without a reference_sigma_m
 # time_shift = {{ prior_s = 0.005 }}          # markers against poses; "none" if one clock has both
 # gravity = {{ prior_rad = 0.01745 }}         # tilt of its direction
+# joining = {{ prior_s = 0.01 }}              # when loads with from_s or until_s join or leave
 # hand_eye = {{ prior_rad = 0.0087, prior_m = 0.001 }}   # the body in its grasp
 # pose = {{ prior_rad = 0.02, prior_m = 0.002 }}         # cameras off; "none" by default
 # camera_offsets = {{ prior_m = 0.001 }}      # of each marker; "none" by default
