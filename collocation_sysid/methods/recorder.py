@@ -33,8 +33,8 @@ def _refuse_sensors(method: str, collocation: Collocation) -> None:
     if method.startswith("casadi:"):
         raise InputError(
             f"method '{method}' needs second derivatives, which measured wrenches (grasp.wrench) "
-            "do not have; expected reduced-space, shooting, continuation, interior-point, penalty or "
-            "augmented-lagrangian"
+            "do not have; expected reduced-space, shooting, continuation, interior-point, penalty "
+            "or augmented-lagrangian"
         )
     if collocation.remembers and method not in THROUGH_MEMORY:
         raise InputError(
