@@ -78,7 +78,11 @@ def refinement_of(
     fitted = [experiment for experiment in problem.experiments if not experiment.validation]
     coarse = replace(problem, experiments=fitted, notes=())
     found: dict[str, list[dict[str, Any]]] = {}
+    moving = any(not experiment.static for experiment in fitted)
     for kind, finer in FINER.items():
+        if kind == "step" and not moving:  # equilibria have none
+            found[kind] = []
+            continue
         at, start, found[kind] = coarse, answer, []
         for level in range(1, levels):
             at = finer(at)

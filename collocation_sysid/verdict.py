@@ -10,7 +10,7 @@ from .check.motion import Motion, motion_of
 from .errors import SimulationError
 from .experiment.turning import TOO_FAST, fastest_turn
 from .fem.plausible import odd_material, oddities
-from .methods.solution import Solution, Status
+from .methods.solution import Solution, Status, pooled_wrench_rms
 from .nlp.schemes import as_scheme
 from .problem import Problem
 from .rollout import Rollout
@@ -98,7 +98,11 @@ def _of_rollout(
     if isinstance(rollout, Rollout):
         fitted = name in fit_rms_m
         fit_m = fit_rms_m.get(name, solution.rms_m)
-        return rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+        found = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+        predicted_n, fit_n = rollout.wrench_rms[0], pooled_wrench_rms(solution)[0]
+        if not fitted and not found and predicted_n is not None and fit_n is not None:
+            found = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+        return found
     return [(f"the roll-out of '{name}' failed: {rollout}", "doubtful")]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -322,3 +323,102 @@ def test_a_displacement_is_a_shift_in_metres(tmp_path):
     np.testing.assert_allclose(poses.positions_m, [[0, 0, 0], [0.1, 0, -3e-3]])
     np.testing.assert_array_equal(poses.quaternions_xyzw[:, 3], 1.0)
     assert displaced_axes(file) == "xz"
+
+
+# Problem files ------------------------------------------------------------------------------------
+
+BENCH = """
+[object]
+mesh = "block.vtu"
+material = "neo-hookean"
+density_kg_m3 = 1000.0
+
+[parameters]
+young_pa = { guess = 5e4 }
+poisson = { fixed = 0.3 }
+gamma_r_s = { fixed = 0.0 }
+gamma_m_1_s = { fixed = 0.0 }
+
+[[experiment]]
+name = "press"
+kind = "static"
+gravity_m_s2 = [0.0, 0.0, 0.0]
+
+[experiment.nuisance]
+displacement_zero = { prior_m = 2e-3 }
+
+[[experiment.grasp]]
+nodes = { box_m = [[-1, -1, -1e-4], [1, 1, 1e-4]] }
+axes = "z"
+
+[[experiment.grasp]]
+nodes = { box_m = [[-1, -1, 0.0999], [1, 1, 1]] }
+axes = "z"
+displacement = "crosshead.csv"
+wrench = { file = "force.csv", sigma_n = 0.01 }
+
+[[experiment.grasp]]
+nodes = { box_m = [[-1e-4, -1, -1], [1e-4, 1, 1]] }
+axes = "x"
+
+[[experiment.grasp]]
+nodes = { box_m = [[-1, -1e-4, -1], [1, 1e-4, 1]] }
+axes = "y"
+"""
+
+
+def bench(folder, zero_m: float = 1e-3) -> Path:
+    """A block pressed between lubricated platens, its load from the analytic solution."""
+    box_mesh((EDGE_M,) * 3, (1, 1, 1)).write(folder / "block.vtu")
+    lame, mu = 1e5 * 0.3 / 1.3 / 0.4, 1e5 / 2.6  # of E = 1e5 Pa, ν = 0.3
+    t_s, z_m = np.array([0.0, 1.0, 3.0, 4.0, 8.0]), -np.array([0.005, 0.01, 0.02, 0.03, 0.035])
+    force_n = []
+    for z in z_m:
+        along = 1 + (z + zero_m) / EDGE_M
+        across = lateral(along, mu, lame)
+        stress = mu * (along - 1 / along) + lame * np.log(along * across**2) / along
+        force_n.append(EDGE_M**2 * stress)
+    for file, name, values in (("crosshead", "z_m", z_m), ("force", "fz_n", force_n)):
+        rows = "".join(f"{t},{value!r}\n" for t, value in zip(t_s, map(float, values), strict=True))
+        (folder / f"{file}.csv").write_text(f"t_s,{name}\n{rows}", encoding="utf-8")
+    (folder / "problem.toml").write_text(BENCH, encoding="utf-8")
+    return folder / "problem.toml"
+
+
+def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
+    found = run(cs.Problem.read(bench(tmp_path)))
+    assert found.estimates["young_pa"].value == pytest.approx(1e5, rel=2e-3)
+    (part,) = found.solution.collocation.parts(found.solution.z)
+    nuisance = part.segment.nuisance
+    (zero,) = nuisance.zero(1)
+    assert part.phi[zero] * nuisance.scales[zero] == pytest.approx(1e-3, rel=0.05)
+    found.save(tmp_path / "run")
+    assert (tmp_path / "run" / "wrench_press.png").is_file()
+    assert not list((tmp_path / "run").glob("tracks_*"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kind = "static"', 'kind = "slow"', "experiment 'press'"),
+        ('kind = "static"', 'kind = "static"\nstart = "undeformed"', 'beside kind = "static"'),
+        ('kind = "static"', 'kind = "static"\nresample_hz = 10.0', "found resample_hz beside"),
+        ("displacement_zero =", "time_shift = { prior_s = 1.0 }  #", "found nuisance.time_shift"),
+        ('displacement = "', 'poses = "p.csv"\ndisplacement = "', "poses and displacement"),
+        ('displacement = "', 'length_unit = "mm"\ndisplacement = "', "length_unit without poses"),
+        ("wrench =", "# wrench =", "nothing is measured: expected markers, or the wrench"),
+        ('axes = "x"', 'axes = "xz"', "held by the grasps 1 and 3 at the same time along z"),
+        ('axes = "x"', 'axes = "w"', "grasp.2.axes"),
+        ('axes = "y"', 'axes = "y"\nfrom_s = 7.0', "it can move along y"),
+        ("[[experiment]]", "[transcription]\nsubsteps = 3\n[[experiment]]", "no steps"),
+        ('"crosshead.csv"', '"lost.csv"', "lost.csv does not exist"),
+    ],
+)
+def test_test_benches_that_make_no_sense_are_refused(tmp_path, old, new, message):
+    file = bench(tmp_path)
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        cs.Problem.read(file)
+    assert message in str(caught.value)

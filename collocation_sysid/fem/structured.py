@@ -47,7 +47,9 @@ def box_mesh(
     return TetMesh(points, orient(points, tetrahedra)[0])
 
 
-def cylinder_mesh(radius_m: float, height_m: float, rings: int, layers: int) -> TetMesh:
+def cylinder_mesh(
+    radius_m: float, height_m: float, rings: int, layers: int, sectors: int = 6
+) -> TetMesh:
     """Mesh an upright cylinder: axis z, base at z = 0.
 
     Ring k of each cross-section has 6k nodes, so a mesh has (1 + 3 rings (rings + 1)) (layers + 1)
@@ -59,6 +61,9 @@ def cylinder_mesh(radius_m: float, height_m: float, rings: int, layers: int) -> 
     radius_m, height_m : float
     rings, layers : int
         Elements along the radius and along the height.
+    sectors : int
+        Nodes of the innermost ring; ring k of each cross-section has k times as many. With a
+        multiple of four no element crosses the planes x = 0 and y = 0.
 
     Returns
     -------
@@ -71,7 +76,7 @@ def cylinder_mesh(radius_m: float, height_m: float, rings: int, layers: int) -> 
     for name, value in (("rings", rings), ("layers", layers)):
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise InputError(f"a cylinder needs a whole number of {name}, 1 or more, not {value!r}")
-    disc, triangles = _disc(rings)
+    disc, triangles = _disc(rings, sectors)
     points = np.concatenate(
         [
             np.column_stack([radius_m * disc, np.full(len(disc), z)])
@@ -90,20 +95,24 @@ def cylinder_mesh(radius_m: float, height_m: float, rings: int, layers: int) -> 
     return TetMesh(points, orient(points, np.concatenate(tetrahedra))[0])
 
 
-def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (·, 2) and triangles (6 rings², 3) of the unit disc."""
-    angles = [2 * np.pi * np.arange(6 * k) / (6 * k) for k in range(1, rings + 1)]
+def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (·, 2) and triangles (sectors · rings², 3) of the unit disc."""
+    counts = [sectors * k for k in range(1, rings + 1)]
+    angles = [2 * np.pi * np.arange(count) / count for count in counts]
     circles = [
         k / rings * np.column_stack([np.cos(angle), np.sin(angle)])
         for k, angle in enumerate(angles, start=1)
     ]
 
     def node(ring: int, sector: int, step: int) -> int:
-        return 1 + 3 * ring * (ring - 1) + (sector * ring + step) % (6 * ring) if ring else 0
+        if not ring:
+            return 0
+        before = 1 + sectors * ring * (ring - 1) // 2
+        return before + (sector * ring + step) % (sectors * ring)
 
     triangles = []
     for k in range(1, rings + 1):
-        for s in range(6):
+        for s in range(sectors):
             for i in range(k):
                 outer = node(k, s, i + 1)
                 triangles.append((node(k - 1, s, i), node(k, s, i), outer))

@@ -249,6 +249,12 @@ class Problem:
             raise InputError("there is no experiment; expected at least one")
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise InputError(f"two experiments are named {repeated[0]!r}; names must differ")
+        if self.substeps != 1 and all(experiment.static for experiment in self.experiments):
+            raise InputError(
+                f"found {self.substeps}, but every experiment is static, and between equilibria "
+                "there are no steps; expected none",
+                where="transcription.substeps",
+            )
         self.parameters.fit(self.bodies)
         for experiment in self.experiments:
             try:

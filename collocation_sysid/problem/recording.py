@@ -348,7 +348,16 @@ class RecordingReader:
         return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
 
     def _times(self, poses: list[PoseSequence]) -> Array:
-        """Those of the poses, where nothing else has any."""
+        """Those of the wrench where there are no markers, else of the poses."""
+        section = self.section
+        named = [grasp.wrench.file for grasp in section.grasps if grasp.wrench is not None]
+        if not named and not section.marked:
+            raise InputError(
+                "nothing is measured: expected markers, or the wrench of a grasp", None, "markers"
+            )
+        files = [self.folder / name for name in named if (self.folder / name).exists()]
+        if files and not section.marked:
+            return read_wrench(files[0])[0]
         times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
         fewest = 1 if self.section.kind == "static" else 3
         if len(times) < fewest:
@@ -414,6 +423,8 @@ class RecordingReader:
 
     def _place(self, t_s: Array, table: MarkerTable, build: Build) -> Experiment:
         """Attach the markers where references are given; the others' places are unknown."""
+        if not self.section.marked:
+            return build(Markers.none(t_s))
         spec, names = self.section.markers, table.names
         markers = Markers(
             t_s,
@@ -427,7 +438,7 @@ class RecordingReader:
             max_distance_m=spec.max_distance_m,
         )
         experiment = build(markers)
-        if not self.simulation and names:
+        if not self.simulation:
             refuse_other_scale(experiment, usual_constants(self.parameters))
         return experiment
 

@@ -39,6 +39,7 @@ gamma_m_1_s = {{}}
 
 [[experiment]]                 # one for each recording; all share the parameters
 name = "swing"
+# kind = "static"              # samples are equilibria, as on a test bench; a motion by default
 start = "equilibrium"          # at rest in the grasps that hold then; or "undeformed"
 gravity_m_s2 = [0.0, 0.0, -9.81]
 # loaded_since_s = 10.0        # with memory: how long at rest; it has relaxed by default
@@ -50,6 +51,8 @@ gravity_m_s2 = [0.0, 0.0, -9.81]
 [experiment.grasp]             # which nodes the gripper holds, and how it moves
 nodes = {{ box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }}   # or ball_m, indices, a group's name
 poses = "poses.csv"            # t_s,x_m,y_m,z_m,qx,qy,qz,qw: undeformed to current position
+# displacement = "crosshead.csv"   # in place of poses: t_s and any of x_m, y_m, z_m
+# axes = "z"                   # held along these axes of the world only, as by a sliding platen
 # gripper_to_body: position_m and quaternion_xyzw of the body in the gripper, if poses are its
 # markers = {{ base1 = [0, 0, 0], base2 = [0.1, 0, 0], base3 = [0, 0.1, 0] }}  # or from tracks
 # sigma_m = 0.0003             # noise of each pose, and sigma_rad; judged by their roughness if not

@@ -241,6 +241,8 @@ def rollout_concerns(
 ) -> list[Concern]:
     """The forward simulation of an experiment against its fit, or its prediction."""
     yardstick_m = max(fit_rms_m, noise_rms_m)
+    if not yardstick_m:  # nothing of the kind is measured
+        return []
     if not fitted:
         times = rms_m / yardstick_m
         if times <= PREDICTION:
@@ -285,6 +287,8 @@ def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:
     fitted : float
         p, the number of parameters that the data determine.
     """
+    if not samples.sum():
+        return 0.0
     total = float(samples.sum())
     left = max(0.0, 1 - fitted / (3 * total))
     return float(np.sqrt(3 * left * (samples @ sigma_m**2) / total))
