@@ -205,7 +205,7 @@ def test_a_value_is_written_as_toml_reads_it():
 def test_bad_models_are_refused_in_one_line(bar, tiny):
     with pytest.raises(InputError, match=r"'yeho'.*did you mean 'yeoh'"):
         parse_materials("yeho,gent")
-    with pytest.raises(InputError, match="whole numbers such as 0,1,2"):
+    with pytest.raises(InputError, match="whole numbers up to 20, such as 0,1,2"):
         parse_branches("1,x")
     with pytest.raises(InputError, match="yeoh alone; expected two or more"):
         variants(bar, (), ("yeoh",), (), TIMES_S)
