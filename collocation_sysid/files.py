@@ -73,7 +73,9 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{file.name} is damaged ({_reason(error)}){AGAIN}", file.parent) from error
+        raise InputError(
+            f"{file.name} is damaged ({_reason(error)}){AGAIN}", file.parent
+        ) from error
     if not isinstance(content, dict):
         raise InputError(f"{file.name} is damaged: it holds no object{AGAIN}", file.parent)
     return content

@@ -20,6 +20,9 @@ Residual = Callable[[Array], Array]
 Linearise = Callable[[Array], tuple[Array, Array, Array]]
 T = TypeVar("T")
 
+# With the factor of the iterate before, a last step must be this much shorter.
+STALE = 0.01
+
 
 @dataclass(frozen=True)
 class NewtonOptions:
@@ -138,7 +141,7 @@ class Solver:
                     value, matrix = self._timed(residual, trial), None
                 next_step = factor.solve(value[self.free])
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
-                    if self._is_last(next_step) and not keep_definite:
+                    if self._is_last(next_step, STALE) and not keep_definite:
                         return trial, factor, next_step
                     if matrix is None:
                         value, *matrix = self._timed(linearise, trial)
@@ -150,8 +153,9 @@ class Solver:
             share /= 2
         raise NewtonFailure(x, "no step along Newton's direction makes progress")
 
-    def _is_last(self, step: Array) -> bool:
-        return bool(np.abs(step).max(initial=0.0) <= self.options.tolerance * self._size_m)
+    def _is_last(self, step: Array, share: float = 1.0) -> bool:
+        tolerance = share * self.options.tolerance * self._size_m
+        return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
     def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
         try:
