@@ -9,6 +9,7 @@ import pytest
 from checks import assert_derivative
 from problems_small import (
     bar_let_go,
+    bar_loaded,
     cube_with_nuisance,
     hung_cube,
     measured_with,
@@ -70,6 +71,7 @@ MADE = {
     "rayleigh": lambda: with_core(weighted(hung_cube()), damping="rayleigh"),
     "quadratic": lambda: with_core(weighted(quadratic_bar(6))),
     "let go": lambda: with_core(bar_let_go()),
+    "loaded": lambda: with_core(bar_loaded(6)),
     "nuisance": lambda: with_core(weighted(cube_with_nuisance(6))),
 }
 
@@ -166,9 +168,9 @@ def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
     assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
 
 
-def test_gradients_where_a_wrench_tells_the_density(rng):
-    cube = with_core(sensing(hung_cube(8)))
-    cube = with_wrenches(cube, [0.01 * rng.standard_normal((9, 6))])
+@pytest.mark.parametrize("make", [hung_cube, bar_loaded])
+def test_gradients_where_a_wrench_tells_the_density(make, rng):
+    cube = with_wrenches(with_core(sensing(make(8))), [0.01 * rng.standard_normal((9, 6))])
     collocation = Collocation([noisy_with(cube, TRUTH)], parameters())
     p = collocation.guess_p
     z = simulated(collocation, p)
