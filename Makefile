@@ -5,17 +5,28 @@ DEV := .venv/.installed-dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 RUN := runs/foam_cylinder
 
-.PHONY: help solve test check bench docs clean
+TRIED := build/tried
+
+.PHONY: help solve test test-dependencies check bench docs dist clean
 
 help: ## list these targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' Makefile
 
 solve: $(CORE) ## identify the foam cylinder's parameters
 	@$(BIN)/collocation-sysid solve problems/foam_cylinder/recording.toml --out $(RUN)
 	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
 
 test: $(DEV) ## run the tests
-	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+
+test-dependencies: ## run the tests with the lowest dependencies, and with the newest
+	@mkdir -p build && $(PYTHON) scripts/lowest_dependencies.py > build/lowest.txt && : > build/newest.txt
+	@for which in lowest newest; do \
+	  echo "With the $$which dependencies" && rm -rf build/$$which && $(PYTHON) -m venv build/$$which && \
+	  build/$$which/bin/python -m pip install --quiet --disable-pip-version-check --upgrade \
+	    -c build/$$which.txt -e '.[test]' && \
+	  COLLOCATION_SYSID_THREADS=1 build/$$which/bin/python -m pytest -n auto --dist loadfile || exit 1; \
+	done
 
 check: $(DEV) ## lint, formatting and types
 	@$(BIN)/ruff check
@@ -29,6 +40,17 @@ docs: $(CORE) ## build the documentation's pages
 	@$(PIP) -e '.[docs]'
 	@$(BIN)/sphinx-build -q -b html docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
+
+dist: $(CORE) ## build wheel and sdist, install each afresh, and solve a problem with it
+	@$(PIP) build
+	@rm -rf dist && $(BIN)/python -m build --outdir dist > /dev/null
+	@for file in dist/*.whl dist/*.tar.gz; do \
+	  echo "Trying $$file" && rm -rf $(TRIED) && $(PYTHON) -m venv $(TRIED) && \
+	  $(TRIED)/bin/python -m pip install --quiet --disable-pip-version-check $$file && \
+	  (cd build && tried/bin/collocation-sysid solve ../problems/foam_cylinder/recording.toml \
+	    --out tried/run --quiet > /dev/null) || exit 1; \
+	done
+	@ls dist/*
 
 clean: ## remove the environment and caches; runs stay
 	@rm -rf .venv build dist .pytest_cache .ruff_cache docs/_build docs/generated

@@ -8,12 +8,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
-AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1)]
+# Sizes that anything measured or meant has; the square of any of them is a number too.
+SMALLEST, LARGEST = 1e-100, 1e100
+
+
+def _of_usual_size(value: float) -> float:
+    if value and not SMALLEST <= abs(value) <= LARGEST:
+        sizes = f"zero, or a size from {SMALLEST:g} to {LARGEST:g}"
+        raise ValueError(f"found {value:g}; expected {sizes}")
+    return value
+
+
+_Usual = AfterValidator(_of_usual_size)
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual]
+AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual]
 Boundless = Annotated[float, Field(strict=True)]
 Whole = Annotated[int, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]

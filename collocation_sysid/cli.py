@@ -219,6 +219,10 @@ def compare(
     prony: Annotated[
         str | None, typer.Option(metavar="0,1,…", help="Numbers of branches of memory.")
     ] = None,
+    region: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Region that has them; by default all the body does."),
+    ] = None,
     starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
     spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
@@ -240,7 +244,8 @@ def compare(
     """Run methods side by side from many starts, or fit several models and say which to use.
 
     With --materials or --prony each model is fitted to all recordings, and to all but each of them,
-    which it then predicts; of one recording the last third is held out.
+    which it then predicts; of one recording the last third is held out. In a body with regions all
+    of it has the model, or --region.
 
     Finished runs are kept in the output folder: the same command resumes.
     """
@@ -253,7 +258,8 @@ def compare(
     limits = Limits(workers, scheduler, time_limit)
     loaded = Problem.read(problem, set_ or (), allow_code)
     if materials is not None or prony is not None:
-        planned = _planned_models(loaded, materials, prony, names, set_ or (), allow_code)
+        choices = materials, prony, region
+        planned = _planned_models(loaded, choices, names, set_ or (), allow_code)
         study = _Study("models", problem, planned, Yardstick(), out)
         _study(study, limits, dry_run, as_json, quiet)
         return
@@ -269,13 +275,13 @@ def compare(
 
 def _planned_models(
     problem: Problem,
-    materials: str | None,
-    prony: str | None,
+    choices: tuple[str | None, str | None, str | None],
     methods: Sequence[str],
     overrides: Sequence[str],
     allow_code: bool,
 ) -> list[PlannedRun]:
-    """The runs that compare models."""
+    """The runs that compare models: materials and branches, of a region."""
+    materials, prony, region = choices
     from .problem import Problem
     from .study import plan_models
     from .study.variants import parse_branches, parse_materials, variants
@@ -292,7 +298,7 @@ def _planned_models(
     fitted = [e for e in problem.experiments if not e.validation]
     times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
     assert problem.path is not None  # it was read
-    found = variants(problem.path, overrides, named, counts, times_s)
+    found = variants(problem.path, overrides, named, counts, times_s, region)
     for variant in found:  # a model that cannot be would fail every run
         Problem.read(problem.path, variant.overrides, allow_code)
     return plan_models(problem, found, methods[0] if methods else None, allow_code)
@@ -599,7 +605,7 @@ def _show(content: RenderableType) -> None:
 
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
-    heed_interrupts()
+    restore = heed_interrupts()
     try:
         app(prog_name="collocation-sysid")
     except InputError as error:
@@ -609,6 +615,8 @@ def main() -> None:
         _refuse("error", reason, EXIT_BAD_INPUT)
     except SimulationError as error:
         _refuse("simulation failed", error, EXIT_NOT_CONVERGED)
+    finally:
+        restore()
 
 
 def _refuse(kind: str, error: Exception, code: int) -> NoReturn:

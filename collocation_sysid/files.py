@@ -31,6 +31,7 @@ DAMAGE = (
     zlib.error,
 )
 LONGEST_REASON = 200
+AGAIN = "; run what wrote it again"
 
 
 def require_regular(path: str | Path, where: str | None = None) -> None:
@@ -72,9 +73,11 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{file.name} is damaged ({_reason(error)})", file.parent) from error
+        raise InputError(
+            f"{file.name} is damaged ({_reason(error)}){AGAIN}", file.parent
+        ) from error
     if not isinstance(content, dict):
-        raise InputError(f"{file.name} is damaged: it holds no object", file.parent)
+        raise InputError(f"{file.name} is damaged: it holds no object{AGAIN}", file.parent)
     return content
 
 

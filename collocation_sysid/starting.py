@@ -9,6 +9,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 COMMAND = "collocation-sysid"
@@ -21,13 +22,21 @@ def _end_quietly() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def heed_interrupts() -> None:
-    """From here on Ctrl-C and SIGTERM raise `KeyboardInterrupt`: results are kept, both times."""
-    if not _in_main_thread():
-        return
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.default_int_handler)
+def heed_interrupts() -> Callable[[], None]:
+    """From here on Ctrl-C and SIGTERM raise `KeyboardInterrupt`: results are kept, both times.
+
+    Returns what makes it as it was.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in changed:
+        signal.signal(number, signal.default_int_handler)
+
+    def restore() -> None:
+        for number in changed:
+            signal.signal(number, signal.SIG_DFL)
+
+    return restore
 
 
 def _in_main_thread() -> bool:

@@ -25,6 +25,7 @@ from .rollout import Rollout
 from .run import Run
 from .statistics.numerical import Refinement
 from .statistics.places import Place
+from .statistics.scale import relative_sentence
 from .statistics.uncertainty import Estimate
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
@@ -139,7 +140,8 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [parameter_table(finished), *_damping(finished), *_numerical(finished)]
+    parts += [parameter_table(finished), *_damping(finished), *_scale(finished)]
+    parts += _numerical(finished)
     parts += [*_verdict(finished), *_nuisance(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
@@ -228,6 +230,12 @@ def _damping(finished: Run) -> list[Text]:
     return [Text(f"{GAMMA_R.symbol} is that of damping = {' and '.join(said)}")] if laws else []
 
 
+def _scale(finished: Run) -> list[Text]:
+    """What the moduli rest on, where nothing else sets their scale."""
+    said = relative_sentence(finished.problem.experiments, finished.problem.parameters)
+    return [] if said is None else [Text(said)]
+
+
 def _guess(item: Parameter) -> str:
     if item.tied is not None:
         return "tied"
@@ -250,7 +258,8 @@ def _nuisance(finished: Run) -> list[Text]:
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
         name = part.segment.experiment.name
-        said = _places(finished.places[name]) + _lengths(part) + _clock(part) + _of_sensors(part)
+        said = _places(finished.places[name]) + _lengths(part) + _clock(part)
+        said += _of_sensors(part) + _drives(part) + _joining(part, finished)
         if said:
             lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
     return lines
@@ -319,6 +328,38 @@ def _of_sensors(part: Part) -> list[str]:
             own = unit or of.rpartition("[")[2].rstrip("]")
             size = _short(factor * abs(values[worst]))
             said.append(f"{what} {size} {own} (prior {_short(factor * prior)})")
+    return said
+
+
+def _drives(part: Part) -> list[str]:
+    """What tensions and pressures are off by."""
+    nuisance, said = part.segment.nuisance, []
+    for k in nuisance.of_drives:
+        prior = float(nuisance.scales[k])
+        value = float(part.phi[k]) * prior
+        what = nuisance.names[k].partition(": ")[2].partition(" [")[0]
+        unit = nuisance.names[k].rpartition("[")[2].rstrip("]")
+        if nuisance.kinds[k] == "factor":
+            said.append(f"{what} by {_short(1e2 * value)} % (prior {_short(1e2 * prior)})")
+        else:
+            said.append(f"{what} {_short(value)} {unit} (prior {_short(prior)})")
+    return said
+
+
+def _joining(part: Part, finished: Run) -> list[str]:
+    """When loads join and leave, in words."""
+    nuisance, said = part.segment.nuisance, []
+    known = finished.uncertainty.nuisance if finished.uncertainty else {}
+    for k, timed in zip(nuisance.places("joining"), nuisance.timed, strict=True):
+        name, prior = nuisance.names[k], 1e3 * float(nuisance.scales[k])
+        late, deviation = prior * float(part.phi[k]), prior * known.get(name, np.nan)
+        what = name.removeprefix(f"{part.segment.experiment.name}: ").removesuffix(" [s]")
+        when = "later" if late > 0 else "earlier"
+        error = "" if np.isnan(deviation) else f" ± {_short(deviation)}"
+        said.append(
+            f"{what} {_short(abs(late))}{error} ms {when} than {timed.stated_s:g} s "
+            f"(prior {_short(prior)})"
+        )
     return said
 
 

@@ -15,6 +15,7 @@ from .nlp.schemes import as_scheme
 from .problem import Problem
 from .rollout import Rollout
 from .statistics.diagnostics import MarkerDiagnosis
+from .statistics.scale import scale_concern
 from .statistics.trust import (
     Concern,
     clock_concerns,
@@ -77,13 +78,17 @@ def concerns(
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
-    """Bodies of a size or a density that is hardly meant, or not with the stiffness found."""
+    """Bodies of a size or a density that is hardly meant, not with the stiffness, or not known."""
     for body in dict.fromkeys(segment.body for segment in solution.collocation.segments):
         said = [oddity.sentence for oddity in oddities(body)]
         if not said and (odd := odd_material(body, body.theta(solution.parameters))) is not None:
             said = [odd]
         for sentence in said:
             yield sentence, "doubtful"
+    experiments = [segment.experiment for segment in solution.collocation.segments]
+    unscaled = scale_concern(experiments, solution.collocation.parameters)
+    if unscaled is not None:
+        yield unscaled, "doubtful"
 
 
 def _of_rollout(

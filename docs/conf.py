@@ -1,6 +1,14 @@
 """Sphinx configuration: `make docs` writes the pages to docs/_build/html."""
 
+import sys
 from importlib.metadata import version as version_of
+from pathlib import Path
+
+from docutils import nodes
+from latex2mathml.converter import convert
+
+sys.path.insert(0, str(Path(__file__).parent))
+from reference import write_pages
 
 project = "collocation_sysid"
 author = "collocation_sysid developers"
@@ -10,13 +18,13 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_math_renderer = "mathml"  # which browsers draw themselves, without a network
 html_title = f"collocation_sysid {release}"
 
 autosummary_generate = True
@@ -35,6 +43,19 @@ def _absolute_values(_app, _what, _name, _object, _options, lines: list[str]) ->
     lines[:] = [line.replace("|", r"\|") for line in lines]
 
 
+def _inline(translator, node) -> None:
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def _displayed(translator, node) -> None:
+    formula = convert(node.astext(), display="block")
+    translator.body.append(f'<div class="math">{formula}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app) -> None:
     """Connect what the extensions leave to the project."""
+    write_pages(Path(__file__).parent / "generated")
+    app.add_html_math_renderer("mathml", (_inline, None), (_displayed, None))
     app.connect("autodoc-process-docstring", _absolute_values)

@@ -1,4 +1,4 @@
-"""Bodies that tendons and pressures drive: a box with a cavity, an eighth of a hollow sphere."""
+"""Bodies under tendons and pressures: a box with a cavity, and an eighth of a hollow sphere."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def hollow_octant(inner_m: float, outer_m: float, divisions: int, layers: int) -
 
 
 def inflated(
-    body: Body, volume: Volume, pressure_pa: float, constants: dict, steps: int
+    body: Body, volume: Volume, pressure_pa: float, constants: dict[str, float], steps: int
 ) -> np.ndarray:
     """(n, 3) equilibrium of an octant under a pressure, its nodes in their planes of symmetry."""
     free = np.flatnonzero(np.abs(body.nodes_m).ravel() > 1e-9)
@@ -69,8 +69,10 @@ def inflated(
             state = x.reshape(-1, 3)
             force = body.elastic_force(state, **constants).ravel() + p * volume.gradient(x[None])[0]
             bent = volume.couplings.matrix(volume.hessian(x[None])[0])
-            matrix = sp.csc_array(body.stiffness(state, **constants) - p * bent)
-            step = spsolve(matrix[free][:, free], force[free], permc_spec="MMD_AT_PLUS_A")
+            matrix = sp.csc_matrix(body.stiffness(state, **constants) - p * bent)
+            step: np.ndarray = spsolve(
+                matrix[free][:, free], force[free], permc_spec="MMD_AT_PLUS_A"
+            )
             x[free] += step
             if np.abs(step).max() < 1e-12:
                 break

@@ -18,8 +18,12 @@ from collocation_sysid.experiment import (
     Nuisance,
     PointMass,
     PoseSequence,
+    Pressure,
+    Tendon,
 )
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.parameters import Parameter, Parameters
@@ -163,6 +167,22 @@ def bar_let_go(steps: int = 10) -> Experiment:
     )
 
 
+def bar_loaded(steps: int = 10) -> Experiment:
+    """A bar that a mass joins and leaves, and a force pulls for a while, at unknown times."""
+    bar = bar_in_two_hands(steps)
+    still, moving = bar.grasps
+    end, dt = moving.nodes, bar.timestep_s
+    pulling = Force(end[1:], [[0.01, 0.02, 0.01]], from_s=1.3 * dt, until_s=3.9 * dt)
+    return replace(
+        bar,
+        name="bar loaded",
+        grasps=(still,),
+        masses=(PointMass(end[:2], 0.003, 1.6 * dt, until_s=4.2 * dt), PointMass(end, 0.001)),
+        forces=(pulling,),
+        nuisance=Nuisance.none(gravity_rad=0.03, joining_s=0.004),
+    )
+
+
 def cube_with_nuisance(steps: int = 10) -> Experiment:
     """The hung cube with everything estimated that an experiment may not know of itself."""
     nuisance = Nuisance(
@@ -192,6 +212,31 @@ def bar_with_nuisance(steps: int = 8) -> Experiment:
     )
 
 
+def driven_bar(steps: int = 8) -> Experiment:
+    """A bar with a cavity, held at one end, that a tendon bends and a pressure fills."""
+    whole, t_s = box_mesh((0.12, 0.06, 0.06), (4, 3, 3)), times(steps)
+    inside = (np.abs(whole.centres_m - [0.06, 0.03, 0.03]) < [0.03, 0.01, 0.01]).all(axis=1)
+    body = Body(TetMesh(whole.points_m, whole.tetrahedra[~inside]), density_kg_m3=30.0)
+    points = [(x, 0.05, 0.03 + 0.1 * x) for x in (0.0, 0.05, 0.08, 0.118)]
+    tip = nodes_where(body, 0, 0.12)
+    return Experiment(
+        body,
+        t_s,
+        [Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))],
+        vertex_markers(body, tip, t_s),
+        name="driven bar",
+        tendons=[Tendon(points, 0.02 + 0.5 * t_s, t_s)],
+        pressures=[Pressure(Box((0.02, 0.015, 0.015), (0.1, 0.045, 0.045)), 20.0)],
+        nuisance=Nuisance.none(
+            tension_factor=0.1,
+            tension_lost_n=0.01,
+            pressure_factor=0.1,
+            pressure_lost_pa=5.0,
+            gravity_rad=0.03,
+        ),
+    )
+
+
 SMALL_EXPERIMENTS = {
     "hung-cube": hung_cube,
     "released-cube": released_cube,
@@ -201,6 +246,7 @@ SMALL_EXPERIMENTS = {
     "bar-let-go": bar_let_go,
     "cube-with-nuisance": cube_with_nuisance,
     "bar-with-nuisance": bar_with_nuisance,
+    "driven-bar": driven_bar,
 }
 
 

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from problem_files import TRUTH, run_command, settings, write_problem
+from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.output import animation
 from collocation_sysid.output.animation import Film, animate, film_samples
+from collocation_sysid.output.page import surface_strain
 from collocation_sysid.output.replay import read_run
 from collocation_sysid.output.view import frame_files, view
 
@@ -166,6 +168,18 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
         np.testing.assert_allclose(shapes, positions[:, outer], atol=1e-6)
     faces = np.frombuffer(b64decode(data["faces"]), "<i4").reshape(-1, 3)
     np.testing.assert_array_equal(outer[faces], swing.surface)
+    strains = np.frombuffer(b64decode(data["strains"]["fitted"]), "u1").reshape(9, -1)
+    assert strains.shape[1] == len(faces)
+    assert strains.max() == 255
+
+
+def test_turning_is_no_strain_and_stretching_is(run):
+    swing = read_run(run)[1][0]
+    x = swing.undeformed_m
+    turned = Rotation.from_rotvec([0.3, -1.2, 0.5]).apply(x)
+    strain = surface_strain(swing, np.stack([turned, x * [1.25, 1.0, 1.0]]))
+    np.testing.assert_allclose(strain[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(strain[1], 0.25)
 
 
 @pytest.mark.skipif(not shutil.which("node"), reason="needs node")

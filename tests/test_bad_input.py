@@ -628,7 +628,7 @@ def test_simulation_without_a_marker_file_needs_places(tiny):
 def test_a_damaged_run_cannot_be_drawn(tiny):
     (tiny / "result.json").write_text('{"history": [')
     np.savez(tiny / "trajectory.npz", t_s=np.zeros(3))
-    assert_refused(tiny, ("damaged", "solve the problem again"), "plot", ".")
+    assert_refused(tiny, ("damaged", "run what wrote it again"), "plot", ".")
     (tiny / "result.json").write_text("{}")
     assert_refused(tiny, ("damaged", "rollout"), "plot", ".")
 

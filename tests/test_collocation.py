@@ -13,8 +13,10 @@ from problems_small import (
     as_theta,
     bar_in_two_hands,
     bar_let_go,
+    bar_loaded,
     cube_with_gaps,
     cube_with_nuisance,
+    driven_bar,
     hung_cube,
     measured,
 )
@@ -157,11 +159,23 @@ def test_derivatives_of_several_experiments(rng):
     assert_derivatives(Collocation(experiments, GUESS, "bdf2"), rng)
 
 
+@pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
+def test_derivatives_of_a_body_that_tendons_and_pressures_drive(scheme: str, rng):
+    assert_derivatives(Collocation([measured(driven_bar(4)), swung()], GUESS, scheme), rng)
+
+
 @pytest.mark.parametrize("explicit_grasps", [False, True])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_derivatives_where_a_hand_lets_go_and_a_mass_joins(scheme: str, explicit_grasps: bool, rng):
     experiment = measured(bar_let_go(6))
     assert_derivatives(Collocation([experiment], GUESS, scheme, 1, explicit_grasps), rng)
+
+
+@pytest.mark.parametrize("parameters", [GUESS, ALL_FIXED])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_derivatives_by_the_times_of_loads(scheme: str, parameters: Parameters, rng):
+    experiments = [bar_loaded(6), replace(bar_let_go(5), nuisance=Nuisance.none(joining_s=0.003))]
+    assert_derivatives(Collocation(experiments, parameters, scheme), rng)
 
 
 @pytest.mark.parametrize("substeps", [1, 2])

@@ -162,7 +162,7 @@ def test_a_late_run_is_a_row(tiny, stand_in):
     assert outcome.code == 0
     rows = table(tiny / "out" / "runs.csv")
     assert [row["status"] for row in rows] == ["converged", "timeout", "converged"]
-    late = "reduced-space, start 1: timeout: killed after the time limit of 3 s"
+    late = "reduced-space, start 1: timeout: ended after the time limit of 3 s"
     assert late in outcome.out
     assert late in (tiny / "out" / "summary.md").read_text()
     (summary,) = table(tiny / "out" / "summary.csv")

@@ -95,3 +95,34 @@ def test_links_between_pages_lead_somewhere():
         for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{name_of(page)}: {target}"
+
+
+# Pages made when the documentation is built
+
+
+@pytest.fixture
+def reference(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    return pytest.importorskip("reference")
+
+
+def keys_of(schema: dict[str, Any]) -> set[str]:
+    tables = [schema, *schema["$defs"].values()]
+    return {key for table in tables for key in table.get("properties", {})}
+
+
+def test_the_reference_of_the_problem_file_has_every_key(reference):
+    page = reference.problem_file()
+    for key in keys_of(ProblemFile.model_json_schema()):
+        assert f"| `{key}` |" in page
+    assert "## `[[experiment]]`" in page
+    assert "## `[solver.reduced-space]`" in page
+
+
+def test_the_reference_of_the_command_line_has_every_command_and_option(reference):
+    page = reference.command_line()
+    for command in ("solve", "check", "compare", "sweep", "report", "new"):
+        assert f"\n## {command}\n" in page
+    for option in ("--start", "--allow-code", "--time-limit", "--over"):
+        assert f"`{option}`" in page
+    assert "collocation-sysid solve problem.toml --method interior-point" in page

@@ -66,7 +66,7 @@ def test_first_step_takes_its_inertia_from_the_start_velocity(backward_euler):
     collocation, x = backward_euler
     dynamics = collocation.segments[0].dynamics
     body, step = dynamics.body, dynamics.step_s
-    force = body.force(x[1], (x[1] - x[0]) / step, THETA)[0] + dynamics.forces.external_n[1]
+    force = body.force(x[1], (x[1] - x[0]) / step, THETA)[0] + dynamics.forces.external_n(THETA)[1]
     expected = force - body.dof_mass * (x[1] - x[0]) / step**2
     np.testing.assert_allclose(dynamics.residual(x, THETA)[1], expected, rtol=1e-12)
 
@@ -112,7 +112,7 @@ def test_constant_forces_add_to_gravity():
     )
     expected = np.zeros((27, 3))
     expected[nodes] = push / 2
-    difference = pushed.forces.external_n - plain.forces.external_n
+    difference = pushed.forces.external_n(THETA) - plain.forces.external_n(THETA)
     np.testing.assert_allclose(difference, [expected.ravel()] * pushed.rows, atol=1e-15)
 
 
@@ -164,7 +164,7 @@ def node_momenta(dynamics: Dynamics, x: np.ndarray, theta: np.ndarray) -> np.nda
     """(N − 1, n, 3) momenta at the nodes of the midpoint rule's grid from t = 1."""
     v = np.diff(x, axis=0) / dynamics.step_s
     middle = (x[1:] + x[:-1]) / 2
-    force = dynamics.body.force(middle, v, theta) + dynamics.forces.external_n[1:]
+    force = dynamics.body.force(middle, v, theta) + dynamics.forces.external_n(theta)[1:]
     momentum = dynamics.body.dof_mass * v + force * dynamics.step_s / 2
     return momentum.reshape(len(v), -1, 3)
 

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
-from checks import assert_derivative
-from memories_small import TWO, guesses, remembering
+from checks import assert_derivative, relative_error
+from memories_small import ONE, TWO, guesses, recorded, remembering, truth
+from problems_small import GUESS, box, hung_cube, measured_with, with_markers
 
+from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.regions import Region
+from collocation_sysid.methods.casadi_nlp import SqpMethod
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit_memory import ExplicitMemory, with_explicit_memory
+from collocation_sysid.nlp.explicit_memory import (
+    ExplicitMemory,
+    carried_over,
+    with_explicit_memory,
+)
 
 KINDS = {
     "relaxed": ("hung-cube", {}),
@@ -23,23 +39,57 @@ LAYOUTS = [(kind, "midpoint") for kind in KINDS] + [
 ]
 
 
+CORE = Region("core", np.arange(6), prony=["slow"])
+REGIONS = ONE | {"core.slow.share": 0.7, "core.slow.tau_s": 0.08}
+
+
+@cache
+def of_branches(count: int) -> Body:
+    """A cube of twelve nodes."""
+    names = [f"prony_{k + 1}" for k in range(count)]
+    return Body(box(divisions=(1, 1, 2)).mesh, density_kg_m3=30.0, prony=names)
+
+
+@cache
+def of_regions() -> Body:
+    """The same with a core that has a branch of its own."""
+    mesh = box(divisions=(1, 1, 2)).mesh
+    return Body(mesh, density_kg_m3=30.0, prony=["prony_1"], regions=[CORE])
+
+
+def swung(body: Body, values: dict[str, float], steps: int, **changes) -> Experiment:
+    """The hung cube with this body, and the tracks that these parameters give it."""
+    experiment = replace(hung_cube(steps, (1, 1, 2)), body=body, **changes)
+    return measured_with(experiment, values)
+
+
+def fitted(branches: int, steps: int, noise_m: float = 0.0) -> Collocation:
+    """All parameters of such a body from its swing."""
+    experiment = swung(of_branches(branches), truth(branches), steps)
+    tracks = experiment.markers.positions_m
+    noise = noise_m * np.random.default_rng(0).normal(size=tracks.shape)
+    return Collocation([with_markers(experiment, tracks + noise)], guesses(truth(branches), 1.2))
+
+
 def explicit(collocation: Collocation) -> ExplicitMemory:
     found = with_explicit_memory(collocation)
     assert isinstance(found, ExplicitMemory)
     return found
 
 
-def some_point(collocation: Collocation, rng: np.random.Generator) -> np.ndarray:
-    """Variables that satisfy nothing."""
+def some_point(program: ExplicitMemory, rng: np.random.Generator) -> np.ndarray:
+    """Variables that satisfy nothing, the recursion of the memory neither."""
     positions = []
-    for segment in collocation.segments:
+    for segment in program.segments:
         rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    p, nq = collocation.guess_p, collocation.nq
+    p, nq = program.guess_p, program.nq
     p[:nq] += 0.1 * rng.normal(size=nq)
-    p[nq:] = 0.5 * rng.normal(size=collocation.nphi)
-    z = collocation.pack(p, positions)
-    return z + 0.01 * rng.normal(size=len(z)) * (np.abs(z - collocation.pack(p, positions)) == 0)
+    p[nq:] = 0.5 * rng.normal(size=program.nphi)
+    z = program.pack(p, positions)
+    for memory in program.memories.values():
+        z[memory.variables] += 0.01 * rng.normal(size=memory.count)
+    return z
 
 
 def assert_derivatives(program: ExplicitMemory, rng: np.random.Generator) -> None:
@@ -64,3 +114,90 @@ def test_derivatives(kind: str, scheme: str, rng):
     name, changes = KINDS[kind]
     collocation = Collocation([remembering(name, 4, 2, **changes)], guesses(TWO, 1.1), scheme)
     assert_derivatives(explicit(collocation), rng)
+
+
+def test_derivatives_of_regions_and_of_several_experiments(rng):
+    one = swung(of_regions(), REGIONS, 3)
+    forgetful = replace(hung_cube(3, (1, 1, 2)), name="forgetful")
+    tilted = replace(one, name="tilted", nuisance=Nuisance.none(gravity_rad=0.1))
+    collocation = Collocation([one, forgetful, tilted], guesses(REGIONS, 1.1))
+    assert_derivatives(explicit(collocation), rng)
+
+
+def test_the_recursion_holds_where_the_memory_follows_from_the_motion():
+    collocation = fitted(2, 4)
+    program = explicit(collocation)
+    p = collocation.guess_p
+    positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_rows, 1)) for s in program.segments]
+    positions[0] *= 1 + 0.1 * np.random.default_rng(0).random(positions[0].shape)
+    z, given = program.pack(p, positions), collocation.pack(p, positions)
+    rows = program.constraint_values(z)
+    np.testing.assert_allclose(rows[collocation.constraints :], 0.0, atol=1e-14)
+    np.testing.assert_allclose(
+        rows[: collocation.constraints], collocation.constraint_values(given), atol=1e-12
+    )
+    np.testing.assert_allclose(carried_over(z, program, collocation), given, rtol=1e-14)
+    assert with_explicit_memory(Collocation([hung_cube(3)], GUESS)).variables < len(z)
+
+
+# What methods find ------------------------------------------------------------------------------
+
+
+def assert_same(found: Solution, expected: Solution, tolerance: float) -> None:
+    assert found.status.converged, found.message
+    for name, value in expected.parameters.items():
+        assert found.parameters[name] == pytest.approx(value, rel=tolerance), name
+
+
+@pytest.mark.parametrize(("branches", "noise_m"), [(1, 0.0), (2, 0.0), (1, 1e-4)])
+def test_interior_point_finds_the_optimum_of_reduced_space(branches: int, noise_m: float):
+    collocation = fitted(branches, 25, noise_m)
+    expected = ReducedSpace(tolerance=1e-10)(collocation)
+    found = InteriorPoint(tolerance=1e-10)(collocation)
+    assert_same(found, expected, 1e-6)
+    assert found.kkt_residual < 1e-9
+    assert found.collocation is collocation
+    assert relative_error(found.z, expected.z) < 1e-6
+    np.testing.assert_allclose(found.multipliers, expected.multipliers, atol=1e-7)
+    assert found.max_violation_relative < 1e-8
+
+
+def test_regions_with_branches_of_their_own_are_told_apart():
+    collocation = Collocation([swung(of_regions(), REGIONS, 25)], guesses(REGIONS, 1.2))
+    found = InteriorPoint(tolerance=1e-10)(collocation)
+    assert_same(found, ReducedSpace(tolerance=1e-10)(collocation), 1e-6)
+    for name, value in REGIONS.items():
+        assert found.parameters[name] == pytest.approx(value, rel=1e-5), name
+
+
+EXACT = InteriorPoint(tolerance=1e-10)
+METHODS = [
+    ("undeformed", EXACT, 1e-5),
+    ("loaded", EXACT, 1e-5),
+    ("let-go", EXACT, 1e-5),
+    ("relaxed", InteriorPoint(hessian="gauss-newton"), 1e-4),
+    ("relaxed", SqpMethod(), 1e-4),
+    ("relaxed", AugmentedLagrangian(tolerance=1e-9), 1e-3),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "method", "tolerance"), METHODS, ids=lambda given: getattr(given, "name", str(given))
+)
+def test_methods_that_see_the_whole_program_find_the_truth(kind: str, method, tolerance: float):
+    if kind == "let-go":
+        experiment = recorded("bar-let-go", 12)
+    else:
+        start = "undeformed" if kind == "undeformed" else "equilibrium"
+        changes = {"loaded_since_s": 0.04} if kind == "loaded" else {}
+        experiment = swung(of_branches(1), ONE, 15, start=start, **changes)
+    found = method(Collocation([experiment], guesses(ONE, 1.2)))
+    assert found.status.converged, found.message
+    for name, value in ONE.items():
+        assert found.parameters[name] == pytest.approx(value, rel=tolerance), name
+
+
+def test_a_penalty_leaves_little_slack_in_the_memory_too():
+    found = Penalty(inner="levenberg-marquardt", rho=1e4)(fitted(1, 10))
+    assert found.status.converged, found.message
+    assert found.max_violation_relative < 1e-3

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fits_small import autoregressive, problem
-from problem_files import EXPERIMENT, PROBLEM, replace_text, run_command, write_problem
+from problem_files import EXPERIMENT, PROBLEM, run_command, write_problem
 from problems_small import smooth_poses, times
+from test_models_in_files import TWO_REGIONS
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import write_poses_csv
@@ -128,9 +129,11 @@ def bar(tiny: Path) -> Path:
     return tiny / "problem.toml"
 
 
-def changed(file: Path, label: str, materials=(), branches=(), overrides=()) -> Problem:
+def changed(
+    file: Path, label: str, materials=(), branches=(), overrides=(), region=None
+) -> Problem:
     """The problem as one of its variants has it."""
-    found = {v.label: v for v in variants(file, overrides, materials, branches, TIMES_S)}
+    found = {v.label: v for v in variants(file, overrides, materials, branches, TIMES_S, region)}
     return Problem.read(file, found[label].overrides)
 
 
@@ -202,14 +205,58 @@ def test_a_value_is_written_as_toml_reads_it():
 def test_bad_models_are_refused_in_one_line(bar, tiny):
     with pytest.raises(InputError, match=r"'yeho'.*did you mean 'yeoh'"):
         parse_materials("yeho,gent")
-    with pytest.raises(InputError, match="whole numbers such as 0,1,2"):
+    with pytest.raises(InputError, match="whole numbers up to 20, such as 0,1,2"):
         parse_branches("1,x")
     with pytest.raises(InputError, match="yeoh alone; expected two or more"):
         variants(bar, (), ("yeoh",), (), TIMES_S)
-    region = '[[object.region]]\nname = "core"\ncells = { indices = [0] }\n\n[parameters]'
-    replace_text("[parameters]", region)(tiny)
-    with pytest.raises(InputError, match=r"object\.region: found regions"):
-        variants(bar, (), BOTH, (), TIMES_S)
+    with pytest.raises(InputError, match="found 'core'; expected none: it has no regions"):
+        variants(bar, (), BOTH, (), TIMES_S, "core")
+    TWO_REGIONS(tiny)
+    with pytest.raises(InputError, match=r"'stif'; expected one of stiff.*did you mean 'stiff'"):
+        variants(bar, (), BOTH, (), TIMES_S, "stif")
+    of_all = ('object.prony=[{"name" = "prony_1"}]',)
+    with pytest.raises(InputError, match="all parts without their own; expected none with"):
+        variants(bar, of_all, (), (0, 1), TIMES_S, "stiff")
+
+
+# The body has young_pa and poisson, its region "stiff" Yeoh's constants.
+OWN = "gamma_r_s gamma_m_1_s young_pa poisson"
+
+
+@pytest.mark.parametrize(
+    ("region", "material", "laws", "expected"),
+    [
+        (None, "neo-hookean", ["neo-hookean"] * 2, f"{OWN} stiff.mu_pa"),
+        (None, "gent", ["gent"] * 2, f"{OWN} gent_limit stiff.mu_pa stiff.gent_limit"),
+        ("stiff", "neo-hookean", ["neo-hookean"] * 2, f"{OWN} stiff.mu_pa"),
+        ("stiff", "gent", ["neo-hookean", "gent"], f"{OWN} stiff.mu_pa stiff.gent_limit"),
+        ("stiff", "yeoh", ["neo-hookean", "yeoh"], f"{OWN} stiff.c10_pa stiff.c20_pa stiff.c30_pa"),
+    ],
+)
+def test_a_region_or_all_of_a_body_has_the_material(bar, tiny, region, material, laws, expected):
+    TWO_REGIONS(tiny)
+    label = material if region is None else f"stiff: {material}"
+    problem = changed(bar, label, {material: 0, "linear": 0}, region=region)
+    assert [part.material.name for part in problem.bodies[0].parts] == laws
+    assert set(problem.parameters.names) == set(expected.split())
+
+
+def test_a_region_keeps_constants_of_its_own_where_it_has_some(bar, tiny):
+    TWO_REGIONS(tiny)
+    own = ("parameters.stiff.young_pa=900", "object.region.0.material=neo-hookean")
+    rid = "c10_pa", "c20_pa", "c30_pa"
+    text = bar.read_text()
+    bar.write_text("".join(s for s in text.splitlines(True) if not any(r in s for r in rid)))
+    problem = changed(bar, "gent", {"gent": 0, "linear": 0}, overrides=own)
+    extra = "stiff.young_pa gent_limit stiff.gent_limit"
+    assert set(problem.parameters.names) == {*OWN.split(), *extra.split()}
+
+
+def test_branches_may_be_a_regions(bar, tiny):
+    TWO_REGIONS(tiny)
+    problem = changed(bar, "stiff: 2 branches", branches=(0, 2), region="stiff")
+    assert [len(part.prony) for part in problem.bodies[0].parts] == [0, 2]
+    assert {"prony_1.share", "prony_2.tau_s"} <= set(problem.parameters.names)
 
 
 # Evidence ---------------------------------------------------------------------------------------

@@ -77,7 +77,7 @@ def test_an_inverted_element_costs_infinitely_much():
 
 def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
     problem = Unconstrained(collocation_of("bar-let-go"))
-    answer = problem.grasped(disturbed(problem, rng))
+    answer = problem.answer(disturbed(problem, rng))
     rows = problem.nlp.constraint_values(answer).reshape(-1, problem.nlp.segments[0].dofs)
     (segment,) = problem.nlp.segments
     assert segment.dynamics.taken.any()

@@ -45,6 +45,7 @@ from collocation_sysid.output.pictures.camera import Camera
 from collocation_sysid.output.pictures.confidence import ellipse
 from collocation_sysid.output.pictures.jacobian import RASTER, SHOWN_STEPS
 from collocation_sysid.output.pictures.mesh import apart
+from collocation_sysid.output.pictures.scene import Drawn, View, sheet
 from collocation_sysid.output.pictures.spectrum import spectral_density
 from collocation_sysid.output.replay import Replay
 from collocation_sysid.output.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
@@ -216,6 +217,12 @@ def test_sparsity_shows_the_first_blocks_below_the_diagonal():
     assert (blocks[(lag < -1) | (lag > 3)] == 0).all()
 
 
+def test_sparsity_needs_few_of_the_timesteps():
+    solution = solved()
+    jacobian_sparsity(solution.collocation, solution.z)
+    assert "jacobian_structure" not in vars(solution.collocation)
+
+
 def test_sparsity_shows_the_mesh_graph_of_one_block():
     solution = solved()
     segment = solution.collocation.segments[0]
@@ -242,6 +249,16 @@ def test_sparsity_is_drawn_for_every_start_and_scheme(make, scheme):
     shown = rasters(figure)
     assert len(shown) == 3
     assert max(max(raster.shape) for raster in shown) <= RASTER
+
+
+def test_curves_tell_where_the_horizon_grows():
+    lines = [replace(line, share=0.5 if k < 2 else 1.0) for k, line in enumerate(history())]
+    figure = convergence(lines)
+    panel = figure.axes[0]
+    assert panel.get_title() == "fitted: 50, 100 % of the timesteps in turn"
+    curves = [line for line in panel.lines if line.get_marker() == "o"]
+    assert [len(line.get_xdata()) for line in curves] == [2, 3]
+    assert not convergence(history()).axes[0].get_title()
 
 
 # In space
@@ -494,3 +511,23 @@ def test_drawing_needs_no_display_and_leaves_pyplot_alone():
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_grasped_nodes_on_the_sides_are_marked():
+    experiment = quadratic_bar()
+    body = experiment.body
+    seen = Replay.of(experiment, (np.tile(body.nodes_m, (len(experiment.t_s), 1, 1)), None))
+    assert seen.surface_nodes.shape == (len(seen.surface), 6)
+    corners, sides = body.nodes_m[seen.surface], body.nodes_m[seen.surface_nodes[:, 3:]]
+    middles = (corners + np.roll(corners, -1, axis=1)) / 2
+    for found, expected in zip(sides, middles, strict=True):
+        distances = np.linalg.norm(found[:, None] - expected, axis=2)
+        np.testing.assert_allclose(distances.min(axis=1), 0.0, atol=1e-12)
+    _, axes = sheet(80, 60)
+    camera = Camera.facing(body.nodes_m[None], seen.up)
+    view = View.fitting(camera, body.nodes_m, (70, 50), (5, 5))
+    drawn = Drawn(axes, view, seen.surface, nodes=seen.surface_nodes)
+    drawn.show(body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3)))
+    marked = len(drawn.grasped.get_xdata())
+    faces = camera.faces(body.nodes_m, seen.surface)[2]
+    assert marked == len(np.unique(seen.surface_nodes[faces])) > len(np.unique(seen.surface[faces]))

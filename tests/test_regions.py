@@ -292,7 +292,7 @@ def test_mass_tied_to_a_node_is_damped_as_the_body_there(make_two):
     v = np.tile([1.0, 2.0, 3.0], len(body.nodes_m))
     theta = theta_of_two(body)
     alone = body.force(body.nodes_m, v, theta)
-    heavier = body.force(body.nodes_m, v, theta, dof_mass=3 * body.dof_mass)
+    heavier = body.force(body.nodes_m, v, theta, tied_kg=2 * body.dof_mass)
     np.testing.assert_allclose(heavier, 3 * alone, atol=1e-13)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from problem_files import TRUTH, run_command, settings, write_problem
 
+from collocation_sysid.output.remedies import LAST, REMEDIES, remedies_for, remedy_for
 from collocation_sysid.output.report.run_page import verdict
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -176,7 +177,7 @@ def test_a_comparison_has_a_page_too(comparison: Path):
     assert outcome.code == 0, outcome.err
     found = Elements((comparison / "report.html").read_text())
     assert len(found.images) == len(list(comparison.glob("*.png"))) > 0
-    for words in ("Methods", "reduced-space", "shooting", "within 1 %", "Runs"):
+    for words in ("Success", "reduced-space", "shooting", "within 1 %", "Runs"):
         assert words in found.text
     assert not found.outside
 
@@ -186,3 +187,29 @@ def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
     outcome = run_command("report", tmp_path)
     assert outcome.code == 2
     assert "summary.json is damaged" in outcome.err
+
+
+def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
+    copy = tmp_path / "run"
+    shutil.copytree(run_folder, copy)
+    result = json.loads((copy / "result.json").read_text())
+    reasons = [
+        "the step moves mu_pa by 3 %, 4 standard errors: halve it",
+        "mu_pa ended at its bound",
+    ]
+    result["trust"] = {"verdict": "check", "reasons": reasons}
+    (copy / "result.json").write_text(json.dumps(result))
+    run_command("report", copy)
+    page = (copy / "report.html").read_text()
+    for remedy in remedies_for(reasons):
+        assert page.count(f'href="#{remedy.anchor}"') == page.count(f'id="{remedy.anchor}"') == 1
+    assert "docs/howto/scheme.md" in page
+    assert "usable after a look at the reasons" in page
+
+
+def test_every_remedy_names_a_page_that_is_there():
+    howto = Path(__file__).parents[1] / "docs" / "howto"
+    for remedy in (*REMEDIES, LAST):
+        assert (howto / f"{remedy.page}.md").is_file()
+    assert remedy_for("the residuals are 3 times as large as sigma_m says").page == "verdict"
+    assert remedy_for("something new") is LAST

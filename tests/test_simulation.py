@@ -74,7 +74,7 @@ def assert_stable_equilibrium(experiment: Experiment, theta: np.ndarray, x: np.n
     """No net force on free nodes, and a positive definite stiffness there."""
     body, solver = experiment.body, Solver(experiment)
     still = np.zeros_like(x)
-    load = Forces.of(experiment, experiment.t_s[:1]).external_n[0]
+    load = Forces.of(experiment, experiment.t_s[:1]).external_n(THETA)[0]
     net = (body.force(x, still, theta)[0] + load)[solver.free]
     assert np.abs(net).max() < 1e-9 * np.abs(load).max()
     stiffness = -body.linearise(x, still, theta).by_position[0]
@@ -262,7 +262,7 @@ def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
     dynamics = Dynamics.of(cube, "midpoint")
     x = march(cube, dynamics, THETA)
     residual = dynamics.residual(x, THETA)[:, Solver(cube).free]
-    assert np.abs(residual).max() < 1e-9 * np.abs(dynamics.forces.external_n).max()
+    assert np.abs(residual).max() < 1e-9 * np.abs(dynamics.forces.external_n(THETA)).max()
     with pytest.raises(SimulationError, match="the step at row 3 failed: an element is inverted"):
         march(cube, dynamics, THETA, NewtonOptions(halvings=0))
 

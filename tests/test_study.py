@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -292,7 +293,31 @@ def test_a_late_run_is_killed(stand_in):
     tries = stand_in("hangs")
     record = process.execute(planned_runs(1)[0].as_dict(), time_limit_s=0.5)
     assert (record["outcome"], tries("key0")) == ("timeout", 1)
-    assert record["message"] == "killed after the time limit of 0.5 s"
+    assert record["message"] == "ended after the time limit of 0.5 s"
+
+
+OBEDIENT = """
+import json, pathlib, signal, sys
+file, ready = map(pathlib.Path, (sys.argv[-1], sys.argv[-2]))
+def end(*_):
+    file.write_text(json.dumps({"outcome": "finished", "result": {"converged": False, "fit": {}}}))
+    sys.exit()
+signal.signal(signal.SIGTERM, end)
+ready.touch()
+signal.pause()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
+    ready = tmp_path / "ready"
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", OBEDIENT, str(ready)))
+    monkeypatch.setattr(process.time, "monotonic", lambda: 100.0 if ready.exists() else 0.0)
+    planned = planned_runs(1)[0]
+    record = process.execute(planned.as_dict(), time_limit_s=10.0)
+    assert record["outcome"] == "timeout"
+    assert record["result"] == {"converged": False, "fit": {}}
+    assert run_row(planned, record, Yardstick())["status"] == "timeout"
 
 
 def test_a_stopped_study_ends_its_runs(stand_in):

@@ -25,7 +25,14 @@ from problems_small import (
 )
 from wrenches_small import sensing, with_wrenches, wristed_cube
 
-from collocation_sysid.experiment import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.experiment import (
+    Experiment,
+    Force,
+    Grasp,
+    Nuisance,
+    PointMass,
+    PoseSequence,
+)
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.shooting import adjoint_gradient, simulated
 from collocation_sysid.nlp.collocation import Collocation, Part
@@ -73,7 +80,7 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(experiment: Experi
     (part,) = collocation.parts_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
     dynamics = part.segment.dynamics
-    mass = dynamics.mass_kg[0, ::3]
+    mass = dynamics.mass.row(0, theta)[::3]
     stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
     acceleration = stencil[grid + part.segment.sensors[0].late].reshape(len(grid), -1, 3)
     pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
@@ -89,7 +96,7 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     collocation = Collocation([experiment], Parameters.of(TRUTH | {"gamma_m_1_s": 0.0}))
     (part,) = collocation.parts_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
-    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass_kg[0, ::3]
+    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass.row(0, theta)[::3]
     at = x.reshape(len(x), -1, 3)
     second = (at[2:] - 2 * at[1:-1] + at[:-2]) / dynamics.step_s**2
     arm = at[1:-1] - [0.1, 0.2, -0.1]
@@ -138,6 +145,21 @@ def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
 # Derivatives --------------------------------------------------------------------------------------
 
 
+def loaded_cube(steps: int = 12) -> Experiment:
+    """A cube that a mass joins and leaves, in the hand and below, and a force pulls there."""
+    cube = hung_cube(steps)
+    dt, held = cube.timestep_s, cube.grasps[0].nodes
+    free = np.setdiff1d(np.arange(len(cube.body.nodes_m)), held)
+    both = np.concatenate([held[:2], free[:2]])
+    return replace(
+        cube,
+        name="loaded",
+        masses=[PointMass(both, 0.01, 2.6 * dt, until_s=7.2 * dt)],
+        forces=[Force(both[1:3], [[0.02, 0.01, 0.03]], from_s=3.3 * dt)],
+        nuisance=replace(EVERYTHING, joining_s=0.004),
+    )
+
+
 def cases() -> list:
     own = times(33, 0.0031) + 0.0017
     with_everything = replace(wristed_cube(nuisance=EVERYTHING, frame="grasp"), name="everything")
@@ -146,6 +168,10 @@ def cases() -> list:
     found += [(f"cube-{scheme}", wristed_cube(), scheme, {}) for scheme in SCHEMES]
     found += [
         (f"everything-{scheme}", sensing(with_everything, own, frame="grasp"), scheme, {})
+        for scheme in SCHEMES
+    ]
+    found += [
+        (f"loaded-{scheme}", sensing(loaded_cube(), own, frame="grasp"), scheme, {})
         for scheme in SCHEMES
     ]
     found += [

@@ -41,10 +41,10 @@ MISTAKES = {
 @pytest.mark.parametrize(("cause", "change"), MISTAKES.items(), ids=MISTAKES)
 def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench], Wrench]):
     collocation = changed(change)
-    found = likely_causes(ReducedSpace()(collocation), budget_s=0.0)
+    found = likely_causes(ReducedSpace()(collocation), budget=0)
     assert found[0].cause == cause
     assert found[0].strength > 2
 
 
 def test_a_wrench_that_fits_has_no_cause():
-    assert not likely_causes(ReducedSpace()(changed(lambda w: w)), budget_s=0.0)
+    assert not likely_causes(ReducedSpace()(changed(lambda w: w)), budget=0)

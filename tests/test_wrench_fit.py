@@ -15,6 +15,7 @@ from wrenches_small import SIGMA_N, SIGMA_NM, sensing
 import collocation_sysid as cs
 from collocation_sysid.check.derivatives import derivative_errors, shortened
 from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting
@@ -23,7 +24,7 @@ from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import covariance, uncertainty_of
 
 NOISE_M = 1e-3
 UNKNOWN = {item.name: cs.Unknown(item.guess, item.lower, item.upper) for item in GUESS.items}
@@ -171,3 +172,32 @@ def test_check_compares_the_slopes_of_wrenches():
     jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
     assert jacobian < 1e-6
     assert hessian < 1e-6
+
+
+def test_interior_point_finds_the_body_in_its_grasp_too():
+    nuisance = Nuisance.none(tare=10.0, gravity_rad=0.02, hand_eye_m=1e-3, sensor_time_s=0.001)
+    collocation = Collocation([swung(nuisance=nuisance, steps=12)], GUESS)
+    reduced = ReducedSpace()(collocation)
+    found = InteriorPoint(max_iterations=500)(collocation)
+    assert found.status.converged
+    np.testing.assert_allclose(found.q, reduced.q, atol=1e-5)
+
+
+def test_a_sensor_tells_stiffness_and_density_apart():
+    """Without it only their ratio is told."""
+    unknown = {**UNKNOWN, "density_kg_m3": cs.Unknown(45.0)}
+    felt = Problem([swung()], unknown)
+    collocation = felt.collocation()
+    solution = ReducedSpace()(collocation)
+    fit = linearised_fit(collocation, solution.z)
+    found = uncertainty_of(fit, felt.parameters, solution.q).estimates
+    for name, true in {**TRUTH, "density_kg_m3": 30.0}.items():
+        assert abs(found[name].value - true) < 4 * found[name].std_error, name
+    # The error bars are those of the slopes that the search has.
+    p, x = collocation.unpack(solution.z)
+    point = Horizon(collocation, [len(x[0])]).evaluate(p, x)
+    rows = np.concatenate([block.slope.reshape(-1, 5) for block in fit.blocks])
+    np.testing.assert_allclose(rows.T @ rows, point.slope.T @ point.slope, rtol=1e-6)
+    seen = Problem([blind(swung())], unknown)
+    told = covariance(seen.collocation(), seen.collocation().pack(p, x)).estimates
+    assert told["density_kg_m3"].std_error is None

@@ -227,7 +227,7 @@ def test_a_finished_run_is_not_lost_when_its_place_is_taken_meanwhile(tmp_path):
 
     with pytest.raises(InputError, match="it is kept in") as caught:
         write_too_late()
-    (kept,) = tmp_path.glob(".run.*.partial")
+    (kept,) = tmp_path.glob("run-*")
     assert str(kept) in str(caught.value)
     assert listing(kept) == ["result.json"]
     assert listing(target) == ["chapter.tex"]

@@ -20,6 +20,7 @@ from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
 from ..statistics.cause import Cause
+from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
 from .cost import Cost, cost_notes, cost_warnings, costs
 from .derivatives import SAMPLES, derivative_errors, shortened
@@ -149,6 +150,7 @@ def check_problem(problem: Problem) -> Findings:
     )
     causes, holds = description_causes(problem), _holds(problem, bodies)
     still = stillness_notes(problem.experiments, problem.parameters)
+    still += scale_notes(problem.experiments, problem.parameters)
     warnings = [cause.sentence for cause in causes] + still + _body_warnings(bodies)
     for hold in holds:
         warnings += hold_warnings(hold)

@@ -43,7 +43,7 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
         return
     if isinstance(method, InteriorPoint):
         needed_mb = interior_point_mb(sum(nonzeros(problem)))
-        fits = memory_mb(collocation) < there_mb and not collocation.remembers
+        fits = memory_mb(collocation) < there_mb
         remedy = 'method = "reduced-space"' if fits else "a coarser mesh or a shorter window_s"
     elif isinstance(method, ReducedSpace):
         needed_mb = memory_mb(collocation)

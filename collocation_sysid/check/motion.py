@@ -92,7 +92,7 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
 
     Of those times the last counts, when all point masses have joined.
     """
-    held = experiment.grasped(experiment.t_s)[0]
+    held = experiment.held(experiment.t_s)
     count = held.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])

@@ -62,7 +62,7 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         elements=len(body.cells),
         element=body.element.name,
         volume_m3=mesh.volume_m3,
-        mass_kg=body.mass_kg,
+        mass_kg=float(body.mass_of_dofs(theta).sum()) / 3,
         size_m=(x, y, z),
         edges_m=(quality.edge_min_m, quality.edge_mean_m, quality.edge_max_m),
         smallest_element_quality=quality.quality_min,

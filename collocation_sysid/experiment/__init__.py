@@ -2,6 +2,7 @@
 
 from .alignment import Aligned, align
 from .clock import sample_interval_s
+from .course_files import read_pressure, read_tension
 from .experiment import Experiment
 from .force_files import read_forces
 from .grasp import Grasp, held_dofs, held_nodes
@@ -10,8 +11,10 @@ from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance
 from .pose_files import displaced_axes, read_displacement, read_poses
 from .poses import PoseSequence
+from .pressure import Pressure
 from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
+from .tendon import Tendon
 from .wrench import Wrench
 from .wrench_files import read_wrench
 from .writers import write_markers_csv, write_poses_csv, write_wrench_csv
@@ -27,8 +30,10 @@ __all__ = [
     "Placement",
     "PointMass",
     "PoseSequence",
+    "Pressure",
     "RigidFit",
     "TemplateFit",
+    "Tendon",
     "Wrench",
     "align",
     "align_to_template",
@@ -41,6 +46,8 @@ __all__ = [
     "read_forces",
     "read_markers",
     "read_poses",
+    "read_pressure",
+    "read_tension",
     "read_wrench",
     "sample_interval_s",
     "write_markers_csv",

@@ -15,6 +15,8 @@ STEP_TOLERANCE = 0.01
 TIME_TOLERANCE_S = 1e-9
 # Rounding of printed times is forgiven up to this part of a step, so that no lost frame passes.
 _ROUNDING_LIMIT = 0.3
+# No clock tells less: rates of such steps overflow.
+SHORTEST_S = 1e-12
 _PRINTED_DECIMALS = range(10)
 
 
@@ -61,7 +63,7 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
 
 def first_time_fault(t_s: Array) -> tuple[int, str] | None:
     """Return the index of the first time that does not follow the one before, and say so."""
-    faulty = np.flatnonzero(~(np.diff(t_s) > 0.0))
+    faulty = np.flatnonzero(~(np.diff(t_s) > SHORTEST_S))
     if not faulty.size:
         return None
     row = int(faulty[0]) + 1

@@ -12,13 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
+from ..fem.pattern import Joined
+from .actuator import Actuator
 from .arrays import read_only_floats
-from .clock import STEP_TOLERANCE, first_time_fault, sample_interval_s
+from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
 from .freedom import free_motions
 from .grasp import Grasp, held_dofs
-from .loads import Force, PointMass
+from .loads import Change, Force, PointMass, ramp
 from .markers import Markers
 from .nuisance import Nuisance
+from .pressure import Pressure
+from .tendon import Tendon
 from .wrench_files import within
 
 if TYPE_CHECKING:
@@ -71,6 +75,10 @@ class Experiment:
         Tied to the body.
     forces : sequence of Force
         On the nodes besides gravity.
+    tendons : sequence of Tendon
+        Put on the body by their points.
+    pressures : sequence of Pressure
+        On faces of the body's boundary.
     nuisance : Nuisance
         What else is to be estimated about this recording alone: by default what a careful
         laboratory does not know better; `Nuisance.none` for ideal data.
@@ -96,6 +104,8 @@ class Experiment:
     validation: bool
     masses: tuple[PointMass, ...]
     forces: tuple[Force, ...]
+    tendons: tuple[Tendon, ...]
+    pressures: tuple[Pressure, ...]
     nuisance: Nuisance
 
     def __init__(
@@ -116,6 +126,8 @@ class Experiment:
         validation: bool = False,
         masses: Iterable[PointMass] = (),
         forces: Iterable[Force] = (),
+        tendons: Iterable[Tendon] = (),
+        pressures: Iterable[Pressure] = (),
         nuisance: Nuisance = AS_IN_A_LABORATORY,
     ) -> None:
         n = len(body.nodes_m)
@@ -137,6 +149,8 @@ class Experiment:
                 validation=validation,
                 masses=tuple(mass.on(body) for mass in masses),
                 forces=tuple(force.on(body) for force in forces),
+                tendons=tuple(tendon.on(body) for tendon in tendons),
+                pressures=tuple(pressure.on(body) for pressure in pressures),
                 nuisance=nuisance,
             )
             self._check_kind()
@@ -144,6 +158,7 @@ class Experiment:
             vars(self)["markers"] = self.markers.on(body, self._carried_back)
             self._check_nodes()
             self._check_start()
+            self._check_actuators()
         except InputError as error:
             raise error.located(where=f"experiment '{name}'") from error
 
@@ -173,7 +188,7 @@ class Experiment:
     @cached_property
     def held_dofs(self) -> Index:
         """Dofs, 3 node + axis, that are grasped throughout, sorted."""
-        held, _ = self.grasped(self.t_s)
+        held = self.held(self.t_s)
         return np.flatnonzero(held.all(axis=0))
 
     @cached_property
@@ -191,14 +206,22 @@ class Experiment:
             NaN where a node is not held.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        held = self.held(times)
         positions = np.full(held.shape, np.nan)
         for grasp in self.grasps:
             here = np.flatnonzero(grasp.holds(times))
-            place = np.ix_(here, grasp.nodes, grasp.columns)
             carried = grasp.carry(self.body.nodes_m, times[here])
-            held[place], positions[place] = True, carried[..., grasp.columns]
+            positions[np.ix_(here, grasp.nodes, grasp.columns)] = carried[..., grasp.columns]
         return held, positions
+
+    def held(self, t_s: ArrayLike) -> NDArray[np.bool_]:
+        """Return which coordinates of the nodes are held at the times `t_s` (T,), (T, n, 3)."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        for grasp in self.grasps:
+            here = np.flatnonzero(grasp.holds(times))
+            held[np.ix_(here, grasp.nodes, grasp.columns)] = True
+        return held
 
     def held_positions(self, t_s: ArrayLike) -> Array:
         """Return where `held_dofs` are carried at `t_s` (T,), as (T, held) metres."""
@@ -206,25 +229,78 @@ class Experiment:
         return positions.reshape(len(positions), -1)[:, self.held_dofs]
 
     def node_mass_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg]."""
+        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg].
+
+        Of the body's densities as stated.
+        """
+        return self.body.node_mass + self.tied_mass_kg(t_s)
+
+    def tied_mass_kg(self, t_s: ArrayLike) -> Array:
+        """Return the mass of all point masses that each node carries at `t_s` (T,), (T, n) [kg]."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
-        mass = np.broadcast_to(self.body.node_mass, (len(times), n))
+        mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
-            mass = mass + point.at_nodes(times, n)
+            mass = mass + np.outer(self.share(point, times), point.at_nodes(n))
         return mass
+
+    def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
+        """Return how much of a load is there at `t_s` (T,), from 0 to 1.
+
+        It joins and leaves between a sample before and a sample after its times, see `loads.ramp`;
+        all is there from the first sample on where it joins by then. Where the experiment is
+        static it joins and leaves at once.
+        """
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        joined, left = (self._changed(load, change, times) for change in get_args(Change))
+        return joined - left
+
+    def _changed(self, load: PointMass | Force, change: Change, times: Array) -> Array:
+        at_s = getattr(load, change)
+        if self.static:
+            return (times >= at_s - TIME_TOLERANCE_S).astype(np.float64)
+        if self.changes(load, change):
+            return ramp((times - at_s) / self.timestep_s)
+        return np.full(len(times), float(at_s <= self.t_s[0]))
+
+    def changes(self, load: PointMass | Force, change: Change) -> bool:
+        """Whether a load joins, or leaves, within the recording of a motion."""
+        within = self.t_s[0] < getattr(load, change) < self.t_s[-1]
+        return bool(within) and not self.static
 
     def node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the forces besides gravity on the nodes at `t_s` (T,), (T, n, 3)."""
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
-            total = total + force.at_nodes(times, n)
+            total = total + self.share(force, times)[:, None, None] * force.at_nodes(times, n)
         return total
+
+    @property
+    def knows_a_force(self) -> bool:
+        """Whether a known mass or force, or a measured one, sets the scale of all forces."""
+        if any(grasp.wrench is not None for grasp in self.grasps):
+            return True
+        if any(actuator.amplitude(self.t_s).any() for actuator in self.actuators):
+            return True
+        tied = np.repeat(self.tied_mass_kg(self.t_s), 3, axis=1)
+        forces = self.node_forces_n(self.t_s).reshape(tied.shape)
+        return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """Its tendons, then its pressures."""
+        return (*self.tendons, *self.pressures)
+
+    @property
+    def joined(self) -> Joined:
+        """The mesh graph of its body, and the couplings of each of the actuators."""
+        couplings = (actuator.measure.couplings for actuator in self.actuators)
+        return Joined.of((self.body.pattern, *couplings))
 
     @property
     def pattern(self) -> SymmetricPattern:
         """Sparsity of the slopes of the forces on its body."""
-        return self.body.pattern
+        return self.joined.pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
@@ -327,6 +403,21 @@ class Experiment:
                 f"but this one has {n}"
             )
 
+    def _check_actuators(self) -> None:
+        names = [actuator.name for actuator in self.actuators]
+        if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+            raise InputError(
+                f"two tendons or pressures are called {twice[0]!r}; expected different names"
+            )
+        for actuator in self.actuators:
+            actuator.course.refuse_short(self.t_s, actuator.name)
+        if not self.pressures:
+            return
+        held, places_m = self.grasped(self.t_s)
+        throughout = np.asarray(held.all(axis=0))
+        bounded = tuple(pressure.bounded(throughout, places_m) for pressure in self.pressures)
+        vars(self)["pressures"] = bounded
+
     def _check_start(self) -> None:
         for key, choices in (("start", Start), ("start_rule", StartRule)):
             if getattr(self, key) not in get_args(choices):
@@ -354,7 +445,7 @@ class Experiment:
             self._refuse_free_motions()
 
     def _refuse_free_motions(self) -> None:
-        held = self.grasped(self.t_s[:1])[0][0]
+        held = self.held(self.t_s[:1])[0]
         free = free_motions(self.body.nodes_m, held)
         if free:
             raise InputError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,10 +12,32 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.selection import Selection
 from .arrays import on_body, read_only_floats, some_nodes
-from .clock import TIME_TOLERANCE_S, first_time_fault
+from .clock import first_time_fault
 
 if TYPE_CHECKING:
     from ..fem.body import Body
+
+# The times of a load that can be estimated.
+Change = Literal["from_s", "until_s"]
+
+
+def ramp(u: Array, order: int = 0) -> Array:
+    """What joins around u = 0: none before −1, all after 1, with a continuous slope between.
+
+    Its slope is a hat: whatever the time between two steps of an even grid at which it joins, the
+    shares add up to the steps that are left. `order` 1 or 2 is a derivative.
+    """
+    u = np.clip(u, -1.0, 1.0)
+    if order == 0:
+        return 0.5 + u - 0.5 * u * np.abs(u)
+    return 1 - np.abs(u) if order == 1 else -np.sign(u) * (np.abs(u) < 1)
+
+
+def _refuse_times(from_s: float, until_s: float, what: str) -> None:
+    if not from_s < until_s:
+        raise InputError(
+            f"a {what} is there from {from_s:g} s until {until_s:g} s; expected from_s < until_s"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +52,9 @@ class PointMass:
         An experiment looks a selection up.
     mass_kg : float
         Of all nodes together.
-    from_s : float
-        When it joins the body; it then moves at the body's velocity. Always, by default.
+    from_s, until_s : float
+        When it joins the body, at the body's velocity, and leaves it; always there by default. See
+        `Experiment.share`.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
     """
@@ -39,6 +62,7 @@ class PointMass:
     nodes: Index
     mass_kg: float
     from_s: float
+    until_s: float
     selection: Selection | None
 
     def __init__(
@@ -47,24 +71,26 @@ class PointMass:
         mass_kg: float,
         from_s: float = -np.inf,
         selection: Selection | None = None,
+        until_s: float = np.inf,
     ) -> None:
         if not (np.isfinite(mass_kg) and mass_kg > 0):
             raise InputError(f"mass_kg of a point mass is {mass_kg:g}; expected more than 0")
+        _refuse_times(from_s, until_s, "point mass")
         tied = some_nodes(nodes, "the point mass")
         chosen = tied if isinstance(tied, Selection) else selection
-        vars(self).update(nodes=tied, mass_kg=mass_kg, from_s=from_s, selection=chosen)
+        vars(self).update(
+            nodes=tied, mass_kg=mass_kg, from_s=from_s, until_s=until_s, selection=chosen
+        )
 
     def on(self, body: Body) -> PointMass:
         """The same mass on the nodes of a body that are selected."""
         nodes = on_body(self.nodes, body)
         return self if nodes is self.nodes else replace(self, nodes=nodes)
 
-    def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
-        """Mass that each node carries at the times `t_s` (T,), (T, n) [kg]."""
-        times = np.atleast_1d(np.asarray(t_s, dtype=float))
-        mass = np.zeros((len(times), node_count))
-        there = times >= self.from_s - TIME_TOLERANCE_S
-        mass[np.ix_(there, self.nodes)] = self.mass_kg / len(self.nodes)
+    def at_nodes(self, node_count: int) -> Array:
+        """Mass that each node carries, (n,) [kg]."""
+        mass = np.zeros(node_count)
+        mass[self.nodes] = self.mass_kg / len(self.nodes)
         return mass
 
 
@@ -82,12 +108,16 @@ class Force:
         Times of the rows; the force is zero outside them. A single row without a time is constant.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
+    from_s, until_s : float
+        When it begins and ends to act; always by default. See `Experiment.share`.
     """
 
     nodes: Index
     force_n: Array
     t_s: Array | None
     selection: Selection | None
+    from_s: float
+    until_s: float
 
     def __init__(
         self,
@@ -95,7 +125,10 @@ class Force:
         force_n: ArrayLike,
         t_s: ArrayLike | None = None,
         selection: Selection | None = None,
+        from_s: float = -np.inf,
+        until_s: float = np.inf,
     ) -> None:
+        _refuse_times(from_s, until_s, "force")
         pulled = some_nodes(nodes, "the force")
         rows = read_only_floats(np.atleast_2d(force_n), (None, 3), "force_n")
         if t_s is None and len(rows) != 1:
@@ -105,7 +138,14 @@ class Force:
             if fault := first_time_fault(t_s):
                 raise InputError(fault[1], where=f"row {fault[0] + 1}")
         chosen = pulled if isinstance(pulled, Selection) else selection
-        vars(self).update(nodes=pulled, force_n=rows, t_s=t_s, selection=chosen)
+        vars(self).update(
+            nodes=pulled,
+            force_n=rows,
+            t_s=t_s,
+            selection=chosen,
+            from_s=from_s,
+            until_s=until_s,
+        )
 
     def on(self, body: Body) -> Force:
         """The same force on the nodes of a body that are selected."""
@@ -113,7 +153,7 @@ class Force:
         return self if nodes is self.nodes else replace(self, nodes=nodes)
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
-        """Force on each node at the times `t_s` (T,), (T, n, 3) [N]."""
+        """Force on each node at the times `t_s` (T,) while it acts, (T, n, 3) [N]."""
         times = np.atleast_1d(np.asarray(t_s, dtype=float))
         total = np.repeat(self.force_n[:1], len(times), axis=0)
         if self.t_s is not None:

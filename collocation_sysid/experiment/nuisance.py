@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..errors import InputError
+from .actuator import Actuator
+from .tendon import Tendon
 
 DEGREE = float(np.pi / 180)
 
@@ -34,6 +36,9 @@ class Nuisance:
     displacement_zero_m : float or None
         By how much displacements are off, constant in time, along each axis of a grasp whose zero
         is not known.
+    joining_s : float or None
+        How much later than stated point masses and forces join or leave, each that does within the
+        recording.
     pose_shift_m, pose_turn_rad : float or None
         A small rigid motion, constant in time, by which grasps and body are off in the frame of
         the markers, such as that of cameras. It turns the body against gravity.
@@ -50,6 +55,10 @@ class Nuisance:
         Mass of what is between a sensor and the body, and each coordinate of its centre about the
         sensor's point (in the world's frame, about the middle of the grasped nodes); it is there
         without `tool_m`.
+    tension_factor, tension_lost_n : float or None
+        How far the factor of each tendon's tension is from one, and what friction takes of it.
+    pressure_factor, pressure_lost_pa : float or None
+        The same of each pressure, whose sensor may have another zero.
     """
 
     marker_offset_m: float | None = 1e-3
@@ -58,6 +67,7 @@ class Nuisance:
     hand_eye_m: float | None = 1e-3
     hand_eye_rad: float | None = 0.5 * DEGREE
     displacement_zero_m: float | None = 1e-4
+    joining_s: float | None = 1e-2
     pose_shift_m: float | None = None
     pose_turn_rad: float | None = None
     camera_offset_m: float | None = None
@@ -66,12 +76,22 @@ class Nuisance:
     sensor_lag_s: float | None = None
     tool_kg: float | None = None
     tool_m: float | None = None
+    tension_factor: float | None = None
+    tension_lost_n: float | None = None
+    pressure_factor: float | None = None
+    pressure_lost_pa: float | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None and not value > 0:
                 raise InputError(f"{field.name} is {value:g}; expected a deviation above 0")
+
+    def off(self, actuator: Actuator) -> tuple[float | None, float | None]:
+        """How well its factor is known, and what it loses."""
+        if isinstance(actuator, Tendon):
+            return self.tension_factor, self.tension_lost_n
+        return self.pressure_factor, self.pressure_lost_pa
 
     @classmethod
     def none(cls, **deviations: float | None) -> Nuisance:

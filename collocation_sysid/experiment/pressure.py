@@ -1,21 +1,26 @@
-"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V that faces enclose."""
+"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V behind faces of a body."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..fem.selection import Selection
+from ..fem.refinement import faces_in_four
+from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.volume import Volume
+from .actuator import Placed, measured
 from .course import Course
 
 if TYPE_CHECKING:
     from ..fem.body import Body
+
+# Points of a plane are this near to it, of the body's size.
+PLANE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +40,8 @@ class Pressure:
     t_s : (m,) array, optional
         Times of the rows, which must reach over the recording.
     name : str
-    factor, offset_pa : float
-        How the pressure in the body differs: factor · pressure + offset.
-
-    Attributes
-    ----------
-    measure : Volume or None
-        Of what is enclosed, once it is on a body.
+    factor, lost_pa : float
+        How the pressure in the body differs: factor · pressure − lost.
     """
 
     faces: Selection | Index
@@ -49,9 +49,11 @@ class Pressure:
     t_s: Array | None
     name: str
     factor: float
-    offset_pa: float
-    measure: Volume | None
+    lost_pa: float
+    placed: Placed[Volume] | None
     course: Course = field(init=False, repr=False)
+
+    unit: ClassVar[str] = "Pa"
 
     def __init__(
         self,
@@ -61,8 +63,8 @@ class Pressure:
         name: str = "pressure",
         *,
         factor: float = 1.0,
-        offset_pa: float = 0.0,
-        measure: Volume | None = None,
+        lost_pa: float = 0.0,
+        placed: Placed[Volume] | None = None,
     ) -> None:
         pressure = Course(pressure_pa, t_s, f"pressure_pa of {name}")
         if not isinstance(faces, Selection):
@@ -79,8 +81,8 @@ class Pressure:
             course=pressure,
             name=name,
             factor=factor,
-            offset_pa=offset_pa,
-            measure=measure,
+            lost_pa=lost_pa,
+            placed=placed,
         )
 
     def on(self, body: Body) -> Pressure:
@@ -91,11 +93,15 @@ class Pressure:
         InputError
             If they are not on its boundary, or enclose the body instead of a cavity.
         """
+        if self.placed is not None and self.placed.body is body:
+            return self
         mesh = body.mesh
         if isinstance(self.faces, Selection):
             rows = self.faces.resolve_faces(mesh)
         else:
-            rows = _rows_of(self.faces, mesh.surface, self.name)
+            rows = np.unique(rows_of_faces(self.faces, mesh.surface))
+            if rows[0] < 0:
+                raise InputError(f"{self.name}: not all faces are on the boundary of the body")
         # Seen from the cavity, the outside of the material is the inside.
         wall = body.nodes.on_faces(mesh.surface[rows][:, ::-1])
         volume = Volume(wall, len(body.nodes_m))
@@ -104,39 +110,72 @@ class Pressure:
                 f"{self.name}: the faces surround the body from outside; expected the wall of a "
                 "cavity in it, or an open patch whose rim is held"
             )
-        return replace(self, measure=volume)
+        return replace(self, placed=Placed(body, volume))
+
+    def refined(self, body: Body, finer: Body) -> Pressure:
+        """The same on a body whose mesh is that of `body`, split in eight."""
+        if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
+            return replace(self, placed=None)
+        corners = self.on(body).measure.faces[:, :3]
+        return replace(self, faces=faces_in_four(corners, body.mesh), placed=None)
+
+    @property
+    def measure(self) -> Volume:
+        """The volume of what is enclosed, on a body."""
+        return measured(self.placed, self.name)
+
+    @property
+    def off(self) -> tuple[float, float]:
+        """Factor, and what is lost."""
+        return self.factor, self.lost_pa
+
+    def off_by(self, factor: float, lost: float) -> Pressure:
+        """The same with another factor, and another pressure lost."""
+        return replace(self, factor=factor, lost_pa=lost)
 
     def amplitude(self, t_s: Array) -> Array:
         """The negative of the pressure at the times `t_s` (T,) [Pa]."""
-        return -(self.factor * self.course.at(t_s) + self.offset_pa)
+        return self.lost_pa - self.factor * self.course.at(t_s)
 
     def slopes(self, t_s: Array) -> Array:
-        """Its derivatives (T, 2) by factor and offset_pa."""
+        """Its derivatives (T, 2) by factor and lost_pa."""
         stated = self.course.at(t_s)
-        return -np.column_stack([stated, np.ones(len(stated))])
+        return np.column_stack([-stated, np.ones(len(stated))])
 
-    def refuse_free_rim(self, held: NDArray[np.bool_]) -> None:
-        """Refuse an open patch whose rim moves freely; `held` (n,) are nodes held throughout.
+    def bounded(self, held: NDArray[np.bool_], places_m: Array) -> Pressure:
+        """The same, with a volume that the rim's motion does not change, where the rim is held.
+
+        The volume of an open patch is that of the cones over it from an apex. It has the pressure's
+        work where its rim is held, or slides in planes, such as those of symmetry: then the apex
+        must lie in these.
+
+        Parameters
+        ----------
+        held : (n, 3) bool, coordinates that grasps hold throughout
+        places_m : (T, n, 3) where they hold them, NaN elsewhere
 
         Raises
         ------
         InputError
-            Naming the pressure.
+            If the rim moves otherwise.
         """
-        rim = self.measure.rim if self.measure else ()
-        free = int((~held[rim]).sum())
+        placed, volume = self.placed, self.measure
+        if placed is None or not volume.rim.size:
+            return self
+        loose = volume.rim[~held[volume.rim].all(axis=(1, 2))]
+        slides = np.asarray(np.logical_and.reduce(held[loose], axis=1))  # (k, 3)
+        free = int((~slides.any(axis=1)).sum())
+        apex, size_m = np.zeros(3), np.nanmax(np.abs(places_m), initial=0.0)
+        for axis in range(3):
+            plane = places_m[:, loose[slides[:, axis]], axis]
+            if plane.size and np.ptp(plane) > PLANE * size_m:
+                free += plane.shape[1]
+            elif plane.size:
+                apex[axis] = plane.mean()
         if free:
             raise InputError(
-                f"{self.name}: the faces are not closed, and {free} of the {len(rim)} nodes on "
-                "their rim are free; expected the whole wall of a cavity, or a rim that is held: "
-                "the force on other patches has no energy"
+                f"{self.name}: the faces are not closed, and {free} of the {len(volume.rim)} edges "
+                "of their rim move; expected the whole wall of a cavity, or a rim that is held or "
+                "slides in one plane across an axis: the force on other patches has no energy"
             )
-
-
-def _rows_of(faces: Index, surface: Index, name: str) -> Index:
-    """Rows of the surface (F, 3) that faces (k, 3) are."""
-    there = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
-    rows = {there.get(tuple(face), -1) for face in np.sort(faces, axis=1).tolist()}
-    if -1 in rows or not rows:
-        raise InputError(f"{name}: not all faces are triangles of the body's boundary")
-    return np.array(sorted(rows), dtype=np.int64)
+        return replace(self, placed=Placed(placed.body, volume.from_apex(apex)))

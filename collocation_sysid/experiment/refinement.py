@@ -34,6 +34,7 @@ def refined(experiment: Experiment, finer: Body) -> Experiment:
         grasps=tuple(map(anew, experiment.grasps)),
         masses=tuple(map(anew, experiment.masses)),
         forces=tuple(map(anew, experiment.forces)),
+        pressures=tuple(pressure.refined(body, finer) for pressure in experiment.pressures),
         markers=replace(markers, placement=placement, places_m=None),
         start_positions_m=_interpolated(experiment.start_positions_m, body, finer),
         start_velocities_m_s=_interpolated(experiment.start_velocities_m_s, body, finer),

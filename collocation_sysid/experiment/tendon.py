@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.length import Length
+from .actuator import Placed, measured
 from .arrays import read_only_floats
 from .course import Course
 from .placement import Shape
@@ -40,11 +41,6 @@ class Tendon:
     name : str
     factor, lost_n : float
         How the tension at the body differs: max(0, factor · tension − lost).
-
-    Attributes
-    ----------
-    measure : Length or None
-        Of its polyline, once it is on a body.
     """
 
     points_m: Array
@@ -53,8 +49,10 @@ class Tendon:
     name: str
     factor: float
     lost_n: float
-    measure: Length | None
+    placed: Placed[Length] | None
     course: Course = field(init=False, repr=False)
+
+    unit: ClassVar[str] = "N"
 
     def __init__(
         self,
@@ -65,7 +63,7 @@ class Tendon:
         *,
         factor: float = 1.0,
         lost_n: float = 0.0,
-        measure: Length | None = None,
+        placed: Placed[Length] | None = None,
     ) -> None:
         points = read_only_floats(points_m, (None, 3), f"points_m of {name}")
         if len(points) < 2:
@@ -93,7 +91,7 @@ class Tendon:
             name=name,
             factor=factor,
             lost_n=lost_n,
-            measure=measure,
+            placed=placed,
         )
 
     def on(self, body: Body) -> Tendon:
@@ -102,8 +100,10 @@ class Tendon:
         Raises
         ------
         InputError
-            If a point is too far outside, or all are tied to the same node.
+            If a point is too far outside.
         """
+        if self.placed is not None and self.placed.body is body:
+            return self
         shape = Shape(body.nodes_m, body)
         found = [shape.embed(point) for point in self.points_m]
         nodes, weights, distances = (np.array(part) for part in zip(*found, strict=True))
@@ -114,7 +114,21 @@ class Tendon:
                 f"{distances[worst]:.4g} m outside the body, more than the mean edge length of "
                 f"{shape.mean_edge_m:.4g} m; expected points_m on the undeformed body, in metres"
             )
-        return replace(self, measure=Length(nodes, weights, len(body.nodes_m)))
+        return replace(self, placed=Placed(body, Length(nodes, weights, len(body.nodes_m))))
+
+    @property
+    def measure(self) -> Length:
+        """The length of its polyline, on a body."""
+        return measured(self.placed, self.name)
+
+    @property
+    def off(self) -> tuple[float, float]:
+        """Factor, and what is lost."""
+        return self.factor, self.lost_n
+
+    def off_by(self, factor: float, lost: float) -> Tendon:
+        """The same with another factor, and another tension lost."""
+        return replace(self, factor=factor, lost_n=lost)
 
     def amplitude(self, t_s: Array) -> Array:
         """The tension at the body at the times `t_s` (T,) [N]."""

@@ -107,7 +107,7 @@ class Wrench:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """(6,) components that are measured at some time."""
-        return self.present.any(axis=0)
+        return np.asarray(self.present.any(axis=0))
 
     @property
     def names(self) -> tuple[str, ...]:

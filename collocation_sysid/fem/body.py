@@ -8,13 +8,15 @@ The slopes of a damping law that is a stress, not a potential, are not symmetric
 are arrays of their own, which are empty, (T, 0), where no part of the body has any.
 
 A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
-part in turn: its material's, its damping law's, those of its memory, and its γ_m. What a body with
-memory brings from the past, see `memory`, is given beside x and v; without it, it has relaxed.
+part in turn: its material's, its damping law's, those of its memory, its γ_m, and its density where
+that is free. What a body with memory brings from the past, see `memory`, is given beside x and v;
+without it, it has relaxed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -118,7 +120,7 @@ class Body(Model):
     nodes_m : (n, 3) undeformed node positions
         The mesh's nodes, then, for quadratic elements, the middle of each of `mesh.edges`.
     cells : (E, nodes per element) node numbers
-    node_mass : (n,) lumped mass [kg]
+    node_mass : (n,) lumped mass, of the densities as stated [kg]
     pattern : SymmetricPattern of K
 
     Raises
@@ -154,8 +156,9 @@ class Body(Model):
         self.nodes_m: Array = self.nodes.points_m
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
-        self._part_masses = [self._lumped(part) for part in self.parts]
-        self.node_mass: Array = np.sum(self._part_masses, axis=0)
+        # (3n,) of each part.
+        self._lumped_m3 = [np.repeat(self._lumped(part), 3) for part in self.parts]
+        self.node_mass: Array = self._weighed([p.density_kg_m3 for p in self.parts])[::3]
         self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)
@@ -172,11 +175,23 @@ class Body(Model):
         )
 
     def _lumped(self, part: Part) -> Array:
-        """(n,) lumped mass of a part."""
+        """(n,) lumped volume of a part."""
         shares = self.mesh.volumes_m3[part.cells, None] * self.element.mass_shares
-        mass = np.zeros(len(self.nodes_m))
-        np.add.at(mass, self.cells[part.cells], part.density_kg_m3 * shares)
-        return mass
+        volume = np.zeros(len(self.nodes_m))
+        np.add.at(volume, self.cells[part.cells], shares)
+        return volume
+
+    def with_free_densities(self, parts: Collection[str]) -> Body:
+        """The same body, with the densities of the parts of these names among its constants."""
+        free = tuple(replace(part, free_density=part.name in parts) for part in self.parts)
+        if all(a.free_density == b.free_density for a, b in zip(free, self.parts, strict=True)):
+            return self
+        other = copy(self)
+        for name in ("starts", "stresses", "elastic_places", "mass_slopes", "_gamma_places"):
+            vars(other).pop(name, None)
+        Model.__init__(other, free)
+        other._evaluators = {}
+        return other
 
     def select(self, selection: Selection) -> Index:
         """Return the nodes of a `selection.Selection`, sorted.
@@ -234,8 +249,36 @@ class Body(Model):
 
     @property
     def mass_kg(self) -> float:
-        """Total mass."""
+        """Total mass, of the densities as stated."""
         return float(self.node_mass.sum())
+
+    @cached_property
+    def mass_slopes(self) -> dict[int, Array]:
+        """∂M/∂ρ (3n,) of each density that is free, by its place in θ [m³]."""
+        return {
+            place + 1: volume
+            for part, place, volume in zip(
+                self.parts, self._gamma_places, self._lumped_m3, strict=True
+            )
+            if part.free_density
+        }
+
+    def densities(self, theta: Theta) -> list[float]:
+        """Of each part [kg/m³]."""
+        return [
+            float(theta[place + 1]) if part.free_density else part.density_kg_m3
+            for part, place in zip(self.parts, self._gamma_places, strict=True)
+        ]
+
+    def mass_of_dofs(self, theta: Theta) -> Array:
+        """(3n,) lumped mass of every degree of freedom [kg]."""
+        if not self.mass_slopes:
+            return self.dof_mass
+        return self._weighed(self.densities(theta))
+
+    def _weighed(self, densities: Sequence[float]) -> Array:
+        """(3n,) mass of every dof."""
+        return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
     @property
     def unsymmetric(self) -> bool:
@@ -244,7 +287,7 @@ class Body(Model):
 
     @cached_property
     def dof_mass(self) -> Array:
-        """(3n,) lumped mass of every degree of freedom [kg]."""
+        """(3n,) lumped mass of every degree of freedom, of the densities as stated [kg]."""
         return np.repeat(self.node_mass, 3)
 
     @cached_property
@@ -283,7 +326,7 @@ class Body(Model):
         positions: ArrayLike,
         velocities: ArrayLike,
         theta: Theta,
-        dof_mass: Array | None = None,
+        tied_kg: Array | None = None,
         carried: Carried | None = None,
     ) -> Array:
         """Internal force f(x, v; θ), (T, 3n) [N].
@@ -292,16 +335,14 @@ class Body(Model):
         ----------
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
         theta : (k,) in the order of `constants`
-        dof_mass : (3n,) or (T, 3n), optional
-            The M that γ_m damps, where more than the body's own mass moves [kg].
+        tied_kg : (3n,) or (T, 3n), optional
+            What γ_m damps besides the body's own mass.
         carried : Carried, optional
             What the states of a body with memory bring from the past; nothing by default.
         """
         x, v = self._states(positions, velocities)
-        mass = self.dof_mass if dof_mass is None else dof_mass
-        return (
-            self._evaluate("force", [x, v], theta, carried=carried) - self._drag(theta) * mass * v
-        )
+        internal = self._evaluate("force", [x, v], theta, carried=carried)
+        return internal - self._drag(theta, tied_kg) * v
 
     def linearise(
         self,
@@ -309,7 +350,7 @@ class Body(Model):
         velocities: ArrayLike,
         theta: Theta,
         out: Array | None = None,
-        dof_mass: Array | None = None,
+        tied_kg: Array | None = None,
         carried: Carried | None = None,
     ) -> Linearisation:
         """Internal force and first derivatives at T states, see `Linearisation` and `force`.
@@ -325,13 +366,12 @@ class Body(Model):
         force, by_position, by_velocity, by_theta, skew = np.split(
             rows, np.cumsum([size, entries, entries, width]), axis=1
         )
-        moving = self.dof_mass if dof_mass is None else dof_mass
-        drag = self._drag(theta)
-        force -= drag * moving * v
-        by_velocity[:, self.pattern.diagonal] -= drag * moving
+        drag = self._drag(theta, tied_kg)
+        force -= drag * v
+        by_velocity[:, self.pattern.diagonal] -= drag
         by_theta = by_theta.reshape(len(x), size, -1)
-        for column, share in self._drag_shares.items():
-            by_theta[:, :, column] = -share * moving * v
+        for column, slope in self._drag_slopes(theta, tied_kg):
+            by_theta[:, :, column] = -slope * v
         self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew)
 
@@ -364,7 +404,7 @@ class Body(Model):
         weights: ArrayLike,
         theta: Theta,
         out: Array | None = None,
-        dof_mass: Array | None = None,
+        tied_kg: Array | None = None,
         carried: Carried | None = None,
         stress_weights: Array | None = None,
     ) -> Curvature:
@@ -385,9 +425,8 @@ class Body(Model):
             rows, np.cumsum([entries, entries, k * size, k * size, k * k, k]), axis=1
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
-        moving = self.dof_mass if dof_mass is None else dof_mass
-        for column, share in self._drag_shares.items():
-            v_theta[:, :, column] = -share * moving * w
+        for column, slope in self._drag_slopes(theta, tied_kg):
+            v_theta[:, :, column] = -slope * w
             by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
         theta_theta = theta_theta.reshape(len(x), k, k)
         for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
@@ -397,6 +436,9 @@ class Body(Model):
                 bends = carried.bends[:, columns, columns]
                 theta_theta[:, columns, columns] += by_theta[:, first, None, None] * bends
         self._spread_stiffening(by_theta[:, None], carried)
+        for density, slope in self.mass_slopes.items():
+            mixed = -np.einsum("ti,ti,i->t", w, v, slope)
+            theta_theta[:, density, density - 1] = theta_theta[:, density - 1, density] = mixed
         return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew)
 
     @property
@@ -407,31 +449,71 @@ class Body(Model):
         return 2 * k * self.pattern.size + entries + k * (k + 1)
 
     @cached_property
-    def _drag_shares(self) -> dict[int, Array]:
-        """Place of each part's γ_m in θ, and the (3n,) shares of the mass at a dof it damps.
+    def _gamma_places(self) -> list[int]:
+        """Place of each part's γ_m in θ; its density follows where it is free."""
+        starts = zip(self.parts, self.starts, strict=False)
+        return [start + part.of_gamma_m for part, start in starts]
 
-        Mass that is tied to a node is damped as the part's own there.
+    @cached_property
+    def tied_shares(self) -> dict[int, Array]:
+        """Place of each part's γ_m in θ, and its share (3n,) in what is tied to a dof."""
+        return dict(zip(self._gamma_places, self._tied_shares, strict=True))
+
+    def tied_drag(self, theta: Theta) -> Array:
+        """(3n,) γ_m of what is tied to every dof [1/s]."""
+        return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
+
+    def _damped(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
+        """Place of each part's γ_m in θ, and the mass (3n,) or (T, 3n) that it damps.
+
+        Mass that is tied to a node is damped as the part's own there, by its share as stated.
         """
-        return {
-            end - 1: np.repeat(mass / self.node_mass, 3)
-            for end, mass in zip(self.starts[1:], self._part_masses, strict=True)
-        }
+        for k, density in enumerate(self.densities(theta)):
+            damped = density * self._lumped_m3[k]
+            if tied_kg is not None:
+                damped = damped + self._tied_shares[k] * tied_kg
+            yield self._gamma_places[k], damped
 
-    def _drag(self, theta: Theta) -> Array:
-        """(3n,) γ_m of every dof."""
-        return np.sum([theta[k] * share for k, share in self._drag_shares.items()], axis=0)
+    @cached_property
+    def _tied_shares(self) -> list[Array]:
+        """(3n,) share of each part in the mass of every dof, as stated."""
+        parts = zip(self.parts, self._lumped_m3, strict=True)
+        return [part.density_kg_m3 * volume / self.dof_mass for part, volume in parts]
+
+    def _drag(self, theta: Theta, tied_kg: Array | None) -> Array:
+        """(3n,) or (T, 3n) of f = −drag v by mass-proportional damping [N·s/m]."""
+        return np.sum([theta[k] * mass for k, mass in self._damped(theta, tied_kg)], axis=0)
+
+    def _drag_slopes(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
+        """Places in θ, and the slopes of that by them."""
+        yield from self._damped(theta, tied_kg)
+        for density, slope in self.mass_slopes.items():
+            yield density, theta[density - 1] * slope
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
-        x = self._states(positions)[0].reshape(-1, len(self.nodes_m), 3)
-        gradients = self.geometry[..., :-1].reshape(len(self.cells), -1, self.element.nodes, 3)
-        f = np.einsum("teai,eqaj->ijteq", x[:, self.cells], gradients)
-        a, b = f[1], f[2]
-        return (
-            f[0, 0] * (a[1] * b[2] - a[2] * b[1])
-            + f[0, 1] * (a[2] * b[0] - a[0] * b[2])
-            + f[0, 2] * (a[0] * b[1] - a[1] * b[0])
+        nodes, (count, points) = len(self.nodes_m), self.geometry.shape[:2]
+        x = self._states(positions)[0].reshape(-1, nodes, 3)
+        by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
+        slopes = (self._shape_slopes @ by_node).reshape(3, count * points, 3, len(x))
+        a, b, c = slopes.transpose(0, 2, 1, 3)
+        ratios = (
+            a[0] * (b[1] * c[2] - b[2] * c[1])
+            + a[1] * (b[2] * c[0] - b[0] * c[2])
+            + a[2] * (b[0] * c[1] - b[1] * c[0])
         )
+        return ratios.reshape(count, points, -1).transpose(2, 0, 1)
+
+    @cached_property
+    def _shape_slopes(self) -> sp.csr_array:
+        """Slopes along each axis, at every quadrature point, of what has values at the nodes."""
+        count, points = self.geometry.shape[:2]
+        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
+        values = np.moveaxis(gradients, 3, 0)
+        columns = np.broadcast_to(self.cells[:, None], values.shape)
+        starts = np.arange(0, values.size + 1, self.element.nodes)
+        shape = (3 * count * points, len(self.nodes_m))
+        return sp.csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
 
     # Assembly -------------------------------------------------------------------------------
 
@@ -509,7 +591,7 @@ class Body(Model):
             cells, geometry = in_ascending_order(cells, geometry)
         vector, lower = element_destinations(self.pattern, cells)
         total, count = len(self.constants), len(cells)
-        # γ_m comes after the constants of the points and needs no elements.
+        # γ_m and the density come after the constants of the points and need no elements.
         columns = self.starts[number] + np.arange(part.of_points)
         by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
         square = (columns[:, None] + total * columns).ravel()

@@ -87,6 +87,9 @@ SHARE = Constant(
     at_least=0.0,
 )  # fmt: skip
 TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
+DENSITY = Constant("density_kg_m3", "ρ", "density", (1.0, 1e5))
+# In place of the densities of all parts, which keep their ratios.
+MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
 )
@@ -110,6 +113,8 @@ KNOWN: Mapping[str, Constant] = {
         CHAIN_STRETCH,
         SHARE,
         TAU,
+        DENSITY,
+        MASS,
         INSTANTANEOUS,
     )
 }
@@ -140,6 +145,11 @@ def constant_named(name: str) -> Constant:
 def is_modulus(name: str) -> bool:
     """Whether a constant scales with the stiffness of its material."""
     return unit_of(name) == "Pa"
+
+
+def is_density(name: str) -> bool:
+    """Whether a parameter of this name gives a density."""
+    return bare(name) in (DENSITY.name, MASS.name)
 
 
 def is_damping(name: str) -> bool:

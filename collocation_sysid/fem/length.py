@@ -32,7 +32,7 @@ class Length:
     """
 
     def __init__(self, nodes: Index, weights: Array, node_count: int) -> None:
-        self.node_count = node_count
+        self.node_count, self._segments = node_count, len(nodes) - 1
         points = np.repeat(np.arange(len(nodes)), nodes.shape[1])
         shape = (len(nodes), node_count)
         placed = sp.csr_array((weights.ravel(), (points, nodes.ravel())), shape=shape)
@@ -49,7 +49,7 @@ class Length:
     def _pairs(self) -> tuple[Index, Index, Array, Index]:
         """Lower-triangle dofs, weight, and place in (6 J) of what each pair of nodes adds."""
         found = []
-        for j in range(self._differences.shape[0]):
+        for j in range(self._segments):
             one = self._differences[[j]].tocoo()
             dofs = (3 * one.coords[1][:, None] + np.arange(3)).ravel()
             axes, weights = np.tile(np.arange(3), one.nnz), np.repeat(one.data, 3)
@@ -66,7 +66,7 @@ class Length:
         """(6 J, entries) from second derivatives by d to those by x."""
         rows, columns, weights, places = self._pairs
         entries = self.couplings.position(rows, columns)
-        shape = (6 * self._differences.shape[0], self.couplings.entries)
+        shape = (6 * self._segments, self.couplings.entries)
         return sp.csr_array((weights, (places, entries)), shape=shape)
 
     def value(self, x: Array) -> Array:

@@ -135,9 +135,9 @@ class TetMesh:
             If the file cannot be read, holds no tetrahedra, their sides are curved by more than
             5 % of their length, or its mesh is refused.
         """
-        *arrays, notes = read_tetrahedra(path, length_unit)
+        points_m, tetrahedra, of_points, of_cells, faces, notes = read_tetrahedra(path, length_unit)
         try:
-            mesh = cls(*arrays)
+            mesh = cls(points_m, tetrahedra, of_points, of_cells, faces)
         except InputError as error:
             raise error.located(path) from None
         mesh._set(notes=(*notes, *mesh.notes))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, hint_at
-from .constants import Constant
+from .constants import DENSITY, MASS, Constant
 from .moduli import Source, elastic_names, source_of
 from .regions import Part
 
@@ -62,8 +62,9 @@ class Model:
         names = []
         for part in self.parts:
             owns = [c.name for c in part.constants] + list(elastic_names(part.material))
+            owns.append(DENSITY.name)
             names += [part.full_name(own) for own in owns] + owns
-        return tuple(dict.fromkeys(names))
+        return tuple(dict.fromkeys([*names, MASS.name]))
 
     def assembled(self, values: Mapping[str, Any]) -> list[Any]:
         """θ from values by the user's names: numbers, or CasADi expressions.
@@ -76,6 +77,8 @@ class Model:
         theta = []
         for part, source in zip(self.parts, self.sources(list(values)), strict=True):
             found = source.constants(values)
+            if source.names.get(DENSITY.name) == MASS.name:
+                found[DENSITY.name] *= part.per_mass_1_m3
             theta += [found[c.name] for c in part.constants]
         return theta
 
@@ -96,6 +99,20 @@ class Model:
             values = part.material.lame(mine[: len(part.material.constants)]).full().ravel()
             found[part.name] = (float(values[0]), float(values[1]))
         return found
+
+    def weighed_by(self, names: Collection[str]) -> list[str]:
+        """Parts whose densities parameters of these names give.
+
+        A density that is stated for a region alone stays, unless ``core.density_kg_m3`` or
+        ``mass_kg`` is among them.
+        """
+        return [
+            part.name
+            for part in self.parts
+            if MASS.name in names
+            or part.full_name(DENSITY.name) in names
+            or (DENSITY.name in names and not part.own_density)
+        ]
 
     def split(self, theta: Any) -> list[Any]:
         """θ, numbers or a CasADi expression, part by part."""

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 
 from ..errors import InputError
-from .constants import Constant
+from .constants import DENSITY, MASS, Constant
 from .materials import Material
 
 ELASTIC = ("lambda_pa", "mu_pa", "kappa_pa", "young_pa", "poisson")
@@ -104,6 +104,13 @@ def source_of(
                 f"{_alternatives(elastic)}"
             )
         names |= {own: str(name_of(own)) for own in fitting[0]}
+    if DENSITY.name in plain and MASS.name in known:
+        if DENSITY.name in names:
+            raise InputError(
+                f"{names[DENSITY.name]} and {MASS.name} both give the density of {where}; expected "
+                "one of them"
+            )
+        names[DENSITY.name] = MASS.name
     if lacking := [own for own in plain if own not in names]:
         raise InputError(
             f"{_listed(lacking)} missing: {what} with its damping expects "

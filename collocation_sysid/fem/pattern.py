@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -81,6 +81,45 @@ class SymmetricPattern:
         """The full symmetric matrix of (m,) lower-triangle values."""
         rows, columns, source = self.full
         return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
+
+    def products(self, values: Array, vectors: Array) -> Array:
+        """(T, 3n) of symmetric matrices, by their values (T, m), and vectors (T, 3n)."""
+        pairs = zip(values, vectors, strict=True)
+        return np.stack([self.matrix(value) @ vector for value, vector in pairs])
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Patterns in one that holds all their entries.
+
+    Attributes
+    ----------
+    pattern : SymmetricPattern
+        The first itself where it holds the others.
+    places : tuple of (m,) int array
+        Where in it the entries of each are.
+    """
+
+    pattern: SymmetricPattern
+    places: tuple[Index, ...]
+
+    @staticmethod
+    @lru_cache(maxsize=16)
+    def of(patterns: tuple[SymmetricPattern, ...]) -> Joined:
+        """The union of patterns of one size; that of the last few is kept."""
+        rows = np.concatenate([pattern.rows for pattern in patterns])
+        columns = np.concatenate([pattern.columns for pattern in patterns])
+        whole = SymmetricPattern.of_entries(rows, columns, patterns[0].size // 3)
+        whole = patterns[0] if whole.entries == patterns[0].entries else whole
+        return Joined(whole, tuple(whole.position(p.rows, p.columns) for p in patterns))
+
+    def spread(self, values: Array) -> Array:
+        """(T, m) values of the first pattern as those of all; itself where that is the same."""
+        if not values.size or values.shape[1] == self.pattern.entries:
+            return values
+        found = np.zeros((len(values), self.pattern.entries))
+        found[:, self.places[0]] = values
+        return found
 
 
 def dofs_of(nodes: Index) -> Index:

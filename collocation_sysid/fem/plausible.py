@@ -63,7 +63,7 @@ def odd_material(body: Body, theta: Array) -> str | None:
 
     Tracks and poses tell the stiffness over the density, so a wrong density leaves no other trace.
     """
-    density_kg_m3 = body.mass_kg / body.mesh.volume_m3
+    density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
     young_pa = max(float(engineering(*lame)[0]) for lame in body.lame(theta).values())
     if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
         return None

@@ -49,12 +49,13 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
         orient(points, children.reshape(-1, 4))[0],
         {name: np.concatenate([a, a[ends].min(axis=1)]) for name, a in masks.items()},
         {name: np.repeat(a, 8, axis=0) for name, a in mesh.cell_arrays.items()},
-        {name: _in_four(faces, ends, count) for name, faces in mesh.face_sets.items()},
+        {name: faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()},
     )
 
 
-def _in_four(faces: Index, ends: Index, count: int) -> Index:
-    """Triangles (k, 3) cut in four at the middles of their edges."""
+def faces_in_four(faces: Index, mesh: TetMesh) -> Index:
+    """Faces (k, 3) of a mesh cut in four, with the nodes of `split_in_eight`."""
+    count, ends = len(mesh.points_m), mesh.edges
     pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
     nodes = np.hstack([faces, count + np.searchsorted(ends @ [count, 1], pairs @ [count, 1])])
     return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
@@ -65,13 +66,19 @@ def refined(body: Body) -> Body:
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
         Region(
-            part.name, inside.ravel(), part.material, part.density_kg_m3, part.damping, part.prony
+            part.name,
+            inside.ravel(),
+            part.material,
+            part.density_kg_m3 if part.own_density else None,
+            part.damping,
+            part.prony,
         )
         for part, inside in zip(body.parts, cells, strict=True)
         if part.name
     ]
-    rest = body.parts[0]
-    return type(body)(
+    # A region without a density of its own has the body's, whether any cell is left for it or not.
+    rest = next((part for part in body.parts if not part.own_density), body.parts[0])
+    finer = type(body)(
         split_in_eight(body.mesh),
         rest.material,
         rest.density_kg_m3,
@@ -82,6 +89,7 @@ def refined(body: Body) -> Body:
         evaluator=body.evaluator,
         threads=body.threads,
     )
+    return finer.with_free_densities([part.name for part in body.parts if part.free_density])
 
 
 def refined_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Index
 from ..errors import InputError
-from .constants import GAMMA_M, Constant
+from .constants import DENSITY, GAMMA_M, Constant
 from .damping import Damping, as_damping
 from .materials import Energy, Material, as_material
 from .memory import Prony, as_branches
@@ -59,8 +59,15 @@ class Part:
     material : Material
     damping : Damping
     density_kg_m3 : float
+        As stated; θ tells where it is free.
     prony : tuple of Prony
         The branches of its memory.
+    per_mass_1_m3 : float
+        The density over the mass of the body.
+    own_density : bool
+        Whether it is stated for this part, not for the body.
+    free_density : bool
+        Whether the density is one of its constants.
     """
 
     name: str
@@ -69,17 +76,26 @@ class Part:
     damping: Damping
     density_kg_m3: float
     prony: tuple[Prony, ...] = ()
+    per_mass_1_m3: float = 0.0
+    own_density: bool = False
+    free_density: bool = False
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
         """Of material, damping law, memory, and the mass, as they follow one another in θ."""
         of_memory = [constant for branch in self.prony for constant in branch.constants]
-        return (*self.material.constants, *self.damping.constants, *of_memory, GAMMA_M)
+        law = (*self.material.constants, *self.damping.constants, *of_memory, GAMMA_M)
+        return (*law, DENSITY) if self.free_density else law
 
     @property
     def of_law(self) -> int:
         """How many of them are the material's and the damping law's."""
         return len(self.material.constants) + len(self.damping.constants)
+
+    @property
+    def of_gamma_m(self) -> int:
+        """Where γ_m is among them; the density follows where it is free."""
+        return self.of_law + 2 * len(self.prony)
 
     @property
     def of_points(self) -> int:
@@ -122,8 +138,11 @@ def parts_of(
             memory = branches if region.prony is None else as_branches(region.prony)
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-        parts.append(Part(region.name, cells, law, drag, density, memory))
-    return tuple(parts)
+        has_own = region.density_kg_m3 is not None
+        part = Part(region.name, cells, law, drag, density, memory, own_density=has_own)
+        parts.append(part)
+    mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
+    return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)
 
 
 def _densities(

@@ -189,24 +189,17 @@ class Named:
         They are the triangles of a face set, or those whose corners are all in a point array.
         """
         if self.name not in mesh.face_sets:
-            mask = self._mask(
-                mesh.point_arrays,
-                len(mesh.points_m),
-                f'point array "{self.name}"',
-                "group of faces",
-            )
-            return _chosen_faces(mask, mesh, f'point array "{self.name}"')
+            what, count = f'point array "{self.name}"', len(mesh.points_m)
+            mask = self._mask(mesh.point_arrays, count, what, "group of faces")
+            return _chosen_faces(mask, mesh, what)
         wanted = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
-        there = {
-            tuple(face): row for row, face in enumerate(np.sort(mesh.surface, axis=1).tolist())
-        }
-        rows = [there.get(tuple(face), -1) for face in wanted.tolist()]
-        if inner := rows.count(-1):
+        rows = rows_of_faces(wanted, mesh.surface)
+        if inner := int((rows < 0).sum()):
             raise InputError(
                 f'{inner} of the {len(rows)} faces of "{self.name}" are not on the boundary of the '
                 "body; a pressure acts on faces that have the material on one side only"
             )
-        return np.sort(np.array(rows, dtype=np.int64))
+        return np.sort(rows)
 
     def _mask(
         self, arrays: Mapping[str, np.ndarray], count: int, what: str, lacking: str = ""
@@ -244,6 +237,13 @@ def _chosen_cells(mask: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:
             f"{_span(mesh.bounds_m)}"
         )
     return np.flatnonzero(mask).astype(np.int64)
+
+
+def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Rows of the surface (F, 3) that faces (k, 3), in any orientation, are; −1 where none."""
+    there = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
+    wanted = np.sort(faces, axis=1).tolist()
+    return np.array([there.get(tuple(face), -1) for face in wanted], dtype=np.int64)
 
 
 def _chosen_faces(chosen_nodes: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:

@@ -38,11 +38,17 @@ class Volume:
 
     def __init__(self, faces: Index, node_count: int, apex_m: Array | None = None) -> None:
         self.faces, self.node_count = faces, node_count
-        self._apex = np.tile(np.zeros(3) if apex_m is None else apex_m, node_count)
+        self.apex_m = np.zeros(3) if apex_m is None else apex_m
+        self._apex = np.tile(self.apex_m, node_count)
+
+    def from_apex(self, apex_m: Array) -> Volume:
+        """The same of cones from another point."""
+        same = (apex_m == self.apex_m).all()
+        return self if same else Volume(self.faces, self.node_count, apex_m)
 
     @cached_property
     def _terms(self) -> tuple[Index, Index, Index, Array]:
-        """Rows and columns (lower triangle) of H, the dof each is linear in, and by how much."""
+        """Rows and columns (lower triangle) of H, the dof that each is linear in, and its slope."""
         form = _form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         found = []
@@ -71,7 +77,7 @@ class Volume:
 
     @cached_property
     def rim(self) -> Index:
-        """Nodes on edges with a face on one side only, ascending; none where it is closed."""
+        """(k, 2) or (k, 3) nodes of edges with a face on one side only; none where it is closed."""
         corners = self.faces[:, :3]
         edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2)
         codes = np.sort(edges, axis=1) @ [self.node_count, 1]
@@ -79,8 +85,8 @@ class Volume:
         # Neighbours go along their edge in opposite directions.
         left = np.bincount(which, np.sign(edges[:, 1] - edges[:, 0]))
         alone = left[which] != 0
-        mid = self.faces[:, 3:].reshape(-1)
-        return np.unique(np.concatenate([edges[alone].ravel(), mid[alone] if mid.size else mid]))
+        mid = self.faces[:, 3:].reshape(len(edges), -1)
+        return np.hstack([edges, mid])[alone]
 
     def value(self, x: Array) -> Array:
         """V (T,) at positions (T, 3n)."""
@@ -115,7 +121,8 @@ def _form(nodes: int) -> Array:
     points, weights = _triangle_rule()
     values, slopes = _shape(points, nodes)
     form = np.einsum("q,qi,qj,qk->ijk", weights / 3, values, slopes[..., 0], slopes[..., 1])
-    return sum(sign * form.transpose(p) for p, sign in _PERMUTATIONS) / 6
+    turned = [sign * form.transpose(p) for p, sign in _PERMUTATIONS]
+    return np.asarray(np.mean(turned, axis=0))
 
 
 def _triangle_rule() -> tuple[Array, Array]:
@@ -133,10 +140,8 @@ def _shape(points: Array, nodes: int) -> tuple[Array, Array]:
     L = np.column_stack([1 - xi - eta, xi, eta])
     if nodes == 3:
         return L, np.broadcast_to(of_corners, (len(points), 3, 2))
-    ends = np.array([0, 1, 2]), np.array([1, 2, 0])
-    values = np.hstack([L * (2 * L - 1), 4 * L[:, ends[0]] * L[:, ends[1]]])
+    following = np.roll(L, -1, axis=1)
+    values = np.hstack([L * (2 * L - 1), 4 * L * following])
     corner = (4 * L - 1)[..., None] * of_corners
-    mid = 4 * (
-        L[:, ends[1], None] * of_corners[ends[0]] + L[:, ends[0], None] * of_corners[ends[1]]
-    )
-    return values, np.concatenate([corner, mid], axis=1)
+    mid = following[..., None] * of_corners + L[..., None] * np.roll(of_corners, -1, axis=0)
+    return values, np.concatenate([corner, 4 * mid], axis=1)

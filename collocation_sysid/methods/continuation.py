@@ -144,7 +144,7 @@ class _Climb:
         assert self.last is not None
         assert self.known is not None
         last, recorder = self.last, self.recorder
-        z, multipliers = last.z, last.multipliers
+        z, multipliers = last.z, last.given_multipliers
         if last.collocation is not recorder.collocation:
             z, multipliers = _continued(recorder.collocation, *self.known), None
         recorder.notes += last.notes

@@ -55,6 +55,9 @@ IPOPT_STATUS = {
 }
 
 
+# Steps that a limited-memory Hessian is made of where wrenches have none: IPOPT's own six are too
+# few for them.
+HISTORY = 60
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
 
@@ -116,7 +119,9 @@ class InteriorPoint(Options):
             recorder.notes.append(
                 "hessian = 'limited-memory' was taken: wrenches have first derivatives only"
             )
-            return replace(self, hessian="limited-memory")._solved(recorder, start)
+            options = {"limited_memory_max_history": HISTORY, **self.ipopt}
+            remembering = replace(self, hessian="limited-memory", ipopt=options)
+            return remembering._solved(recorder, start)
         return self._solved(recorder, start)
 
     def _solved(self, recorder: Recorder, start: Array | None) -> Solution:

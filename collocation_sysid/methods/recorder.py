@@ -12,7 +12,6 @@ from ..errors import InputError, SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
 from .method import Watch
-from .multipliers import constraint_multipliers
 from .solution import Iteration, Solution, Status, Timing
 from .start import initial_variables
 
@@ -136,12 +135,7 @@ class Recorder:
         iterations: int,
         evaluations: int,
     ) -> Solution:
-        """The answer of the solve, by default with the multipliers that one sweep finds."""
-        if multipliers is None:
-            try:
-                multipliers = constraint_multipliers(self.collocation, z, self.stopwatch)
-            except SimulationError:
-                multipliers = np.zeros(self.collocation.constraints)
+        """The answer of the solve."""
         return Solution(
             status,
             message,

@@ -11,9 +11,11 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, root_mean
+from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from ..nlp.collocation import Collocation, Violation
 from ..nlp.stopwatch import Stopwatch
+from .multipliers import constraint_multipliers
 from .scan import Scan
 
 
@@ -109,7 +111,7 @@ class Solution:
     collocation : Collocation
         The problem that was solved.
     z : (variables,) the final variables, see `nlp.collocation`
-    multipliers : (constraints,) of g, in the scaling of the NLP
+    given_multipliers : (constraints,) of g, in the scaling of the NLP, or None
     iterations : int
     history : sequence of Iteration
     timing : Timing
@@ -127,13 +129,23 @@ class Solution:
     method: str
     collocation: Collocation
     z: Array
-    multipliers: Array
+    given_multipliers: Array | None
     iterations: int
     history: Sequence[Iteration]
     timing: Timing
     notes: Sequence[str] = field(default=())
     evaluations: int = 0
     scan: Scan | None = None
+
+    @cached_property
+    def multipliers(self) -> Array:
+        """(constraints,) the method's own, or those that one sweep finds; zeros where it fails."""
+        if self.given_multipliers is not None:
+            return self.given_multipliers
+        try:
+            return constraint_multipliers(self.collocation, self.z)
+        except SimulationError:
+            return np.zeros(self.collocation.constraints)
 
     @property
     def q(self) -> Array:

@@ -205,6 +205,8 @@ class Chart:
     def _has_left(self, point: Array, cell: int) -> bool:
         if not np.isfinite(point).all():
             return False
+        if self._shape.barycentric(point, np.array([cell])).min() >= 0:
+            return False  # none holds it better
         best, _ = self._shape.cell_of(point)
         depth = self._shape.barycentric(np.stack([point, point]), np.array([cell, best])).min(
             axis=1

@@ -12,6 +12,8 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by experiment
 =================  =========================================================================
 
+The memory of bodies follows from them, or is among them, see `nlp.explicit_memory`.
+
 Constraints g, in this order:
 
 =================  =========================================================================
@@ -414,11 +416,12 @@ class Collocation:
         for segment in self.segments:
             layout, first = segment.hessian_layout, segment.first
             indptr.append(used + layout.phi_indptr[1:])
-            of_x = layout.phi_indices < segment.variables
             # In z all φ stand after all x.
             first_phi = first.phi - self.nq + self.variables - self.nphi
-            shift = np.where(of_x, first.x, first_phi - segment.variables)
-            indices.append(layout.phi_indices + shift)
+            ends = np.array([self.nq, self.nq + segment.variables])
+            shifts = np.array([0, first.x - self.nq, first_phi - ends[1]])
+            kind = np.searchsorted(ends, layout.phi_indices, side="right")
+            indices.append(layout.phi_indices + shifts[kind])
             used += len(layout.phi_indices)
         return np.concatenate(indptr), np.concatenate(indices)
 
@@ -516,7 +519,7 @@ class Collocation:
         for part in self.parts(z):
             dynamics = part.setting.dynamics
             total = dynamics.force(part.x, part.setting.theta)
-            external = dynamics.evaluated.external_n
+            external = dynamics.evaluated.external_n(part.setting.theta)
             for force in (total - external, external):
                 largest = max(largest, float(np.abs(force[:, part.segment.free_dofs]).max()))
         return largest

@@ -13,7 +13,7 @@ from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
 from ..fem.memory import Carried
 from ..fem.pattern import SymmetricPattern
-from .forces import Forces, per_dof
+from .forces import Forces, Mass
 from .memory import History, Recursion, recursions_of
 from .schemes import QUASI_STATIC, Scheme, as_scheme
 
@@ -54,12 +54,13 @@ class Dynamics:
     tables : Tables
     t_s : (N,) grid times
     first_row : int
-    mass_kg : (N, 3n) of every dof in each row, point masses included
+    mass : Mass of every dof in each row: the mean over its evaluations
     forces : Forces at each row's evaluation
     taken : (N, 3n) bool
         Held dofs that are free at other times: while one is held, the grasp takes what force
         there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
         first step, from the velocity it has.
+    evaluated_s : (N,) times of the evaluations
     start_velocity_m_s : (3n,)
     loaded_since_s : float
         How long the body has been in its start shape; infinite where its memory has relaxed.
@@ -74,9 +75,10 @@ class Dynamics:
     tables: Tables
     t_s: Array
     first_row: int
-    mass_kg: Array
+    mass: Mass
     forces: Forces
     taken: NDArray[np.bool_]
+    evaluated_s: Array
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
     static: bool = False
@@ -97,14 +99,16 @@ class Dynamics:
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps
+        forces = Forces.of(experiment, evaluated_s)
         return cls(
             body=experiment.body,
             tables=tables,
             t_s=t_s,
             first_row=first_row,
-            mass_kg=per_dof(experiment.node_mass_kg(t_s)),
-            forces=Forces.of(experiment, evaluated_s),
+            mass=_of_rows(tables, forces.mass),
+            forces=forces,
             taken=_taken(experiment, t_s),
+            evaluated_s=evaluated_s,
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
             static=experiment.static,
@@ -114,6 +118,19 @@ class Dynamics:
         """The same with a constant (3,) added to gravity."""
         return replace(self, forces=self.forces.under_gravity(change_m_s2))
 
+    def driven(self, values: Array) -> Dynamics:
+        """The same with tensions and pressures that are off by values (A, 2)."""
+        return replace(self, forces=self.forces.driven(values))
+
+    def with_loads(self, tied_kg: Array, applied_n: Array) -> Dynamics:
+        """The same with mass and forces (N, 3n) added at the evaluations."""
+        forces = self.forces.joined_by(tied_kg, applied_n)
+        return replace(self, mass=_of_rows(self.tables, forces.mass), forces=forces)
+
+    def of_rows(self, at_evaluations: Array) -> Array:
+        """What a row has of mass (N, …) that is there at the evaluations."""
+        return _mean(self.tables, at_evaluations)
+
     def first_rows(self, rows: int) -> Dynamics:
         """The same on the first grid times only."""
         t = self.tables
@@ -121,9 +138,10 @@ class Dynamics:
             self,
             tables=Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
             t_s=self.t_s[:rows],
-            mass_kg=self.mass_kg[:rows],
+            mass=self.mass.rows(slice(rows)),
             forces=self.forces.rows(slice(rows)),
             taken=self.taken[:rows],
+            evaluated_s=self.evaluated_s[:rows],
         )
 
     @property
@@ -154,7 +172,7 @@ class Dynamics:
 
     @property
     def state_weights(self) -> Array:
-        """(N, reach + 1) p, and that of a given start: only its stress is evaluated there."""
+        """(N, reach + 1) p, and that of a given start, where only a stress is evaluated."""
         weights = self.tables.p.copy()
         weights[: self.first_row, 0] = 1.0
         return weights
@@ -186,13 +204,7 @@ class Dynamics:
 
     def combine(self, table: Array, rows: Array) -> Array:
         """Σ_i table[t, i] rows[t − i] for every t; `rows` is (N, …)."""
-        result = np.zeros_like(rows)
-        shape = (-1,) + (1,) * (rows.ndim - 1)
-        for lag in range(min(table.shape[1], len(rows))):
-            column = table[lag:, lag].reshape(shape)
-            if np.any(column):
-                result[lag:] += column * rows[: len(rows) - lag]
-        return result
+        return _combine(table, rows)
 
     def combine_transposed(self, table: Array, rows: Array) -> Array:
         """Σ_i table[k + i, i] rows[k + i] for every k, the transpose of `combine`."""
@@ -206,7 +218,7 @@ class Dynamics:
 
     def residual(self, x: Array, theta: Array) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
-        return self.assemble_residual(x, self.force(x, theta))
+        return self.assemble_residual(x, theta, self.force(x, theta))
 
     @property
     def evaluated(self) -> Forces:
@@ -218,22 +230,23 @@ class Dynamics:
         carried = self.carried(self.history(x, theta))
         return self.evaluated.total(*self.evaluation_states(x), theta, carried)
 
-    def assemble_residual(self, x: Array, force: Array) -> Array:
+    def assemble_residual(self, x: Array, theta: Array, force: Array) -> Array:
         """The same from the forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
         total[self.first_row :] = force
-        return self.combine(self.tables.w, self.without_taken(total)) - self.inertia(x)
+        inertia = self.mass.at(theta) * self.acceleration(x)
+        return self.combine(self.tables.w, self.without_taken(total)) - inertia
 
     def without_taken(self, rows: Array) -> Array:
         """Forces (N, 3n, …) with those that a passing grasp takes set to zero, in place."""
         rows[self.taken] = 0
         return rows
 
-    def inertia(self, x: Array) -> Array:
-        """Mass times acceleration of every row, (N, 3n) [N]."""
+    def acceleration(self, x: Array) -> Array:
+        """Acceleration of every row, (N, 3n) [m/s²]."""
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
-        return acceleration * self.mass_kg
+        return acceleration
 
     def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
         """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
@@ -263,7 +276,31 @@ class Dynamics:
         return -self.tables.s[:, lag] / self.step_s**2
 
 
+def _combine(table: Array, rows: Array) -> Array:
+    result = np.zeros_like(rows)
+    shape = (-1,) + (1,) * (rows.ndim - 1)
+    for lag in range(min(table.shape[1], len(rows))):
+        column = table[lag:, lag].reshape(shape)
+        if np.any(column):
+            result[lag:] += column * rows[: len(rows) - lag]
+    return result
+
+
+def _of_rows(tables: Tables, at_evaluations: Mass) -> Mass:
+    """The mass of the rows from that at the evaluations."""
+    return replace(at_evaluations, tied_kg=_mean(tables, at_evaluations.tied_kg))
+
+
+def _mean(tables: Tables, at_evaluations: Array) -> Array:
+    # As a row weighs forces: then gravity alone accelerates all mass alike, also what just joins.
+    if (at_evaluations == at_evaluations[:1]).all():
+        return at_evaluations
+    total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))
+    mean = _combine(tables.w, at_evaluations) / np.where(total == 0, 1.0, total)
+    return np.where(total == 0, at_evaluations, mean)
+
+
 def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
-    held = experiment.grasped(t_s)[0].reshape(len(t_s), -1)
+    held = experiment.held(t_s).reshape(len(t_s), -1)
     held[:, experiment.held_dofs] = False
     return held

@@ -18,10 +18,12 @@ class HessianLayout:
     Attributes
     ----------
     x_indptr, x_indices : columns of x; rows 0 … nq − 1 are q, then x
-    phi_indptr, phi_indices : columns of φ; rows count from the first x, φ after the last
+    phi_indptr, phi_indices : columns of φ; rows 0 … nq − 1 are q, then x, then φ
     band : place of each entry of the dynamics' band; None where the band is all there is
     loss, scale : place of each entry of the loss, and its factor in scaled variables
     phi : place of each entry (i <= j) of φ by φ, row after row
+    coupled : place of each entry of φ by q and x that the dynamics has
+    driven : (variables k,) places of the entries of other φ by all x, those of one x together
     diagonal : places of the diagonal of x
     """
 
@@ -33,6 +35,8 @@ class HessianLayout:
     loss: Index
     scale: Array
     phi: Index
+    coupled: Index
+    driven: Index
     diagonal: Index
 
     @property
@@ -56,6 +60,8 @@ class HessianLayout:
         columns: Index,
         nphi: int,
         length_m: float,
+        coupled: tuple[Index, Index],
+        drives: Index,
     ) -> HessianLayout:
         """Merge the band in the columns of x with the loss's entries.
 
@@ -65,6 +71,8 @@ class HessianLayout:
         rows, columns : entries of the loss by (x, φ), upper triangle, sorted by column
         nphi : number of φ
         length_m : unit of the scaled x
+        coupled : rows and columns of the dynamics' entries of φ by (q, x), columns from the first φ
+        drives : (k,) which φ have entries by all x
         """
         of_x = columns < variables
         band_columns = np.repeat(np.arange(variables), np.diff(band.indptr))
@@ -78,22 +86,27 @@ class HessianLayout:
         loss[of_x] = np.searchsorted(merged, wanted)
 
         triangle = [(i, j) for j in range(nphi) for i in range(j + 1)]
-        dense = np.array(triangle, dtype=np.int64).reshape(-1, 2) + variables
-        tall = variables + nphi
-        of_phi = columns[~of_x] * tall + rows[~of_x]
-        phi_codes = np.unique(np.concatenate([of_phi, dense[:, 1] * tall + dense[:, 0]]))
+        dense = np.array(triangle, dtype=np.int64).reshape(-1, 2)
+        tall = height + nphi
+        of_phi = (columns[~of_x] - variables) * tall + nq + rows[~of_x]
+        of_dynamics = coupled[1] * tall + coupled[0]
+        of_drives = (drives * tall + nq + np.arange(variables)[:, None]).ravel()
+        among_phi = dense[:, 1] * tall + height + dense[:, 0]
+        phi_codes = np.unique(np.concatenate([of_phi, of_dynamics, of_drives, among_phi]))
         loss[~of_x] = len(merged) + np.searchsorted(phi_codes, of_phi)
-        first, second = (index + variables for index in np.triu_indices(nphi))
+        first, second = np.triu_indices(nphi)
         placed = None if merged is codes else np.searchsorted(merged, codes)
         return cls(
             x_indptr=x_indptr,
             x_indices=merged % height,
-            phi_indptr=np.searchsorted(phi_codes, (variables + np.arange(nphi + 1)) * tall),
+            phi_indptr=np.searchsorted(phi_codes, np.arange(nphi + 1) * tall),
             phi_indices=phi_codes % tall,
             band=placed,
             loss=loss,
             scale=length_m ** ((rows < variables).astype(float) + (columns < variables)),
-            phi=len(merged) + np.searchsorted(phi_codes, second * tall + first),
+            phi=len(merged) + np.searchsorted(phi_codes, second * tall + height + first),
+            coupled=len(merged) + np.searchsorted(phi_codes, of_dynamics),
+            driven=len(merged) + np.searchsorted(phi_codes, of_drives),
             diagonal=diagonal if placed is None else placed[diagonal],
         )
 

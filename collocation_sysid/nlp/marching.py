@@ -145,7 +145,7 @@ class _Step:
         t: int,
         carried: Carried | None = None,
     ) -> None:
-        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t)
+        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t, theta)
         self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
         self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
         row = self.row

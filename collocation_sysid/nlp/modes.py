@@ -82,7 +82,7 @@ def natural_modes(
     Modes
     """
     forces = forces or Forces.on(body)
-    mass, pattern = forces.mass_kg[0, free_dofs], forces.pattern
+    mass, pattern = forces.mass.row(0, theta)[free_dofs], forces.pattern
     state = np.asarray(x, dtype=float).reshape(1, -1)
     at = forces.linearise(state, np.zeros_like(state), theta)
     lower, damping = -at.by_position[0], -at.by_velocity[0]

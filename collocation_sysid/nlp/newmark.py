@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
-from .forces import Forces
+from .forces import Forces, Mass
 from .lapack import one_blas_thread
 from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
@@ -116,19 +116,17 @@ class _Stepper:
         return Forces.of(self.experiment, load_s).total(state.x, state.v, self.theta, now)[0]
 
     def _solver(self, time_s: float) -> Solver:
-        return self.solvers.holding(self.experiment.grasped(time_s)[0][0])
+        return self.solvers.holding(self.experiment.held(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
-        return np.repeat(self.experiment.node_mass_kg(time_s)[0], 3)
+        return Mass.of(self.experiment, time_s).row(0, self.theta)
 
     def _after_a_change(self, state: _State, goal_s: float) -> _State:
-        """The state with the accelerations after nodes are let go or a mass has joined."""
+        """The state with the accelerations after nodes are let go."""
         before, after = self._solver(state.t_s), self._solver(goal_s)
-        joined = self._mass(goal_s) != self._mass(state.t_s)
-        if before is after and not joined.any():
+        if before is after:
             return state
-        jumps = np.union1d(np.setdiff1d(after.free, before.free), np.flatnonzero(joined))
-        return self._balanced(state, goal_s, np.intersect1d(jumps, after.free))
+        return self._balanced(state, goal_s, np.setdiff1d(after.free, before.free))
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""
@@ -140,7 +138,7 @@ class _Stepper:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
         theta, h = self.theta, end_s - state.t_s
         forces = Forces.of(self.experiment, load_s)
-        mass = forces.mass_kg[0]
+        mass = forces.mass.row(0, theta)
         carried = state.memory.ahead(h) if state.memory else None
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h

@@ -20,6 +20,9 @@ Residual = Callable[[Array], Array]
 Linearise = Callable[[Array], tuple[Array, Array, Array]]
 T = TypeVar("T")
 
+# With the factor of the iterate before, a last step must be this much shorter.
+STALE = 0.01
+
 
 @dataclass(frozen=True)
 class NewtonOptions:
@@ -78,7 +81,7 @@ class Solver:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         self.options = options or NewtonOptions()
-        at_start = experiment.grasped(experiment.t_s[:1])[0][0]
+        at_start = experiment.held(experiment.t_s[:1])[0]
         holding = at_start if held is None else held
         self.free, self.held = np.flatnonzero(~holding), np.flatnonzero(holding)
         self.factoriser = Factoriser.of(experiment.pattern, self.free)
@@ -105,16 +108,14 @@ class Solver:
         """
         x = x.copy()
         self._require_upright(x)
-        tolerance = self.options.tolerance * self._size_m
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
+        step = factor.solve(value[self.free])
         for _ in range(self.options.iterations):
-            step = factor.solve(value[self.free])
-            length = float(np.linalg.norm(step, np.inf))
-            if length <= tolerance:
+            if self._is_last(step):
                 x[self.free] += step
                 return x
-            x, factor, value = self._backtrack(x, step, factor, residual, linearise, keep_definite)
+            x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
         raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
 
     def _backtrack(
@@ -126,6 +127,7 @@ class Solver:
         linearise: Linearise,
         keep_definite: bool,
     ) -> tuple[Array, Factor, Array]:
+        """The next iterate, its factor and its step."""
         length = np.linalg.norm(step)
         share = 1.0
         for _ in range(self.options.backtracks):
@@ -139,14 +141,21 @@ class Solver:
                     value, matrix = self._timed(residual, trial), None
                 next_step = factor.solve(value[self.free])
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
+                    if self._is_last(next_step, STALE) and not keep_definite:
+                        return trial, factor, next_step
                     if matrix is None:
                         value, *matrix = self._timed(linearise, trial)
                     try:
-                        return trial, self._factorise(matrix, trial, keep_definite), value
+                        own = self._factorise(matrix, trial, keep_definite)
+                        return trial, own, own.solve(value[self.free])
                     except NewtonFailure:
                         pass
             share /= 2
         raise NewtonFailure(x, "no step along Newton's direction makes progress")
+
+    def _is_last(self, step: Array, share: float = 1.0) -> bool:
+        tolerance = share * self.options.tolerance * self._size_m
+        return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
     def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
         try:

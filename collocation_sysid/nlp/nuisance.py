@@ -17,6 +17,9 @@ tare of a sensor       of each component that it measures [N] or [N m], see `sen
 its clock              τ, how much later than its times say it measured [s]
 its lag                T of a first-order low-pass [s]
 its tool               mass [kg], and centre (3) about the sensor's point [m]
+factor                 f less one, of each tension, and of each pressure
+lost                   b of each tension [N], and of each pressure [Pa]
+joining                how much later than stated a point mass or force joins, or leaves [s]
 =====================  ====================================================================
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
@@ -25,21 +28,29 @@ nothing but what the markers read, and the direction of gravity, which becomes R
 
 In the grasp the undeformed body is off by H X = R(a_h) (X − c_h) + c_h + d_h, c_h being the middle
 of the grasped nodes: they are held at U_t H X.
+
+A tension T is max(0, f T − b) at the body, a pressure p is f p − b.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Index
+from ..experiment.actuator import Actuator
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp, held_nodes
+from ..experiment.loads import Change, Force, PointMass
 from ..experiment.wrench import COMPONENTS, UNITS
+
+Load = TypeVar("Load", PointMass, Force)
 
 # Samples are read between neighbours, up to this many away from the chart's.
 LARGEST_SHIFT_SAMPLES = 2.0
@@ -47,6 +58,9 @@ LARGEST_SHIFT_SAMPLES = 2.0
 LARGEST_SHIFT_SHARE = 0.25
 # The clock and the lag of a sensor may be this many deviations of their priors.
 SENSOR_DEVIATIONS = 3.0
+# A load joins within this many standard deviations of its prior, further than any that is right,
+# and within the recording: not quite at its ends, where it would join at once or never.
+LARGEST_DELAY, NARROWER = 4.0, 1 - 1e-9
 # A place may move this many edges of the mesh in a step.
 EDGES_A_STEP = 2.0
 KINDS = (
@@ -58,11 +72,28 @@ KINDS = (
     "tilt",
     "grasp-turn",
     "grasp-shift",
+    "factor",
+    "lost",
+    "joining",
 )
 # Those of a grasp's zero have its number behind them.
 OF_GRASP = "zero"
 # Those of a sensor have its number behind them: "tare 0".
 OF_SENSOR = ("tare", "sensor-time", "sensor-lag", "tool-mass", "tool-centre")
+# The time at which a load joins may move this many samples in a step.
+SAMPLES_A_STEP = 2.0
+
+
+class Timed(NamedTuple):
+    """A load that joins or leaves at an estimated time."""
+
+    load: PointMass | Force
+    change: Change
+
+    @property
+    def stated_s(self) -> float:
+        """The time stated."""
+        return getattr(self.load, self.change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +111,10 @@ class NuisanceMap:
     gravity_m_s2 : (3,) as stated
     pivot_m : (3,) c
     grasp_pivot_m : (3,) c_h
+    stated_off : (A, 2) f and b of tensions and pressures as stated
+    driving : (A, 2) which φ their estimates are, −1 where they have none
+    timed : of each φ of the kind "joining", what joins or leaves
+    recorded_s : first and last time of the recording
     """
 
     names: tuple[str, ...]
@@ -91,6 +126,10 @@ class NuisanceMap:
     gravity_m_s2: Array
     pivot_m: Array
     grasp_pivot_m: Array
+    stated_off: Array
+    driving: Index
+    timed: tuple[Timed, ...]
+    recorded_s: tuple[float, float]
 
     @classmethod
     def of(cls, experiment: Experiment) -> NuisanceMap:
@@ -104,6 +143,9 @@ class NuisanceMap:
         reach = np.where(linear, 1e3, 1.0).astype(float)
         of_place = np.array([kind == "place" for kind in kinds], dtype=bool)
         reach[of_place] = np.minimum(1e3, EDGES_A_STEP * edge_m / scales[of_place])
+        of_joining = np.array([kind == "joining" for kind in kinds], dtype=bool)
+        joining_s = SAMPLES_A_STEP * experiment.timestep_s
+        reach[of_joining] = np.minimum(1.0, joining_s / scales[of_joining])
         held = held_nodes(experiment.grasps)
         return cls(
             tuple(f"{experiment.name}: {label}" for label in labels),
@@ -115,6 +157,10 @@ class NuisanceMap:
             np.array(experiment.gravity_m_s2),
             experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
             body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
+            np.array([a.off for a in experiment.actuators]).reshape(-1, 2),
+            _driving(experiment, labels),
+            tuple(timed for _, timed in _timed(experiment)),
+            (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
 
     @property
@@ -128,9 +174,23 @@ class NuisanceMap:
 
     @cached_property
     def moving(self) -> NDArray[np.int64]:
-        """Positions in φ of what changes the motion: what turns gravity, or moves the grasps."""
+        """Positions in φ of what changes the motion: gravity, grasps, loads and what drives it."""
         zeros = {kind for kind in self.kinds if kind.startswith(OF_GRASP)}
-        return self.places("turn", "tilt", "grasp-turn", "grasp-shift", *zeros)
+        kinds = ("turn", "tilt", "grasp-turn", "grasp-shift", *zeros, "joining", "factor", "lost")
+        return self.places(*kinds)
+
+    @cached_property
+    def of_drives(self) -> NDArray[np.int64]:
+        """Positions in φ of what tensions and pressures may be off by."""
+        return self.places("factor", "lost")
+
+    def drives(self, phi: Array) -> tuple[Array, Array]:
+        """F and b (A, 2) of tensions and pressures, and their derivatives (2 A, k) by φ."""
+        slopes = np.zeros((self.driving.size, self.size))
+        estimated = np.flatnonzero(self.driving.ravel() >= 0)
+        places = self.driving.ravel()[estimated]
+        slopes[estimated, places] = self.scales[places]
+        return self.stated_off + (slopes @ phi).reshape(-1, 2), slopes
 
     @cached_property
     def moves_grasps(self) -> bool:
@@ -161,7 +221,27 @@ class NuisanceMap:
             if kind.startswith(("sensor-time", "sensor-lag", "tool-mass")):
                 low[k] = -SENSOR_DEVIATIONS if kind.startswith("sensor-time") else 0.0
                 high[k] = np.inf if kind.startswith("tool-mass") else SENSOR_DEVIATIONS
+        for k, timed in zip(self.places("joining"), self.timed, strict=True):
+            way = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
+            low[k], high[k] = np.clip(NARROWER * way, -LARGEST_DELAY, LARGEST_DELAY)
         return low, high
+
+    def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
+        """The experiment with its loads joining and leaving when φ says."""
+        if not self.timed:
+            return experiment
+        late_s = (phi * self.scales)[self.places("joining")]
+
+        def moved(load: Load) -> Load:
+            times = {
+                timed.change: timed.stated_s + float(late)
+                for timed, late in zip(self.timed, late_s, strict=True)
+                if timed.load is load
+            }
+            return replace(load, **times) if times else load
+
+        masses, forces = map(moved, experiment.masses), map(moved, experiment.forces)
+        return replace(experiment, masses=masses, forces=forces)
 
     def of_sensor(self, kind: str, number: int) -> NDArray[np.int64]:
         """Positions in φ of what is not known of a sensor."""
@@ -280,6 +360,13 @@ def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
     for k, grasp in enumerate(experiment.grasps):
         which = f"zero of grasp {k + 1}"
         add(f"{OF_GRASP} {k}", which, "m", " ".join(grasp.zero), wanted.displacement_zero_m)
+    for actuator in experiment.actuators:
+        factor, lost = wanted.off(actuator)
+        if factor:
+            entries.append(("factor", _factor_of(actuator.name), factor))
+        if lost:
+            entries.append(("lost", _lost_of(actuator), lost))
+    entries += [("joining", label, wanted.joining_s) for label, _ in _timed(experiment)]
     return entries + _sensor_entries(experiment)
 
 
@@ -294,9 +381,10 @@ def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
             if deviation:
                 entries.append((f"{kind} {number}", f"{what} [{unit}]", deviation))
 
-        for k in np.flatnonzero(wrench.measured) if wanted.tare else ():
+        tare = wanted.tare or 0.0
+        for k in np.flatnonzero(wrench.measured):
             what = f"tare{which} of {COMPONENTS[k]}"
-            add("tare", what, UNITS[k], wanted.tare * float(wrench.sigmas[k]))
+            add("tare", what, UNITS[k], tare * float(wrench.sigmas[k]))
         if not experiment.static:
             add("sensor-time", f"time shift of the sensor{which}", "s", wanted.sensor_time_s)
             add("sensor-lag", f"lag of the sensor{which}", "s", wanted.sensor_lag_s)
@@ -304,6 +392,38 @@ def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
         for axis in "xyz" if wanted.tool_kg else "":
             add("tool-centre", f"centre of the tool{which}, {axis}", "m", wanted.tool_m)
     return entries
+
+
+def _factor_of(name: str) -> str:
+    return f"{name}, more than stated [1]"
+
+
+def _lost_of(actuator: Actuator) -> str:
+    return f"{actuator.name}, lost [{actuator.unit}]"
+
+
+def _driving(experiment: Experiment, labels: Sequence[str]) -> Index:
+    """(A, 2) places among the labels of what each actuator may be off by, or −1."""
+    place = {label: k for k, label in enumerate(labels)}
+    found = [
+        (place.get(_factor_of(a.name), -1), place.get(_lost_of(a), -1))
+        for a in experiment.actuators
+    ]
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
+    """What joins or leaves at a time that is to be estimated, and its label."""
+    if not experiment.nuisance.joining_s:
+        return []
+    said: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
+    return [
+        (f"{said[change]} of {kind} {number} [s]", Timed(load, change))
+        for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
+        for number, load in enumerate(loads, start=1)
+        for change in get_args(Change)
+        if experiment.changes(load, change)
+    ]
 
 
 def rotation(turn: ca.SX) -> ca.SX:

@@ -237,7 +237,7 @@ class Overstress:
         return (history.gaps / self.unit_pa).ravel(), np.concatenate(values)
 
     def _by_q(self, history: History, setting: Setting) -> Array:
-        """(nq, N − 1, width) of r."""
+        """Of r by q, (nq, N − 1, width)."""
         found = np.empty((self.segment.nq, *self.shape))
         theta_q, stresses = setting.theta_q, history.body.stresses
         for start in range(0, self.shape[0], CHUNK):
@@ -253,7 +253,7 @@ class Overstress:
         return found / self.unit_pa
 
     def _stress_values(self, history: History) -> list[Array]:
-        """R by x."""
+        """Of r by x."""
         place, own, _, number = self._slopes
         scale = -self.segment.length_m / self.unit_pa[own]
         a = np.stack([r.a for r in history.recursions], axis=1)
@@ -265,7 +265,7 @@ class Overstress:
         return [values.ravel() for values in self._spread(self._stress_lags, slopes)]
 
     def _force_values(self, history: History, setting: Setting) -> list[Array]:
-        """C by m."""
+        """Of the motion by m."""
         place, own, dofs, _ = (each[self._moved] for each in self._slopes)
         scale, taken = self.unit_pa[own] / self.segment.force_n, setting.dynamics.taken
 
@@ -294,8 +294,8 @@ class Overstress:
         by_q = np.zeros((segment.nq, *self.shape))
         recursions = setting.dynamics.recursions(setting.theta)
         for r, mu in zip(recursions, self.weights(multipliers), strict=True):
-            slopes = theta_q[[r.branch.share, r.branch.tau]].T @ r.d_by[:, 1:]
-            by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", slopes, mu[1:])
+            fading = theta_q[[r.branch.share, r.branch.tau]].T @ r.d_by[:, 1:]
+            by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", fading, mu[1:])
         place, own, _, _ = self._slopes
         scale = segment.length_m * self.unit_pa[own]
         # f_H is linear in x and in H, so that its slope by both is that by H at the weights.

@@ -18,7 +18,15 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, hint_at
 from ..fem.body import Body
-from ..fem.constants import INSTANTANEOUS, Scale, bare, constant_named, is_modulus, usual_value
+from ..fem.constants import (
+    INSTANTANEOUS,
+    Scale,
+    bare,
+    constant_named,
+    is_density,
+    is_modulus,
+    usual_value,
+)
 from ..fem.moduli import ENGINEERING, engineering
 
 
@@ -366,8 +374,10 @@ class Parameters:
                     "no part of the model uses it: every region has a value of its own", None, name
                 )
         for item in self.items:
-            if item.fixed and item.guess == 0 and bare(item.name) in ("mu_pa", "young_pa"):
-                raise InputError("fixed = 0, expected a stiffness above 0", None, item.name)
+            stiff = bare(item.name) in ("mu_pa", "young_pa")
+            if item.fixed and item.guess == 0 and (stiff or is_density(item.name)):
+                what = "a stiffness" if stiff else "a density"
+                raise InputError(f"fixed = 0, expected {what} above 0", None, item.name)
 
 
 def _guess(item: Parameter) -> float:

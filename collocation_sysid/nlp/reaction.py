@@ -104,13 +104,12 @@ def forces_on(dynamics: Dynamics, x: Array, theta: Array, dofs: Index) -> Array:
     return force
 
 
-def reactions(dynamics: Dynamics, force: Array, x: Array, dofs: Index) -> Array:
-    """R (N, g) [N] from the forces F (N, g) on the dofs and the positions x (N, 3n)."""
-    return dynamics.inertia(x)[:, dofs] - dynamics.combine(dynamics.tables.w, force)
+def reactions(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:
+    """R (N, g) [N] of some dofs from their mass, the forces F on them and their acceleration."""
+    return mass_kg * acceleration - dynamics.combine(dynamics.tables.w, force)
 
 
-def reaction_slopes(dynamics: Dynamics, slopes: Array, moved: Array, dofs: Index) -> Array:
-    """DR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
-    mass = dynamics.mass_kg[:, dofs, None] / dynamics.step_s**2
-    inertia = mass * dynamics.combine(dynamics.tables.s, moved)
-    return inertia - dynamics.combine(dynamics.tables.w, slopes)
+def reaction_slopes(dynamics: Dynamics, mass_kg: Array, slopes: Array, moved: Array) -> Array:
+    """Changes dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
+    second = dynamics.combine(dynamics.tables.s, moved) / dynamics.step_s**2
+    return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, slopes)

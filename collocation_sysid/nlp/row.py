@@ -39,8 +39,8 @@ class Row:
     mass_kg: Array
 
     @classmethod
-    def of(cls, dynamics: Dynamics, t: int) -> Row:
-        """Row t of the tables."""
+    def of(cls, dynamics: Dynamics, t: int, theta: Array) -> Row:
+        """Row t of the tables, with the mass at θ."""
         tables, step_s = dynamics.tables, dynamics.step_s
         return cls(
             tables.p[t],
@@ -48,7 +48,7 @@ class Row:
             tables.w[t],
             tables.s[t] / step_s**2,
             float(tables.r[t]) / step_s,
-            dynamics.mass_kg[t],
+            dynamics.mass.row(t, theta),
         )
 
     def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:

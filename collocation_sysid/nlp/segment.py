@@ -23,6 +23,7 @@ from .charts import Chart
 from .dynamics import Dynamics
 from .held import Grasping, Held
 from .hessian_layout import HessianLayout
+from .joining import Joinings
 from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
@@ -274,7 +275,7 @@ class Segment:
         theta, last = self.constants.theta(self.parameters.guess_q), dynamics.rows - 1
         at_last = dynamics.forces.rows(slice(last, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest), theta)
-        last, pattern = Row.of(dynamics, last), self.pattern
+        last, pattern = Row.of(dynamics, last, theta), self.pattern
         block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
@@ -312,17 +313,30 @@ class Segment:
         theta_q, theta_qq = self.constants.derivatives(q)
         dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
         gravity_phi_phi = np.zeros((3, 0, 0))
-        moving = self.nuisance.moving
+        moving, joining = self.nuisance.moving, self.joinings.at(phi)
+        drives = self.nuisance.drives(phi)
+        if joining:
+            dynamics = dynamics.with_loads(
+                sum(np.outer(load.share[0], load.mass_kg) for load in joining),
+                sum(load.share[0, :, None] * load.force_n for load in joining),
+            )
         if len(moving):
+            dynamics = dynamics.driven(drives[0])
             gravity, first, second = self.nuisance.gravity(phi)
             dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
             gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
         theta = self.constants.theta(q)
         held = self.grasping.at(phi)
-        return Setting(theta, theta_q, theta_qq, dynamics, gravity_phi, gravity_phi_phi, held)
+        slopes = gravity_phi, gravity_phi_phi, drives[1][:, moving]
+        return Setting(theta, theta_q, theta_qq, dynamics, *slopes, held, joining)
+
+    @cached_property
+    def joinings(self) -> Joinings:
+        """Loads that join or leave at estimated times."""
+        return Joinings(self.experiment, self.nuisance, self.dynamics)
 
     def corrected(self, phi: Array) -> Experiment:
-        """The experiment in the body's frame: gravity turned, and the body moved in its grasps."""
+        """The experiment in the body's frame, as φ has gravity, grasps, loads and drives."""
         if not len(self.nuisance.moving):
             return self.experiment
         grasps = self.experiment.grasps
@@ -332,8 +346,20 @@ class Segment:
                 replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
                 for k, g in enumerate(grasps)
             )
-        gravity = self.nuisance.gravity(phi)[0]
-        return replace(self.experiment, gravity_m_s2=gravity, grasps=grasps)
+        gravity, timed = self.nuisance.gravity(phi)[0], self.nuisance.with_times
+        off = iter(self.nuisance.drives(phi)[0])
+        tendons, pressures = (
+            tuple(actuator.off_by(*next(off)) for actuator in actuators)
+            for actuators in (self.experiment.tendons, self.experiment.pressures)
+        )
+        changed = replace(
+            self.experiment,
+            gravity_m_s2=gravity,
+            grasps=grasps,
+            tendons=tendons,
+            pressures=pressures,
+        )
+        return timed(changed, phi)
 
     def grasped(self, x: Array, phi: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
@@ -406,25 +432,39 @@ class Segment:
             blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
         return blocks
 
+    def _inertia_rows(self, lag: int) -> Index:
+        """Grid times whose rows have inertia at a lag."""
+        rows = np.arange(max(self.dynamics.first_row, lag), self.grid_rows)
+        return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
+
     @cached_property
-    def _jacobian_constants(self) -> tuple[Index, Array, Index]:
-        """Positions and values of the inertia, and positions of the unit grasp entries."""
-        first = self.dynamics.first_row
+    def _jacobian_constants(self) -> tuple[Index, Index]:
+        """Positions of the inertia, and of the unit grasp entries."""
         row_place = np.searchsorted(self.row_dofs, self.free_dofs)
-        mass = self.dynamics.mass_kg[:, self.free_dofs] * self.length_m / self.force_n
-        positions, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+        positions = [np.zeros(0, dtype=np.int64)]
         for lag in range(self.dynamics.reach + 1):
-            coefficient = self.dynamics.inertia_coefficient(lag)
-            rows = np.arange(max(first, lag), self.grid_rows)
-            rows = rows[coefficient[rows] != 0]
-            places = self.jacobian.positions(rows - lag, lag, row_place, self.free_dofs)
+            columns = self._inertia_rows(lag) - lag
+            places = self.jacobian.positions(columns, lag, row_place, self.free_dofs)
             positions.append(places.ravel())
-            values.append((coefficient[rows, None] * mass[rows]).ravel())
         grasps = [np.zeros(0, dtype=np.int64)]
         if self.grasps_have_rows:
-            rows = np.arange(first, self.grid_rows)
+            rows = np.arange(self.dynamics.first_row, self.grid_rows)
             grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
-        return np.concatenate(positions), np.concatenate(values), np.concatenate(grasps)
+        return np.concatenate(positions), np.concatenate(grasps)
+
+    def _inertia(self, dynamics: Dynamics, theta: Array) -> Array:
+        """∂c/∂x of the inertia, in the order of its positions."""
+        mass = dynamics.mass.at(theta)[:, self.free_dofs] * self.length_m / self.force_n
+        values = [np.zeros(0)]
+        for lag in range(self.dynamics.reach + 1):
+            rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
+            values.append((coefficient[rows, None] * mass[rows]).ravel())
+        return np.concatenate(values)
+
+    @cached_property
+    def _known_inertia(self) -> Array:
+        """The same where it does not depend on (q, φ)."""
+        return self._inertia(self.dynamics, np.zeros(0))
 
     @cached_property
     def _passing(self) -> PassingGrasps:
@@ -455,33 +495,44 @@ class Segment:
         dynamics = setting.dynamics
         forces = dynamics.linearise(x, setting.theta, self.linearisation_rows)
         self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
-        positions, inertia, grasps = self._jacobian_constants
-        values[positions] += inertia
+        positions, grasps = self._jacobian_constants
+        if setting.mass_moves:
+            values[positions] += self._inertia(dynamics, setting.theta)
+        else:
+            values[positions] += self._known_inertia
         skew = skew_values(self.pattern, forces.by_position_skew)
         if skew.size:
             self._skew_jacobian.fill(values, skew, skew, self.body.threads)
         self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
         values[grasps] = 1.0
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
-        weighed = dynamics.evaluated.mass_kg
-        by_p[dynamics.first_row :] = setting.force_slopes(forces.by_theta, weighed)
-        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p)) / self.force_n
+        rows, nu = slice(dynamics.first_row, None), dynamics.evaluation_states(x)[1]
+        by_p[rows] = setting.force_slopes(rows, forces.by_theta, nu)
+        by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p))
+        if setting.mass_moves:
+            whole = slice(None)
+            by_p -= setting.inertia_slopes(whole, dynamics.acceleration(x), whole)
+        by_p /= self.force_n
         dynamics.without_taken(by_p)
         by_p[:, self.held_dofs] = 0
         if setting.held.moves:
             by_p[:, setting.held.dofs, self.nq :] -= setting.held.by_phi / self.length_m
         by_p = by_p[dynamics.first_row :, self.row_dofs]
-        rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
+        rows = self._rows(x, dynamics.assemble_residual(x, setting.theta, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
-    def force_weights(self, multipliers: Array) -> Array:
-        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
+    def _row_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the rows in newtons."""
         dynamics = self.dynamics
         row_weights = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
         row_weights[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
         row_weights[:, self.held_dofs] = 0
-        dynamics.without_taken(row_weights)
+        return dynamics.without_taken(row_weights)
+
+    def force_weights(self, multipliers: Array) -> Array:
+        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
+        dynamics, row_weights = self.dynamics, self._row_weights(multipliers)
         return dynamics.without_taken(dynamics.combine_transposed(dynamics.tables.w, row_weights))
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
@@ -597,17 +648,23 @@ class Segment:
         skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
-        by_xi = curvature.position_theta @ setting.theta_q
+        by_xi = setting.by_q(curvature.position_theta)
         by_nu = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
         by_theta = dynamics.combine_transposed(dynamics.state_weights, by_xi)
         by_theta += dynamics.combine_transposed(dynamics.tables.q, by_nu)
+        by_theta -= (by_inertia := self._inertia_curvature(x, setting, multipliers))[0]
         of_band[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
         if layout.band is not None:
             values[: layout.x_entries] = 0
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
-        pull = (weights * dynamics.forces.mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
+        if layout.driven.size:
+            of_drives = setting.by_drive(curvature.position_theta)[..., self._driving]
+            of_x = dynamics.combine_transposed(dynamics.state_weights, of_drives)
+            values[layout.driven] += self.length_m * of_x.ravel()
+        mass_kg = dynamics.forces.mass.at(setting.theta)
+        pull = (weights * mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
         by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
@@ -620,9 +677,11 @@ class Segment:
             by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
                 phi, of_goals
             )
+        by_phi += self._add_coupling(x, setting, weights, multipliers, values)
         by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
-        theta_theta, theta_gradient = curvature.theta_theta.sum(axis=0), curvature.theta.sum(axis=0)
+        theta_theta = curvature.theta_theta.sum(axis=0)
+        theta_gradient = curvature.theta.sum(axis=0) - by_inertia[1]
         by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
         return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
 
@@ -643,6 +702,72 @@ class Segment:
         return curvature
 
     @cached_property
+    def _tilts(self) -> Index:
+        """Columns, of those that move the body, that turn gravity where it pulls at an own ρ."""
+        turning = np.isin(self.nuisance.moving, self.nuisance.places("turn", "tilt"))
+        return np.flatnonzero(turning & bool(self.body.mass_slopes))
+
+    @cached_property
+    def _driving(self) -> Index:
+        """Among the φ that move the body, those of tensions and pressures."""
+        return np.flatnonzero(np.isin(self.nuisance.moving, self.nuisance.of_drives))
+
+    def _weight_curvature(self, weights: Array, setting: Setting) -> Array:
+        """Second derivatives (m, nq) of weights · M g by the φ that turn gravity, and q."""
+        by_q = np.zeros((3, self.nq))
+        for density, slope in self.body.mass_slopes.items():
+            pull = (weights.sum(axis=0) * slope).reshape(-1, 3).sum(axis=0)
+            by_q += np.outer(pull, setting.theta_q[density])
+        return setting.gravity_phi[:, self._tilts].T @ by_q
+
+    def _inertia_curvature(
+        self, x: Array, setting: Setting, multipliers: Array
+    ) -> tuple[Array | float, Array | float]:
+        """Of multipliers · M a: second derivatives by x and q, (N, 3n, nq), and the first by θ."""
+        slopes, dynamics = self.body.mass_slopes, self.dynamics
+        if not slopes:
+            return 0.0, 0.0
+        weights, of_theta = self._row_weights(multipliers), np.zeros(len(setting.theta))
+        pulled = dynamics.combine_transposed(dynamics.tables.s, weights) / dynamics.step_s**2
+        acceleration, of_x = dynamics.acceleration(x), 0.0
+        for density, slope in slopes.items():
+            of_theta[density] = np.einsum("ti,ti,i->", weights, acceleration, slope)
+            of_x = of_x + (pulled * slope)[..., None] * setting.theta_q[density]
+        return of_x, of_theta
+
+    def _add_coupling(
+        self, x: Array, setting: Setting, force_weights: Array, multipliers: Array, values: Array
+    ) -> Array:
+        """Second derivatives by what turns gravity, and by when loads join, and by q and x.
+
+        They go into `values`; those (k, k) of the loads by φ are returned.
+        """
+        by_phi = np.zeros((len(self.nuisance.moving),) * 2)
+        row_weights = self._row_weights(multipliers)
+        coupled = [self._weight_curvature(force_weights, setting).ravel()]
+        for load in setting.joining:
+            by_q, by_x, own = setting.curvature(load, x, force_weights, row_weights)
+            coupled += [by_q, self.length_m * by_x[:, load.dofs].ravel()]
+            by_phi[load.column] += own
+            by_phi[:, load.column] += np.where(np.arange(len(own)) == load.column, 0.0, own)
+        values[self.hessian_layout.coupled] += np.concatenate(coupled)
+        whole = np.zeros((self.nuisance.size, self.nuisance.size))
+        whole[np.ix_(self.nuisance.moving, self.nuisance.moving)] = by_phi
+        return whole
+
+    @property
+    def _coupled(self) -> tuple[Index, Index]:
+        """Rows (q, then x) and columns (φ) of what `_add_coupling` writes."""
+        of_q, moving = np.arange(self.nq), self.nuisance.moving
+        rows = [np.tile(of_q, len(self._tilts))]
+        columns = [np.repeat(moving[self._tilts], self.nq)]
+        for load in self.joinings.at(np.zeros(self.nuisance.size)):
+            of_x = np.add.outer(np.arange(self.grid_rows) * self.dofs, load.dofs).ravel()
+            rows.append(np.concatenate([of_q, self.nq + of_x]))
+            columns.append(np.full(len(rows[-1]), moving[load.column]))
+        return np.concatenate(rows), np.concatenate(columns)
+
+    @cached_property
     def _curvature_rows(self) -> Array:
         return np.zeros((self.grid_rows, self.dynamics.forces.curvature_width))
 
@@ -661,6 +786,8 @@ class Segment:
             columns,
             self.nuisance.size,
             self.length_m,
+            self._coupled,
+            self.nuisance.of_drives,
         )
 
     # Structure --------------------------------------------------------------------------------

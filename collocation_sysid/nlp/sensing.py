@@ -57,18 +57,31 @@ class Sensing:
         """The reactions at positions x (N, 3n)."""
         dynamics, dofs = self.setting.dynamics, self.segment.sensed_dofs
         force = forces_on(dynamics, x, self.setting.theta, dofs)
-        return Forced.still(reactions(dynamics, force, x, dofs), x[:, dofs])
+        reaction = reactions(dynamics, self._mass_kg, force, dynamics.acceleration(x)[:, dofs])
+        return Forced.still(reaction, x[:, dofs])
 
-    def along(self, x: Array, held: HeldForces, moved: Array) -> Forced:
+    @property
+    def _mass_kg(self) -> Array:
+        """(N, g) of the sensed dofs."""
+        dynamics = self.setting.dynamics
+        return dynamics.mass.at(self.setting.theta)[:, self.segment.sensed_dofs]
+
+    def along(self, x: Array, held: HeldForces, moved: Array, first: int | None = None) -> Forced:
         """The same of the first rows x, from their forces, and how they change.
 
         Parameters
         ----------
         moved : (rows, g, c) how the dofs move
+        first : int, optional
+            Column from which on they are those of what moves the body.
         """
         dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
-        reaction = reactions(dynamics, held.force, x, dofs)
-        by = reaction_slopes(dynamics, held.slopes, moved, dofs)
+        acceleration, mass_kg = dynamics.acceleration(x)[:, dofs], self._mass_kg[: len(x)]
+        reaction = reactions(dynamics, mass_kg, held.force, acceleration)
+        by = reaction_slopes(dynamics, mass_kg, held.slopes, moved)
+        if first is not None:
+            rows = slice(len(x))
+            by[..., first:] += self.setting.inertia_slopes(rows, acceleration, dofs)
         return Forced(reaction, x[:, dofs], by, moved)
 
     # Residuals --------------------------------------------------------------------------------
@@ -91,7 +104,7 @@ class Sensing:
 
     def projected(self, x: Array, held: HeldForces, moved: Array) -> list[tuple[Array, Array]]:
         """The same after a feasibility step, which is the first of the columns, to first order."""
-        forced = self.along(x, held, moved)
+        forced = self.along(x, held, moved, first=1)
         after = Forced(
             forced.reaction + forced.reaction_by[..., 0],
             forced.position_m + forced.position_by[..., 0],
@@ -156,8 +169,13 @@ class Sensing:
         first, whole = dynamics.first_row, np.zeros_like(x)
         whole[:, dofs] = -dynamics.combine_transposed(t.w, weights)
         at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
-        slopes = setting.force_slopes(at.by_theta, dynamics.evaluated.mass_kg)
+        nu = dynamics.evaluation_states(x)[1]
+        slopes = setting.force_slopes(slice(first, None), at.by_theta, nu)
         by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
+        if setting.mass_moves:
+            acceleration = dynamics.acceleration(x)[:, dofs]
+            own = setting.inertia_slopes(slice(None), acceleration, dofs)
+            by_p += np.einsum("tg,tgp->p", weights, own)
         rows = HeldRows(dynamics.pattern, dofs)
         state, rate = np.zeros_like(x), np.zeros_like(x)
         for k, weight in enumerate(whole[first:, dofs]):
@@ -167,7 +185,7 @@ class Sensing:
                 rate[first + k] = rows.of(at.by_velocity[k], skew[:0]).T @ weight
         by_x = dynamics.combine_transposed(t.p, state)
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
-        inertia = dynamics.combine_transposed(t.s, dynamics.mass_kg[:, dofs] * weights)
+        inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)
         by_x[:, dofs] += inertia / dynamics.step_s**2
         of_memory, of_q = segment.pulled_through_memory(x, setting, whole)
         by_p[: segment.nq] += of_q

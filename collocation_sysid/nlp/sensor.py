@@ -357,7 +357,7 @@ def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tup
     for grasp in experiment.grasps:
         if grasp.wrench is not None:
             own = dofs_of(grasp.nodes)
-            held, places = np.isin(own, grasp.dofs) * 1.0, np.searchsorted(dofs, own)
+            held, places = np.isin(own, grasp.dofs).astype(np.float64), np.searchsorted(dofs, own)
             found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places, held))
     return tuple(found)
 

@@ -103,7 +103,9 @@ def simulate(
         still = np.zeros_like(grid)
         v = still if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::taken]
         at, force = Grid.of(dynamics), forces_on(dynamics, grid, theta, sensed)
-        forced = Forced.still(reactions(dynamics, force, grid, sensed), grid[:, sensed])
+        mass_kg, acceleration = dynamics.mass.at(theta)[:, sensed], dynamics.acceleration(grid)
+        reaction = reactions(dynamics, mass_kg, force, acceleration[:, sensed])
+        forced = Forced.still(reaction, grid[:, sensed])
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
     markers = experiment.markers.observe(positions)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
+from .dynamics import Dynamics
 from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
@@ -89,15 +90,17 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, and G's skew part."""
+    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, G's skew part, ν."""
 
     t: int
+    row: Row
     force: Array
     by_position: Array
     by_velocity: Array
     by_theta: Array
     factor: Factor
     skew: Array
+    velocity: Array
 
 
 class BlockSolver:
@@ -174,7 +177,7 @@ class BlockSolver:
         if known is not None:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
-        inertia = self.dynamics.inertia(x)
+        acceleration = self.dynamics.acceleration(x)
         given = GivenMotion.of(self, setting, x)
         memory = known.memory if known else None
         held = HeldForces.nothing(len(x), len(self.sensed), count)
@@ -185,9 +188,11 @@ class BlockSolver:
         for step in self._steps(x, setting, first=done, history=history):
             indefinite += not step.factor.positive_definite
             right, force = np.zeros(march.shape), np.zeros((x.shape[1], count))
-            residual = march.residual(step, inertia[step.t])
+            residual = march.residual(step, acceleration[step.t])
             violation = max(violation, float(np.abs(residual).max(initial=0.0)))
             right[:, 0] = residual
+            if setting.mass_moves:
+                right[:, 1:] -= march.inertia_slopes(step, acceleration[step.t])
             force[:, 1:] = march.force_slopes(step)
             with self.stopwatch.solving():
                 columns[step.t, self.free] = march.advance(step, right, force, given)
@@ -210,9 +215,12 @@ class BlockSolver:
         march = _Forward(self, setting, (len(self.free), shape[1]), held=held)
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
         march.remember(history, setting.columns(shape[1], first=0))
+        acceleration = self.dynamics.acceleration(x)
         yield from np.zeros((self.dynamics.first_row, *shape))
         for step in self._steps(x, setting, history=history):
             row, right = np.zeros(shape), np.zeros(march.shape)
+            if setting.mass_moves:
+                right -= march.inertia_slopes(step, acceleration[step.t])
             row[self.free] = march.advance(step, right, march.force_slopes(step), given)
             if given is not None:
                 row[given.held_dofs] = given.of_held[step.t]
@@ -248,17 +256,17 @@ class BlockSolver:
 
         Dofs that a passing grasp holds have zeros.
         """
-        dynamics, reach = self.dynamics, self.dynamics.reach
-        rows = [Row.of(dynamics, t) for t in range(dynamics.rows)]
+        dynamics, reach = self.dynamics_at(setting), self.dynamics.reach
+        rows = [Row.of(dynamics, t, setting.theta) for t in range(dynamics.rows)]
         y = np.zeros((dynamics.rows, len(self.free)))
         pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
-        history = dynamics.history(x, setting.theta)
+        history = self.dynamics.history(x, setting.theta)
         weights = Weights(history) if history else None
         for step in self._steps(x, setting, backward=True, history=history):
             t = step.t
             through_stress = weights.pulled()[self.free] if weights else 0.0
             lags = range(min(reach, t) + 1)
-            mass = dynamics.mass_kg[t, self.free]
+            mass = rows[t].mass_kg[self.free]
             later = [j for j in range(1, reach + 1) if t + j < dynamics.rows]
             known = self.without_taken(
                 t,
@@ -325,6 +333,10 @@ class BlockSolver:
         self._held.data = _entries(lower, skew, self._held_source)
         return self._held @ columns
 
+    def dynamics_at(self, setting: Setting) -> Dynamics:
+        """The equations of motion of the rows at a setting."""
+        return setting.dynamics.first_rows(self.dynamics.rows)
+
     def _steps(
         self,
         x: Array,
@@ -334,7 +346,7 @@ class BlockSolver:
         history: History | None = None,
     ) -> Iterator[_Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
-        dynamics, theta = self.dynamics, setting.theta
+        dynamics, theta = self.dynamics_at(setting), setting.theta
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
@@ -346,28 +358,35 @@ class BlockSolver:
                 carried = dynamics.carried(history, slice(start, stop))
                 at = forces.linearise(xi[here], nu[here], theta, carried=carried)
             with self.stopwatch.solving():
-                factors = self._factorise(at, slice(start, stop), rooms)
+                rows = [Row.of(dynamics, t, theta) for t in range(start, stop)]
+                factors = self._factorise(dynamics, at, slice(start, stop), rows, rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
                 yield _Step(
                     start + k,
+                    rows[k],
                     at.force[k],
                     at.by_position[k],
                     at.by_velocity[k],
                     at.by_theta[k],
                     factors[k],
                     at.by_position_skew[k],
+                    nu[start - dynamics.first_row + k],
                 )
 
     def _factorise(
-        self, at: Linearisation, rows: slice, rooms: Sequence[Array | None] = ()
+        self,
+        dynamics: Dynamics,
+        at: Linearisation,
+        here: slice,
+        rows: list[Row],
+        rooms: Sequence[Array | None] = (),
     ) -> list[Factor]:
-        pattern, taken = self.pattern, self.dynamics.taken[rows]
+        pattern, taken = self.pattern, dynamics.taken[here]
 
         def matrix(k: int) -> tuple[Array, Array]:
-            row = Row.of(self.dynamics, rows.start + k)
-            values = row.block(at.by_position[k], at.by_velocity[k], pattern)
-            skew = row.skew_block(at.by_position_skew[k])
+            values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
+            skew = rows[k].skew_block(at.by_position_skew[k])
             if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
                 gone = taken[k][pattern.rows] | taken[k][pattern.columns]
@@ -384,7 +403,7 @@ class BlockSolver:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
                 f"motion cannot be solved: {error}",
-                float(self.dynamics.t_s[rows.start]),
+                float(dynamics.t_s[here.start]),
             ) from error
 
 
@@ -486,6 +505,7 @@ class _Forward:
         self.solver = solver
         self.held = held if len(solver.sensed) else None
         self.setting = setting
+        self.dynamics = solver.dynamics_at(setting)
         self.shape = shape
         reach = solver.dynamics.reach
         nothing = (np.zeros(shape),) * reach
@@ -515,12 +535,12 @@ class _Forward:
             # The start is given.
             self.slopes.advance(np.zeros((self.solver.pattern.size, theta_q.shape[1])))
 
-    def residual(self, step: _Step, inertia: Array) -> Array:
+    def residual(self, step: _Step, acceleration: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
-        solver, row = self.solver, Row.of(self.solver.dynamics, step.t)
+        solver, row = self.solver, step.row
         force = step.force[solver.free]
         solver.without_taken(step.t, force)
-        total = row.w[0] * force - inertia[solver.free]
+        total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
             total += weighted(row.w, self.past_forces, force.shape)
             self.past_forces.appendleft(force)
@@ -528,15 +548,19 @@ class _Forward:
 
     def force_slopes(self, step: _Step) -> Array:
         """∂F/∂p (3n, m)."""
-        weighed = self.setting.dynamics.forces.mass_kg[step.t]
-        return self.setting.force_slopes(step.by_theta, weighed)
+        return self.setting.force_slopes(step.t, step.by_theta, step.velocity)
+
+    def inertia_slopes(self, step: _Step, acceleration: Array) -> Array | float:
+        """∂(M a)/∂p on the free dofs."""
+        free = self.solver.free
+        return self.setting.inertia_slopes(step.t, acceleration[free], free)
 
     def advance(
         self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None
     ) -> Array:
         """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
-        row = Row.of(solver.dynamics, t)
+        row = step.row
         w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
         right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)

@@ -44,6 +44,7 @@ LAYOUT = {
     "rolled_out_positions_m": ("f", "Tn3"),
     "rolled_out_m": ("f", "TM3"),
     "natural_hz": ("f", "k"),
+    "tendons_m": ("f", "p3"),
 }
 # Arrays that may hold NaN or infinity, and the largest length, time or frequency of any.
 GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
@@ -78,6 +79,7 @@ class Replay:
         out, NaN where there are none.
     static : bool
         Whether every sample is an equilibrium of its own.
+    tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
     """
 
     name: str
@@ -101,6 +103,7 @@ class Replay:
     natural_hz: Array | None = None
     wrenches: Sequence[Array] = ()
     static: bool = False
+    tendons_m: Array | None = None
 
     @classmethod
     def of(
@@ -128,7 +131,7 @@ class Replay:
             body.part_of_cells[body.mesh.surface_cells],
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            experiment.grasped(experiment.t_s)[0].any(axis=2),
+            np.asarray(experiment.held(experiment.t_s).any(axis=2)),
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
             given_m if places_m is None else places_m,
@@ -139,6 +142,7 @@ class Replay:
             natural_hz,
             wrenches,
             experiment.static,
+            _apart([tendon.points_m for tendon in experiment.tendons]),
         )
 
     @property
@@ -162,6 +166,7 @@ class Replay:
             "held": self.held,
             "up": self.up,
             "natural_hz": self.natural_hz,
+            "tendons_m": self.tendons_m,
             "static": np.array(True) if self.static else None,
         } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
         shared: dict[str, Any] = {
@@ -191,6 +196,7 @@ class Replay:
             "rolled_out_positions_m",
             "rolled_out_m",
             "natural_hz",
+            "tendons_m",
         )
         found: dict[str, Any] = {key: arrays[key] for key in SHARED}
         found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
@@ -210,6 +216,13 @@ class Replay:
         return cls(name=name, marker_names=names, part_names=parts, **found)
 
 
+def _apart(lines_m: Sequence[Array]) -> Array | None:
+    """Polylines (P, 3) in one (p, 3), a row of NaN after each; None where there are none."""
+    if not lines_m:
+        return None
+    return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])
+
+
 def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:
     """Corners of each face (F, 3), and of quadratic cells (F, 10) the nodes on its sides too."""
     if cells.shape[1] != 10:
@@ -227,14 +240,15 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             continue
         wanted = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
         here = array.shape
-        if array.dtype.kind not in kinds or array.ndim != len(letters) or 0 in here[:-1]:
+        empty = any(not size for x, size in zip(letters, here, strict=False) if x not in "Mk")
+        if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
             raise ValueError(f"{key} is {array.dtype} of shape {here}")
         if any(size not in (None, found) for size, found in zip(wanted, here, strict=True)):
             raise ValueError(f"{key} has shape {here}, which does not go with the others")
         sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
         if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
             raise ValueError(f"{key} holds numbers that are not finite")
-        if kinds == "f" and np.nanmax(np.abs(array), initial=0.0) > LARGEST:
+        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
             raise ValueError(f"{key} holds numbers above {LARGEST:g}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:

@@ -16,6 +16,7 @@ from ..fem.plausible import oddities
 from ..fem.regions import Region
 from ..nlp.parameters import Parameters, Tied, Unknown
 from .code import load_material
+from .densities import completed, guessed
 from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file, selection
@@ -40,8 +41,14 @@ def read_problem(
         )
     folder = path.parent if folder is None else Path(folder)
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
-    body = _located(path, "object", lambda: _load_body(file.object, mesh, folder, allow_code))
-    parameters = _located(path, "parameters", lambda: _load_parameters(file.parameters, body))
+    given = file.parameters
+    body = _located(
+        path,
+        "object",
+        lambda: _load_body(completed(file.object, given), mesh, folder, allow_code),
+    )
+    body = body.with_free_densities(body.weighed_by(given))
+    parameters = _located(path, "parameters", lambda: _load_parameters(guessed(given, body), body))
     odd = _located(path, "object", lambda: [oddity.sentence for oddity in oddities(body)])
     experiments, notes = [], []
     for section in file.experiment:
@@ -75,6 +82,8 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
         names += [grasp.poses or grasp.displacement for grasp in section.grasps]
         names += [grasp.wrench.file for grasp in section.grasps if grasp.wrench is not None]
         names += [force.file for force in section.force]
+        names += [tendon.tension for tendon in section.tendon]
+        names += [pressure.pressure for pressure in section.pressure]
     return tuple(folder / name for name in names if name is not None)
 
 

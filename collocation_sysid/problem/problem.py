@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,7 @@ from ..methods.options import Options
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
+from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
 from ..statistics.uncertainty import ErrorsOption, NoiseOption
 
@@ -144,11 +145,11 @@ class Problem:
         notes: Iterable[str] = (),
         origin: Origin | None = None,
     ) -> None:
+        if not isinstance(parameters, Parameters):
+            parameters = Parameters.of(parameters)
         vars(self).update(
-            experiments=tuple(experiments),
-            parameters=(
-                parameters if isinstance(parameters, Parameters) else Parameters.of(parameters)
-            ),
+            experiments=_weighed(experiments, parameters),
+            parameters=parameters,
             scheme=scheme,
             substeps=substeps,
             explicit_grasps=explicit_grasps,
@@ -165,6 +166,8 @@ class Problem:
         still = stillness_notes(self.experiments, self.parameters)
         vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *notes)))
         self._check()
+        unscaled = scale_notes(self.experiments, self.parameters)
+        vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
         names = ", ".join(repr(experiment.name) for experiment in self.experiments)
@@ -266,3 +269,14 @@ class Problem:
                     f"found {name!r}; expected estimated parameters, {', '.join(free)}",
                     where="uncertainty.profile",
                 )
+
+
+def _weighed(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[Experiment, ...]:
+    """The experiments with bodies whose densities are free where parameters give them."""
+    found, experiments = {}, tuple(experiments)
+    for body in {id(e.body): e.body for e in experiments}.values():
+        found[id(body)] = body.with_free_densities(body.weighed_by(parameters.names))
+    return tuple(
+        e if found[id(e.body)] is e.body else replace(e, body=found[id(e.body)])
+        for e in experiments
+    )

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from ..experiment import (
     Nuisance,
     PointMass,
     PoseSequence,
+    Pressure,
+    Tendon,
     Wrench,
     align,
     displaced_axes,
@@ -29,8 +31,11 @@ from ..experiment import (
     read_displacement,
     read_forces,
     read_poses,
+    read_pressure,
+    read_tension,
     read_wrench,
 )
+from ..experiment.loads import Change
 from ..experiment.wrench_files import within
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
@@ -46,11 +51,16 @@ from .recording_schema import (
     MassSection,
     NodesSection,
     NuisanceSection,
+    PressureSection,
+    TendonSection,
     WrenchSection,
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
+A = TypeVar("A", Tendon, Pressure)
 Build = Callable[[Markers], Experiment]
+
+TIMES = get_args(Change)
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
@@ -62,6 +72,7 @@ NUISANCES = {
     "time_shift": {"time_shift_s": "prior_s"},
     "gravity": {"gravity_rad": "prior_rad"},
     "hand_eye": {"hand_eye_m": "prior_m", "hand_eye_rad": "prior_rad"},
+    "joining": {"joining_s": "prior_s"},
     "pose": {"pose_shift_m": "prior_m", "pose_turn_rad": "prior_rad"},
     "displacement_zero": {"displacement_zero_m": "prior_m"},
     "camera_offsets": {"camera_offset_m": "prior_m"},
@@ -69,6 +80,10 @@ NUISANCES = {
     "sensor_time": {"sensor_time_s": "prior_s"},
     "sensor_lag": {"sensor_lag_s": "prior_s"},
     "tool": {"tool_kg": "prior_kg", "tool_m": "prior_m"},
+    "tension_factor": {"tension_factor": "prior"},
+    "tension_lost": {"tension_lost_n": "prior_n"},
+    "pressure_factor": {"pressure_factor": "prior"},
+    "pressure_lost": {"pressure_lost_pa": "prior_pa"},
 }
 
 
@@ -142,6 +157,8 @@ class RecordingReader:
         )
         masses = tuple(self._mass(k, mass) for k, mass in enumerate(section.mass))
         forces = tuple(self._force(k, force) for k, force in enumerate(section.force))
+        tendons = tuple(self._tendon(k, tendon) for k, tendon in enumerate(section.tendon))
+        pressures = tuple(self._pressure(k, given) for k, given in enumerate(section.pressure))
 
         def build(markers: Markers) -> Experiment:
             return Experiment(
@@ -158,6 +175,8 @@ class RecordingReader:
                 validation=section.validation,
                 masses=masses,
                 forces=forces,
+                tendons=tendons,
+                pressures=pressures,
                 nuisance=_nuisance(section.nuisance),
             )
 
@@ -265,16 +284,41 @@ class RecordingReader:
 
     def _mass(self, k: int, mass: MassSection) -> PointMass:
         nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")
-        given = mass.model_dump(include={"mass_kg", "from_s"}, exclude_none=True)
+        given = mass.model_dump(include={"mass_kg", *TIMES}, exclude_none=True)
         return PointMass(nodes, **given, selection=selection(mass.nodes))
 
     def _force(self, k: int, force: ForceSection) -> Force:
         nodes, chosen = self._nodes(force.nodes, f"force.{k}.nodes"), selection(force.nodes)
+        times = force.model_dump(include={*TIMES}, exclude_none=True)
         if force.force_n is not None:
-            return Force(nodes, np.array(force.force_n), selection=chosen)
+            return Force(nodes, np.array(force.force_n), selection=chosen, **times)
         assert force.file is not None  # by the schema
         t_s, force_n = read_forces(existing_file(self.folder, force.file, f"force.{k}.file"))
-        return Force(nodes, force_n, t_s, chosen)
+        return Force(nodes, force_n, t_s, chosen, **times)
+
+    def _tendon(self, k: int, tendon: TendonSection) -> Tendon:
+        t_s, tension_n = None, tendon.tension_n
+        if tendon.tension is not None:
+            file = existing_file(self.folder, tendon.tension, f"tendon.{k}.tension")
+            t_s, tension_n = read_tension(file)
+        assert tension_n is not None  # by the schema
+        name = tendon.name or f"tendon_{k + 1}"
+        return self._on_body(f"tendon.{k}", lambda: Tendon(tendon.points_m, tension_n, t_s, name))
+
+    def _pressure(self, k: int, given: PressureSection) -> Pressure:
+        t_s, pressure_pa = None, given.pressure_pa
+        if given.pressure is not None:
+            file = existing_file(self.folder, given.pressure, f"pressure.{k}.pressure")
+            t_s, pressure_pa = read_pressure(file)
+        assert pressure_pa is not None  # by the schema
+        faces, name = selection(given.faces), given.name or f"pressure_{k + 1}"
+        return self._on_body(f"pressure.{k}", lambda: Pressure(faces, pressure_pa, t_s, name))
+
+    def _on_body(self, key: str, make: Callable[[], A]) -> A:
+        try:
+            return make().on(self.body)
+        except InputError as error:
+            raise error.located(None, key) from error
 
     def _nodes(self, nodes: NodesSection | str, key: str) -> NDArray[np.int64]:
         try:

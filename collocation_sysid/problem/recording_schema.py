@@ -300,7 +300,12 @@ class MassSection(Section):
 
     nodes: Nodes = Field(description="Nodes that carry it in equal parts, selected as in a grasp.")
     mass_kg: Positive
-    from_s: Finite | None = Field(None, description="When it joins the body; always by default.")
+    from_s: Finite | None = Field(
+        None,
+        description="When it joins the body, as well as nuisance.joining knows; always there by "
+        "default.",
+    )
+    until_s: Finite | None = Field(None, description="When it leaves the body, likewise.")
 
 
 class ForceSection(Section):
@@ -311,10 +316,55 @@ class ForceSection(Section):
     )
     force_n: Vector | None = Field(None, description="Constant force [x, y, z].")
     file: Text | None = Field(None, description="CSV with the columns t_s, fx_n, fy_n, fz_n.")
+    from_s: Finite | None = Field(
+        None,
+        description="When it begins to act, as well as nuisance.joining knows; always by default.",
+    )
+    until_s: Finite | None = Field(None, description="When it ends, likewise.")
 
     @model_validator(mode="after")
     def _one(self) -> ForceSection:
         require_one(self, "force_n", "file")
+        return self
+
+
+class TendonSection(Section):
+    """A thread through points of the body, straight between them, that pulls itself shorter."""
+
+    name: Text | None = Field(None, description="Name; tendon_1, tendon_2 and so on by default.")
+    points_m: list[Vector] = Field(
+        description="List of points [x, y, z] on the undeformed body, from base to end.",
+        min_length=2,
+    )
+    tension: Text | None = Field(
+        None, description="CSV with the columns t_s and tension_n, over all of the recording."
+    )
+    tension_n: NotNegative | None = Field(None, description="Constant tension.")
+
+    @model_validator(mode="after")
+    def _one(self) -> TendonSection:
+        require_one(self, "tension", "tension_n")
+        return self
+
+
+class PressureSection(Section):
+    """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall."""
+
+    name: Text | None = Field(
+        None, description="Name; pressure_1, pressure_2 and so on by default."
+    )
+    faces: Nodes = Field(
+        description="Faces with all their corners in box_m, ball_m or indices; or the name of a "
+        "physical group or cell array of triangles, or of a point array."
+    )
+    pressure: Text | None = Field(
+        None, description="CSV with the columns t_s and pressure_pa, over all of the recording."
+    )
+    pressure_pa: Finite | None = Field(None, description="Constant pressure; negative sucks.")
+
+    @model_validator(mode="after")
+    def _one(self) -> PressureSection:
+        require_one(self, "pressure", "pressure_pa")
         return self
 
 
@@ -349,6 +399,24 @@ class ToolPrior(Section):
     prior_m: Positive = Field(
         0.05, description="Standard deviation of each coordinate of its centre [m]."
     )
+
+
+class SharePrior(Section):
+    """How well a factor near one is known."""
+
+    prior: Positive = Field(description="Standard deviation, such as 0.05.")
+
+
+class TensionPrior(Section):
+    """How well it is known what friction takes of a tension."""
+
+    prior_n: Positive = Field(description="Standard deviation [N].")
+
+
+class PressurePrior(Section):
+    """How well the zero of a pressure is known."""
+
+    prior_pa: Positive = Field(description="Standard deviation [Pa].")
 
 
 class PosePrior(Section):
@@ -394,12 +462,24 @@ OffOrTool = Annotated[
     Annotated[Literal["none"], Tag("<none>")] | Annotated[ToolPrior, Tag("<table>")],
     Discriminator(_nuisance_form),
 ]
+OffOrShare = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[SharePrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+OffOrTension = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[TensionPrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
+OffOrPressure = Annotated[
+    Annotated[Literal["none"], Tag("<none>")] | Annotated[PressurePrior, Tag("<table>")],
+    Discriminator(_nuisance_form),
+]
 
 
 class NuisanceSection(Section):
     """What is estimated of this recording alone, each with a prior around zero.
 
-    The first four are estimated unless they are "none", and where a wrench is measured tare and
+    The first five are estimated unless they are "none", and where a wrench is measured tare and
     sensor_time.
     """
 
@@ -420,6 +500,11 @@ class NuisanceSection(Section):
         None,
         description="A constant motion of the body in its grasps: prior_rad, prior_m; 0.5 degrees "
         "and 1 mm by default.",
+    )
+    joining: OffOrTime | None = Field(
+        None,
+        description="How much later than stated each point mass or force joins or leaves, where it "
+        "does so within the recording: prior_s, 10 ms by default.",
     )
     pose: OffOrPose | None = Field(
         None,
@@ -451,6 +536,18 @@ class NuisanceSection(Section):
         None,
         description="A mass between sensor and body, and its centre about point_m: prior_kg, "
         "prior_m.",
+    )
+    tension_factor: OffOrShare | None = Field(
+        None, description="A factor on the tension of each tendon, about one: prior."
+    )
+    tension_lost: OffOrTension | None = Field(
+        None, description="Tension of each tendon that friction takes: prior_n."
+    )
+    pressure_factor: OffOrShare | None = Field(
+        None, description="A factor on each pressure, about one: prior."
+    )
+    pressure_lost: OffOrPressure | None = Field(
+        None, description="An offset that each pressure lacks: prior_pa."
     )
 
 
@@ -511,6 +608,13 @@ class ExperimentSection(Section):
     )
     force: list[ForceSection] = Field(
         default_factory=list, description="[[experiment.force]] tables: forces besides gravity."
+    )
+    tendon: list[TendonSection] = Field(
+        default_factory=list, description="[[experiment.tendon]] tables: tendons in the body."
+    )
+    pressure: list[PressureSection] = Field(
+        default_factory=list,
+        description="[[experiment.pressure]] tables: pressures in cavities or on held patches.",
     )
     nuisance: NuisanceOrNone = Field(
         default_factory=lambda: NuisanceSection.model_construct(),

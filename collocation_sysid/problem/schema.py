@@ -75,8 +75,13 @@ class ObjectSection(Section):
     surface: Text | None = Field(None, description="Closed surface to fill with tetrahedra.")
     edge_length_m: Positive | None = Field(None, description="Wanted edge length of a surface.")
     length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
-    mass_kg: Positive | None = Field(None, description="Weighed mass of the whole object.")
-    density_kg_m3: Positive | None = Field(None, description="Uniform density instead of a mass.")
+    mass_kg: Positive | None = Field(
+        None,
+        description="Weighed mass of the whole object; or a parameter, then it may be left out.",
+    )
+    density_kg_m3: Positive | None = Field(
+        None, description="Uniform density instead of a mass; likewise."
+    )
     material: Material = Field(
         "neo-hookean", description="A material's name, or a table of file and function."
     )
@@ -100,7 +105,8 @@ class ObjectSection(Section):
         require_one(self, "mesh", "surface")
         if (self.surface is None) != (self.edge_length_m is None):
             raise ValueError("edge_length_m belongs to surface; expected both or neither")
-        require_one(self, "mass_kg", "density_kg_m3")
+        if len(given_keys(self, "mass_kg", "density_kg_m3")) > 1:
+            require_one(self, "mass_kg", "density_kg_m3")
         regions = [region.name for region in self.region]
         for branch in self.prony:
             if branch.region is not None and branch.region not in regions:

@@ -32,6 +32,7 @@ element = "tet4"               # or tet10 if it bends or is slender; tet10-p0, p
 [parameters]                   # {{}} is estimated, a number alone is fixed
 young_pa    = {{}}               # no guess is needed; {{ guess = 1e4, lower = 1e2, upper = 1e6 }}
 poisson     = {{ lower = 0.05, upper = 0.45 }}
+# density_kg_m3 = {{ guess = 100.0 }}   # with a known force or mass on the body
 # lambda_pa and mu_pa, or kappa_pa and mu_pa, may stand in place of young_pa and poisson
 gamma_r_s   = {{}}
 gamma_m_1_s = {{}}
@@ -70,6 +71,7 @@ sigma_m = 0.001                # standard deviation of a coordinate
 # marker_offsets = {{ prior_m = 0.001 }}      # of reference_m without a reference_sigma_m
 # time_shift = {{ prior_s = 0.005 }}          # markers against poses; "none" if one clock has both
 # gravity = {{ prior_rad = 0.01745 }}         # tilt of its direction
+# joining = {{ prior_s = 0.01 }}              # when loads with from_s or until_s join or leave
 # hand_eye = {{ prior_rad = 0.0087, prior_m = 0.001 }}   # the body in its grasp
 # pose = {{ prior_rad = 0.02, prior_m = 0.002 }}         # cameras off; "none" by default
 # camera_offsets = {{ prior_m = 0.001 }}      # of each marker; "none" by default
@@ -82,6 +84,14 @@ sigma_m = 0.001                # standard deviation of a coordinate
 # [[experiment.force]]         # a force besides gravity
 # nodes = {{ indices = [12, 13] }}
 # force_n = [0.0, 0.0, 0.5]    # or file = "force.csv": t_s,fx_n,fy_n,fz_n
+
+# [[experiment.tendon]]        # a tendon through points of the undeformed body, base to end
+# points_m = [[0.0, 0.01, 0.2], [0.0, 0.01, 0.1], [0.0, 0.01, 0.0]]
+# tension = "tension.csv"      # t_s,tension_n; or tension_n = 3.1
+
+# [[experiment.pressure]]      # a pressure in a cavity
+# faces = {{ name = "cavity" }}  # a group of triangles, or {{ ball_m = [[0, 0, 0.1], 0.03] }}
+# pressure = "pressure.csv"    # t_s,pressure_pa; or pressure_pa = 5e3
 
 [transcription]
 scheme = "midpoint"            # or "bdf2", "backward-euler"

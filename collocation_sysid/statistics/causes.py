@@ -2,14 +2,14 @@
 
 Doubts about the description (`statistics.description`) come for little. The others are changes of
 one experiment, the one that fits worst: it is fitted again without each mistake, and the factor by
-which its misfit falls is the cause's strength.
+which its misfit falls is the cause's strength. Of gravity's directions the body's modes choose the
+one that is tried.
 """
 
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from ..methods.solution import Solution, Status
 from ..nlp.any_stiffness import Described
 from ..nlp.collocation import Collocation
 from .cause import Cause, ranked
-from .description import doubts
+from .description import Comparison, doubts
 from .mistakes import gravity_mistakes
 from .wrench_causes import wrench_causes
 
@@ -39,7 +39,8 @@ BETTER = 1.5
 # A marker slips if two means, before and after, explain its residuals so much better than one.
 SLIP = 2.0
 MOST_SAMPLES, MOST_SWEEPS, CLOCK_REFITS = 100, 40, 4
-BUDGET_S = 60.0
+# Sweeps of all refits together, and the last step of a parameter's logarithm in each.
+BUDGET, TOLERANCE = 150, 1e-2
 SAME_LAG_S = 5e-4
 # Samples before and after a slip at least.
 SHORTEST = 4
@@ -52,14 +53,14 @@ class _Trial:
     experiment: Experiment
 
 
-def likely_causes(found: Run | Solution, budget_s: float = BUDGET_S) -> tuple[Cause, ...]:
+def likely_causes(found: Run | Solution, budget: int = BUDGET) -> tuple[Cause, ...]:
     """What is likely described wrongly, likeliest first; empty where the residuals are noise.
 
     Parameters
     ----------
     found : Run or Solution
-    budget_s : float
-        No further refit is begun after this time.
+    budget : int
+        Sweeps over the recording's first samples that all refits together may take.
 
     Returns
     -------
@@ -76,22 +77,19 @@ def likely_causes(found: Run | Solution, budget_s: float = BUDGET_S) -> tuple[Ca
         if max(misfits) <= NOISE:
             return ranked(causes)
         causes += doubts(worst, solution.parameters)
-        causes += _refitted(solution.collocation, worst, time.monotonic() + budget_s)
+        causes += _refitted(_Alone(solution.collocation, budget), worst, solution.parameters)
     return ranked(causes)
 
 
-def _refitted(collocation: Collocation, experiment: Experiment, until: float) -> list[Cause]:
+def _refitted(alone: _Alone, experiment: Experiment, constants: Mapping[str, float]) -> list[Cause]:
     """Causes without which the experiment fits far better."""
-    alone = _Alone(collocation)
     given = _first_samples(experiment)
     base = alone.fit(given)
     if base is None:
         return []
     misfit = _misfit(given, base)
-    found = [] if given.static else [_best_lag(alone, given, base, until)]
-    for trial in (*_slip(given, base), *_trials(given)):
-        if time.monotonic() > until:
-            break
+    found = [] if given.static else [_best_lag(alone, given, base)]
+    for trial in (*_slip(given, base), *_trials(given, constants)):
         if (read := alone.fit(trial.experiment)) is not None:
             found.append((trial, _misfit(trial.experiment, read)))
     causes = []
@@ -103,11 +101,14 @@ def _refitted(collocation: Collocation, experiment: Experiment, until: float) ->
     return causes
 
 
-def _trials(given: Experiment) -> Iterator[_Trial]:
-    described = Described.of(given)
-    for mistake in gravity_mistakes(described) if described is not None else ():
-        turned = replace(given, gravity_m_s2=mistake.without.gravity_m_s2)
-        yield _Trial(mistake.cause, mistake.said, turned)
+def _trials(given: Experiment, constants: Mapping[str, float]) -> Iterator[_Trial]:
+    comparison = Comparison.of(given, constants)
+    if comparison is not None:
+        others = gravity_mistakes(comparison.given)
+        nearest = min(others, key=lambda m: comparison.misfit_m(m.without), default=None)
+        if nearest is not None:
+            turned = replace(given, gravity_m_s2=nearest.without.gravity_m_s2)
+            yield _Trial(nearest.cause, nearest.said, turned)
     for deeper, said in ((True, "deeper"), (False, "less deep")):
         layered = _one_layer(given, deeper)
         if layered is not None:
@@ -155,32 +156,36 @@ def _step(residual: Array) -> tuple[float, int]:
 
 
 class _Alone:
-    """Fits of one experiment at a time, from the problem's guess."""
+    """Fits of one experiment at a time, from the problem's guess, as long as sweeps are left."""
 
-    def __init__(self, collocation: Collocation) -> None:
+    def __init__(self, collocation: Collocation, sweeps: int) -> None:
         self.collocation = collocation
-        self.method = ReducedSpace(max_iterations=MOST_SWEEPS, tolerance=1e-3)
+        self.sweeps = sweeps
 
     def fit(self, experiment: Experiment) -> Array | None:
         """Fitted markers (T, M, 3); None where there is no fit."""
+        if self.sweeps <= 0:
+            return None
+        method = ReducedSpace(max_iterations=min(MOST_SWEEPS, self.sweeps), tolerance=TOLERANCE)
         try:
-            found = self.method(replace(self.collocation, experiments=(experiment,)))
+            found = method(replace(self.collocation, experiments=(experiment,)))
         except (InputError, SimulationError):
             return None
+        self.sweeps -= found.iterations
         if found.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         ended = found.status.converged or found.status is Status.ITERATION_LIMIT
         return found.readings_m[0] if ended else None
 
 
-def _best_lag(alone: _Alone, given: Experiment, read: Array, until: float) -> tuple[_Trial, float]:
+def _best_lag(alone: _Alone, given: Experiment, read: Array) -> tuple[_Trial, float]:
     """The lag by which residuals and velocities agree, refitted a few times, and what it leaves."""
     misfit, lag_s = _misfit(given, read), 0.0
     best, least, shifted = 0.0, misfit, given
     for _ in range(CLOCK_REFITS):
         more_s = _lag_s(shifted, read)
         lag_s += more_s
-        if abs(more_s) < SAME_LAG_S or time.monotonic() > until:
+        if abs(more_s) < SAME_LAG_S:
             break
         later = with_lag(given, lag_s)
         fitted = None if later is None else alone.fit(later)

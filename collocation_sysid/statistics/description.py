@@ -58,16 +58,12 @@ def doubts(experiment: Experiment, constants: Mapping[str, float]) -> tuple[Caus
     """
     if experiment.static or not experiment.markers.names:
         return ()
-    given = Described.of(experiment)
-    if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
+    comparison = Comparison.of(experiment, constants)
+    if comparison is None:
         return steps(experiment)
-    try:
-        comparison = Comparison(experiment, Sway.of(experiment, constants))
-    except (SimulationError, np.linalg.LinAlgError, ArpackError):  # no modes, nothing to tell
-        return steps(experiment)
-    base = comparison.misfit_m(given)
+    base = comparison.misfit_m(comparison.given)
     found = []
-    for doubt in comparison.doubts(given):
+    for doubt in comparison.doubts():
         strength = base / doubt.misfit_m / doubt.handicap
         if strength > FAR_BETTER:
             sentence = f"'{experiment.name}': {doubt.said} ({strength:.2g} times nearer)"
@@ -78,11 +74,26 @@ def doubts(experiment: Experiment, constants: Mapping[str, float]) -> tuple[Caus
 class Comparison:
     """Descriptions of one experiment against its tracks."""
 
-    def __init__(self, experiment: Experiment, sway: Sway) -> None:
+    def __init__(self, experiment: Experiment, given: Described, sway: Sway) -> None:
+        self.given = given
         self.names = experiment.markers.names
         self.sway = sway
         sigma_m = float(np.median(experiment.markers.sigma_m))
         self.floor_m = float(np.hypot(np.sqrt(3) * sigma_m, ROUGHLY * sway.size_m))
+
+    @classmethod
+    def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Comparison | None:
+        """That of an experiment, see `doubts`; None where the body has no modes to tell by.
+
+        Nor where tendons or pressures drive it, which is beyond a sway under gravity.
+        """
+        given = None if experiment.actuators else Described.of(experiment)
+        if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
+            return None
+        try:
+            return cls(experiment, given, Sway.of(experiment, constants))
+        except (SimulationError, np.linalg.LinAlgError, ArpackError):
+            return None
 
     def misfit_m(self, described: Described) -> float:
         """Misfit of the stiffness that suits best."""
@@ -93,8 +104,9 @@ class Comparison:
         predicted = self.sway.predicted(described)
         return predicted[int(self._misfits_m(described, predicted).argmin())]
 
-    def doubts(self, given: Described) -> Iterator[Doubt]:
+    def doubts(self) -> Iterator[Doubt]:
         """All that is tried in place of what is given."""
+        given = self.given
         for mistake in mistakes(given):
             yield Doubt(mistake.cause, mistake.said, self.misfit_m(mistake.without))
         yield from self._other_frames(given)

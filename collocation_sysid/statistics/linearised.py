@@ -196,7 +196,16 @@ def _of_markers(part: Part, response: Response) -> FitBlock:
         part.x, part.phi, response.markers, segment.moving, segment.nq
     )
     name, present = segment.experiment.name, segment.observation.present
-    return FitBlock(name, markers.t_s, markers.names, present, residual, slope, markers.sigma_m)
+    return FitBlock(
+        name,
+        markers.t_s,
+        markers.names,
+        present,
+        residual,
+        slope,
+        markers.sigma_m,
+        static=segment.experiment.static,
+    )
 
 
 def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
@@ -204,7 +213,7 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
     sensors, found = part.segment.sensors, []
     if not sensors:
         return found
-    forced = part.sensing.along(part.x, response.held, response.moved)
+    forced = part.sensing.along(part.x, response.held, response.moved, first=0)
     linear = part.sensing.linearised(forced, part.segment.moving)
     for k, (sensor, (residual, slope)) in enumerate(zip(sensors, linear, strict=True)):
         which = "" if len(sensors) == 1 else f" {k + 1}"
@@ -214,10 +223,11 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
                 part.segment.experiment.name,
                 sensor.wrench.t_s,
                 (f"force{which}", f"torque{which}"),
-                seen.any(axis=2),
+                np.asarray(seen.any(axis=2)),
                 residual,
                 slope,
                 sensor.wrench.sigmas[[0, 3]],
+                static=part.segment.experiment.static,
                 components=seen,
                 of_sensor=True,
             )

@@ -28,7 +28,7 @@ def motionless(experiment: Experiment) -> bool:
     moved_m = np.ptp(positions_m[:, lasting], axis=0)
     if moved_m.size and moved_m.max() > HELD * sigma_m:
         return False
-    if np.ptp(experiment.node_mass_kg(t_s), axis=0).any():
+    if np.ptp(experiment.tied_mass_kg(t_s), axis=0).any():
         return False
     if np.ptp(experiment.node_forces_n(t_s), axis=0).any():
         return False

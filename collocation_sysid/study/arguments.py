@@ -104,9 +104,13 @@ def _positive(name: str, value: Any, source: Path | None) -> float:
         number = np.nan
     if not 0 < number < np.inf:
         raise InputError(
-            f"found {name} = {short(value)}; expected a positive number", source, "--truth"
+            f"found {name} = {_quoted(value)}; expected a positive number", source, "--truth"
         )
     return number
+
+
+def _quoted(value: Any) -> str:
+    return value[:60] if isinstance(value, str) else short(value)
 
 
 # Swept keys ---------------------------------------------------------------------------------------

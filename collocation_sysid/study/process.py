@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from .store import CRASHED, STOPPED, TIMEOUT, Record
+from .store import CRASHED, ERROR, STOPPED, TIMEOUT, Record
 
 COMMAND = (sys.executable, "-m", "collocation_sysid.study.worker")
 # Runs side by side must not fight for cores, and compared times must mean the same.
@@ -30,6 +30,8 @@ ONE_THREAD = {
     )
 }
 LOOK_EVERY_S = 0.2
+# What a run that is late has to write the best answer that it found.
+GRACE_S = 10.0
 
 
 def execute(
@@ -45,7 +47,8 @@ def execute(
     planned : dict
         A `PlannedRun` as a dict.
     time_limit_s : float, optional
-        The process is killed after this, loading included.
+        The process is asked to end after this, loading included, and killed if it does not; the
+        record has the best answer that it found, where there is one.
     retries : int
         Further tries when the process dies.
     stopped : callable
@@ -81,12 +84,16 @@ def _attempt(
             finally:
                 process.kill()
                 process.wait()
-            if verdict is not None:
+            if verdict is not None and verdict["outcome"] != TIMEOUT:
                 return verdict
             try:
-                return json.loads(file.read_text(encoding="utf-8"))
+                record = json.loads(file.read_text(encoding="utf-8"))
             except (OSError, ValueError):
-                return {"outcome": CRASHED, "message": _last_words(process.returncode, said)}
+                return verdict or {
+                    "outcome": CRASHED,
+                    "message": _last_words(process.returncode, said),
+                }
+            return record if verdict is None or record["outcome"] == ERROR else record | verdict
 
 
 def _watch(
@@ -105,7 +112,10 @@ def _watch(
         while True:
             left = LOOK_EVERY_S if deadline is None else deadline - time.monotonic()
             if left <= 0:
-                message = f"killed after the time limit of {time_limit_s:g} s"
+                process.terminate()  # as Ctrl-C: it may write what it has
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(GRACE_S)
+                message = f"ended after the time limit of {time_limit_s:g} s"
                 return {"outcome": TIMEOUT, "message": message}
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(min(left, LOOK_EVERY_S))

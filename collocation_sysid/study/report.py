@@ -269,7 +269,7 @@ def run_view(rows: Sequence[Row]) -> View:
     names = {"start": _text("start"), "method": _text("method")}
     cells: dict[str, Cell] = {
         "ended": _text("status"),
-        "success": lambda row: "yes" if row["success"] else "no",
+        "succeeded": lambda row: "yes" if row["success"] else "no",
     }
     for name in (column for column in rows[0] if column.startswith("error_")):
         cells[f"Δ{symbol_of(name.removeprefix('error_'))} %"] = _number(name, 100)

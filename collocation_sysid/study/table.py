@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from .plan import PlannedRun
-from .store import Record
+from .store import TIMEOUT, Record
 
 Row = dict[str, Any]
 
@@ -88,7 +88,8 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
     result = record.get("result") or {}
     timing, rollout = result.get("timing_s") or {}, result.get("rollout") or {}
     dynamics, history = result.get("dynamics") or {}, result.get("history") or []
-    converged = bool(result.get("converged"))
+    late = record["outcome"] == TIMEOUT
+    converged = bool(result.get("converged")) and not late
     parameters = _parameters(run, result, yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
     near = all(error is not None and error <= yardstick.within for error in errors)
@@ -97,7 +98,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
         "method": run.method,
         "start": run.start,
         **run.swept,
-        "status": result.get("status", record["outcome"]),
+        "status": record["outcome"] if late else result.get("status", record["outcome"]),
         "converged": converged,
         "success": converged and near,
         **parameters,

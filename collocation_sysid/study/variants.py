@@ -76,6 +76,7 @@ def variants(
     materials: Sequence[str],
     branches: Sequence[int],
     times_s: tuple[float, float],
+    region: str | None = None,
 ) -> list[Variant]:
     """Every material with every number of branches.
 
@@ -87,21 +88,18 @@ def variants(
     branches : sequence of numbers of Prony branches; as in the file if there is none
     times_s : (shortest, longest)
         Time constants of branches start between them.
+    region : str, optional
+        Whose material and branches they are; by default every part of the body has them.
 
     Raises
     ------
     InputError
-        For less than two models, and for materials of a body with regions.
+        For less than two models, an unknown region, and branches that belong to others.
     """
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True)
     body = content["object"]
-    if materials and body.get("region"):
-        raise InputError(
-            "found regions in the object; expected a body of one material to compare others",
-            path,
-            "object.region",
-        )
+    _refuse_region(body, region, bool(branches), path)
     found = []
     for material in materials or (None,):
         for count in branches or (None,):
@@ -109,18 +107,21 @@ def variants(
             parameters = content["parameters"]
             if material is not None:
                 label.append(material)
-                changes["object.material"] = material
-                parameters = _of_material(parameters, material)
+                changes |= _with_material(body, material, region)
+                parameters = _of_material(parameters, material, region)
             if count is not None:
                 label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
-                tables = _branches(body.get("prony", []), count)
+                given = [t for t in body.get("prony", []) if t.get("region") == region]
+                others = [t for t in body.get("prony", []) if t.get("region") != region]
+                tables = _branches(given, count, {t["name"] for t in others}, region)
                 if tables or body.get("prony"):
-                    changes["object.prony"] = tables
-                old = [each["name"] for each in body.get("prony", [])]
+                    changes["object.prony"] = [*others, *tables]
+                old = [each["name"] for each in given]
                 parameters = _with_memory(parameters, old, tables, times_s)
             changes["parameters"] = parameters
             settings = tuple(f"{key}={toml(value)}" for key, value in changes.items())
-            found.append(Variant(", ".join(label), (*overrides, *settings)))
+            said = f"{region}: " * (region is not None) + ", ".join(label)
+            found.append(Variant(said, (*overrides, *settings)))
     if len(found) < 2:
         raise InputError(
             f"found the model {found[0].label} alone; expected two or more to compare, such as "
@@ -131,23 +132,76 @@ def variants(
     return found
 
 
-def _of_material(parameters: Mapping[str, Any], material: str) -> dict[str, Any]:
-    """The parameters of a body that is of this material instead."""
-    own = [constant.name for constant in MATERIALS[material].constants]
+def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, path: Path) -> None:
+    names = [each["name"] for each in body.get("region", [])]
+    if region is not None and region not in names:
+        known = (
+            f"expected one of {', '.join(names)}" if names else "expected none: it has no regions"
+        )
+        raise InputError(f"found {region!r}; {known}{hint_at(region, names)}", path, "--region")
+    owners = {each.get("region") for each in body.get("prony", [])}
+    if branches and owners - {region}:
+        owner = next(iter(owners - {region}))
+        whose = "all parts without their own" if owner is None else f"region '{owner}'"
+        expected = "none with --region" if owner is None else f"--region {owner}"
+        raise InputError(f"found branches of {whose}; expected {expected}", path, "object.prony")
+
+
+def _with_material(body: Mapping[str, Any], material: str, region: str | None) -> dict[str, Any]:
+    """The object's keys with a material for a region, or for all parts."""
+    regions = [dict(each) for each in body.get("region", [])]
+    for each in regions:
+        if region is None:
+            each.pop("material", None)
+        elif each["name"] == region:
+            each["material"] = material
+    changes: dict[str, Any] = {"object.region": regions} if regions else {}
+    return changes if region is not None else changes | {"object.material": material}
+
+
+def _of_material(
+    parameters: Mapping[str, Any], material: str, region: str | None
+) -> dict[str, Any]:
+    """The parameters of a body whose parts, or one of whose regions, are of this material instead.
+
+    A part that has constants of a material for itself goes on having them for itself; the others
+    share theirs.
+    """
     of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {*ELASTIC}
-    elastic = [name for name in parameters if name in elastic_names(MATERIALS[material])]
-    kept = {n: v for n, v in parameters.items() if n not in of_any or n in (*own, *elastic)}
-    if "mu_pa" in own and "mu_pa" not in elastic and "young_pa" not in elastic:
-        kept["mu_pa"] = {}
-    return kept | {name: {} for name in own if name not in ELASTIC and name not in kept}
+    fronts = {name[: -len(bare(name))] for name in parameters if bare(name) in of_any}
+    if region is not None:
+        fronts = {f"{region}."}
+    found = dict(parameters)
+    for front in sorted(fronts):  # what is shared is first
+        found = _of_part(found, front, material, of_any)
+    return found
 
 
-def _branches(given: Sequence[Mapping[str, Any]], count: int) -> list[dict[str, Any]]:
-    """The first branches of the file, and others up to a number."""
+def _of_part(
+    parameters: Mapping[str, Any], front: str, material: str, of_any: set[str]
+) -> dict[str, Any]:
+    """The same of the part whose constants have something in front of their names."""
+    own = [constant.name for constant in MATERIALS[material].constants]
+    possible = {*own, *elastic_names(MATERIALS[material])}
+    mine = {front + name for name in of_any}
+    kept = {n: v for n, v in parameters.items() if n not in mine or bare(n) in possible}
+    alone = any(name in mine for name in parameters)
+    elastic = {bare(name) for name in kept if name in (mine if alone else of_any)}
+    if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
+        kept[f"{front}mu_pa"] = {}
+    needed = [front + name for name in own if name not in ELASTIC]
+    return kept | {name: {} for name in needed if name not in kept}
+
+
+def _branches(
+    given: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
+) -> list[dict[str, Any]]:
+    """The first branches of the file, and more up to a number."""
     tables = [dict(each) for each in given[:count]]
-    names = (f"prony_{k}" for k in range(1, 2 * count + 1))
-    taken = {each["name"] for each in tables}
-    new = [{"name": name} for name in names if name not in taken]
+    taken = {each["name"] for each in tables} | others
+    names = (f"prony_{k}" for k in range(1, count + len(taken) + 1))
+    owner = {} if region is None else {"region": region}
+    new = [{"name": name, **owner} for name in names if name not in taken]
     return [*tables, *new[: count - len(tables)]]
 
 

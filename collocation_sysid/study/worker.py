@@ -22,12 +22,14 @@ from ..output.record import as_json, result
 from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run, run
+from ..starting import heed_interrupts
 from .prediction import model_record
 from .store import ERROR, FINISHED, write_whole
 
 
 def main() -> None:
     """Entry point."""
+    heed_interrupts()
     planned = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     write_whole(Path(sys.argv[1]), as_json(attempt(planned)))

@@ -76,6 +76,7 @@ def _of_body(replay: Replay) -> dict[str, Figure]:
             replay.part_names,
             replay.given_places_m,
             replay.surface_nodes,
+            replay.tendons_m,
         ),
         "elements": elements_picture(replay.undeformed_m, replay.tetrahedra),
     }

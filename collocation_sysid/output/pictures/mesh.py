@@ -34,8 +34,10 @@ TALLEST_MM = 70.0
 # A way between two places that is shorter on paper would hide below their marks.
 SEEN_MM = 0.4
 GIVEN, UNKNOWN = "place given", "no place given"
+TENDON = "tendons"
 LOOKS: dict[str, dict[str, Any]] = {
     GIVEN: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
+    TENDON: {"color": BLUE, "lw": 1.0, "marker": ".", "ms": 2.0},
     UNKNOWN: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
 }
 
@@ -51,6 +53,7 @@ def mesh_picture(
     part_names: Sequence[str] = (),
     given_m: Array | None = None,
     surface_nodes: NDArray[np.integer] | None = None,
+    tendons_m: Array | None = None,
 ) -> Figure:
     """Draw the undeformed body from the front and from behind, with its markers' names.
 
@@ -69,6 +72,8 @@ def mesh_picture(
         marker was found elsewhere, and a frame about a marker without.
     surface_nodes : (F, k), optional
         The nodes of each triangle, its corners by default.
+    tendons_m : (p, 3), optional
+        Points of the tendons, a row of NaN after each; they are drawn through the body.
     """
     given_m = places_m if given_m is None else given_m
     front = Camera.facing(nodes_m[None], up)
@@ -82,7 +87,8 @@ def mesh_picture(
     width = (room - GAP_MM) / 2 if beside else room
     height = min(width / aspect, TALLEST_MM / (1 if beside else 2))
     elsewhere = not np.array_equal(given_m, places_m)
-    head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + elsewhere)
+    marked = elsewhere or tendons_m is not None
+    head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + marked)
     total = head + FOOT_MM + (height if beside else 2 * height + GAP_MM)
     figure, axes = sheet(COLUMN_MM, total)
     corners = (
@@ -95,6 +101,9 @@ def mesh_picture(
         view = View.fitting(camera, everything, (width, height), corner)
         Drawn(axes, view, surface, parts, surface_nodes).show(nodes_m, held, places_m)
         unlike |= _draw_given(axes, view, places_m, given_m)
+        if tendons_m is not None:
+            axes.plot(*view.places(tendons_m).T, zorder=5.5, **LOOKS[TENDON])
+            unlike.add(TENDON)
         if named:
             dots = view.places(places_m[mine])
             own = [name for name, here in zip(names, mine, strict=True) if here]

@@ -23,7 +23,7 @@ def wrench_picture(sensed: Array) -> Figure:
         Time [s], and six components as measured, fitted and rolled out, NaN where there are none.
     """
     t_s, measured, fitted, rolled_out = np.split(sensed, [1, 7, 13], axis=1)
-    there = np.isfinite(measured).any(axis=0)
+    there = np.asarray(np.isfinite(measured).any(axis=0))
     rows = [k for k in range(2) if there[3 * k : 3 * k + 3].any()]
     figure = Figure(figsize=(PAGE_MM / 25.4, HEIGHT_MM * len(rows) / 25.4), layout="constrained")
     grid = figure.subplots(len(rows), 3, sharex=True, squeeze=False)

@@ -223,7 +223,8 @@ def _worst_errors(run: Path) -> list[dict[str, Any]]:
         prefix = key.removesuffix("residuals_m")
         t_s, markers = arrays[f"{prefix}t_s"], arrays[f"{prefix}marker_names"]
         shape, residuals_m = (len(t_s), len(markers), 3), arrays[key]
-        if residuals_m.shape != shape or np.nanmax(np.abs(residuals_m), initial=0.0) > LARGEST:
+        largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
+        if residuals_m.shape != shape or largest > LARGEST:
             raise ValueError(f"{key} does not go with its times and markers")
         errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
         found += _peaks(prefix.rstrip("/"), errors, t_s, markers)

@@ -1,0 +1,123 @@
+"""How often the 95 % intervals of E, ρ and ν hold the truth with a force sensor: noisy twins.
+
+A block sticks out of a hand that swings it. Its tracks and the wrench of the hand come from the
+scheme that also fits them, with white noise of 1 mm and 0.05 N. Without the sensor only the ratio
+of E and ρ is told.
+
+    nice -n 15 python scripts/study_wrench.py --twins 200
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import cache
+
+import numpy as np
+from scipy.stats import binom
+
+from collocation_sysid import (
+    Body,
+    Experiment,
+    Grasp,
+    Markers,
+    Nuisance,
+    PoseSequence,
+    Problem,
+    ReducedSpace,
+    Unknown,
+    Wrench,
+    simulate,
+    with_markers,
+)
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.simulation import with_wrenches
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_of
+
+SIZE_M, DIVISIONS = (0.2, 0.06, 0.06), (4, 1, 1)
+NOISE_M, NOISE_N, NOISE_NM = 1e-3, 0.05, 0.005
+STEPS, STEP_S = 60, 0.01
+DENSITY = "density_kg_m3"
+TRUTH = {
+    "young_pa": 6e4,
+    "poisson": 0.3,
+    "gamma_r_s": 0.004,
+    "gamma_m_1_s": 0.5,
+    DENSITY: 300.0,
+}
+COUNTED = ("young_pa", "poisson", DENSITY)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Coverage of intervals with a force sensor.")
+    parser.add_argument("--twins", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    exact, rng = recording(), np.random.default_rng(arguments.seed)
+    held: dict[str, int] = {name: 0 for name in COUNTED}
+    errors: dict[str, list[float]] = {name: [] for name in COUNTED}
+    for twin in range(1, arguments.twins + 1):
+        uncertainty = fitted(noisy(exact, rng))
+        for name in COUNTED:
+            estimate = uncertainty.estimates[name]
+            assert estimate.ci95 is not None
+            assert estimate.std_error is not None
+            held[name] += estimate.ci95[0] <= TRUTH[name] <= estimate.ci95[1]
+            errors[name].append(estimate.std_error / TRUTH[name])
+        if twin % 20 == 0 or twin == arguments.twins:
+            report(held, errors, twin)
+
+
+def report(held: dict[str, int], errors: dict[str, list[float]], twins: int) -> None:
+    """Say how often, and how wide."""
+    low, high = binom.interval(0.95, twins, 0.95)
+    print(f"{twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %")
+    for name, count in held.items():
+        error = 100 * np.median(errors[name])
+        print(f"  {name:16}{100 * count / twins:6.1f} % held, ± {error:.2g} %", flush=True)
+
+
+def fitted(experiment: Experiment):
+    """The uncertainty of a fit of all parameters, from guesses near the truth."""
+    unknown = {name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()}
+    problem = Problem([experiment], unknown)
+    solution = ReducedSpace()(problem.collocation())
+    fit = linearised_fit(solution.collocation, solution.z)
+    return uncertainty_of(fit, problem.parameters, solution.q)
+
+
+def noisy(exact: Experiment, rng: np.random.Generator) -> Experiment:
+    """The recording with noise on tracks and wrench."""
+    tracks, (grasp,) = exact.markers.positions_m, exact.grasps
+    assert grasp.wrench is not None
+    sizes = np.repeat([NOISE_N, NOISE_NM], 3)
+    wrench = grasp.wrench.values + sizes * rng.normal(size=grasp.wrench.values.shape)
+    seen = with_markers(exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape))
+    return with_wrenches(seen, [wrench])
+
+
+@cache
+def recording() -> Experiment:
+    """The block with the tracks and the wrench that the truth gives it."""
+    body = Body(box_mesh(SIZE_M, DIVISIONS), density_kg_m3=TRUTH[DENSITY])
+    t_s = np.asarray(STEP_S * np.arange(STEPS + 1), dtype=np.float64)
+    share = 1 - np.cos(2 * np.pi * t_s / 0.3)
+    half = np.outer(share, [0.15, 0.1, 0.2])
+    quaternions = np.column_stack([half, np.sqrt(1 - np.sum(half**2, axis=1))])
+    poses = PoseSequence(t_s, np.outer(share, [0.01, 0.02, 0.03]), quaternions)
+    held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
+    seen = np.flatnonzero(body.nodes_m[:, 0] > 0.09)
+    markers = Markers(t_s, np.zeros((len(t_s), len(seen), 3)), NOISE_M, None, body.nodes_m[seen])
+    sensor = Wrench(t_s, np.zeros((len(t_s), 6)), NOISE_N, NOISE_NM, frame="grasp")
+    grasp = Grasp(held, poses, sigma_m=0.0, sigma_rad=0.0, wrench=sensor)
+    nuisance = Nuisance.none(tare=10.0)
+    experiment = Experiment(body, t_s, [grasp], markers, name="block", nuisance=nuisance)
+    values = {name: value for name, value in TRUTH.items() if name in body.constants} | {
+        name: TRUTH[name] for name in ("young_pa", "poisson")
+    }
+    found = simulate(experiment, values, "midpoint")
+    return with_wrenches(with_markers(experiment, found.markers_m), found.wrenches)
+
+
+if __name__ == "__main__":
+    main()

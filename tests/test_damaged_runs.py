@@ -1,0 +1,184 @@
+"""A damaged or foreign folder of results gets one line and exit code 2, from every command."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from problem_files import run_command, settings, write_problem
+
+from collocation_sysid.earlier import Earlier
+from collocation_sysid.errors import InputError
+from collocation_sysid.output.view import frame_files
+
+Damage = Callable[[Path], object]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    write_problem(folder, {"swing": 6})
+    method = settings("solver.method=reduced-space")
+    done = run_command(
+        "solve", folder / "problem.toml", *method, "--out", folder / "run", "--quiet"
+    )
+    assert done.code == 0, done.err
+    return folder / "run"
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def whole(content: str | bytes, file: str = "result.json") -> Damage:
+    data = content.encode() if isinstance(content, str) else content
+    return lambda run: (run / file).write_bytes(data)
+
+
+def cut(file: str) -> Damage:
+    return lambda run: (run / file).write_bytes((run / file).read_bytes()[:500])
+
+
+def entry(value: Any, *keys: str) -> Damage:
+    def damage(run: Path) -> None:
+        result = json.loads((run / "result.json").read_text())
+        place = result
+        for key in keys[:-1]:
+            place = place[key]
+        place[keys[-1]] = value
+        (run / "result.json").write_text(json.dumps(result))
+
+    return damage
+
+
+def array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Damage:
+    def damage(run: Path) -> None:
+        with np.load(run / "trajectory.npz") as stored:
+            arrays = dict(stored)
+        arrays[name] = change(arrays[name])
+        np.savez(run / "trajectory.npz", **arrays)
+
+    return damage
+
+
+def gone(file: str) -> Damage:
+    return lambda run: (run / file).unlink()
+
+
+def refused(*words: object) -> str:
+    outcome = run_command(*words)
+    assert outcome.code == 2, f"{outcome.code}: {outcome.out}{outcome.err}"
+    assert len(outcome.err.strip().splitlines()) == 1
+    assert outcome.err.startswith("error: ")
+    return outcome.err
+
+
+def of_result(id: str, damage: Damage):
+    return pytest.param(damage, id=id)
+
+
+RESULTS = [
+    of_result("gone", gone("result.json")),
+    of_result("empty", whole("")),
+    of_result("cut", cut("result.json")),
+    of_result("noise", whole(bytes(range(256)))),
+    of_result("a list", whole("[1, 2]")),
+    of_result("another's", whole('{"schema": 7, "answer": 42}')),
+    of_result("deep", whole("[" * 100_000)),
+    of_result("digits", whole('{"fit": ' + "9" * 5000 + "}")),
+]
+ENTRIES = [
+    of_result("no parameters", entry(None, "parameters")),
+    of_result("fit of another kind", entry([1], "fit")),
+    of_result("text for a number", entry("x", "parameters", "mu_pa", "value")),
+    of_result("table for a number", entry({}, "rollout", "experiments", "swing")),
+]
+ARRAYS = [
+    of_result("gone", gone("trajectory.npz")),
+    of_result("cut", cut("trajectory.npz")),
+    of_result("noise", whole(b"PK\x03\x04 and then nothing", "trajectory.npz")),
+    of_result("not an archive", whole(os.urandom(300), "trajectory.npz")),
+    of_result("fewer nodes", array("undeformed_m", lambda x: x[:5])),
+    of_result("flat", array("positions_m", np.ravel)),
+    of_result("texts", array("measured_m", lambda x: x.astype(str))),
+    of_result("huge", array("markers_m", lambda x: x + 1e300)),
+    of_result("foreign nodes", array("surface", lambda x: x + 1000)),
+    of_result("standing time", array("t_s", np.zeros_like)),
+    of_result("no samples", array("held", lambda x: x[:0])),
+]
+
+
+@pytest.mark.parametrize("damage", RESULTS)
+def test_every_reader_refuses_a_damaged_result(run: Path, tmp_path: Path, damage: Damage):
+    damage(run)
+    refused("report", run)
+    refused("plot", run)
+    refused("view", run, "--html", tmp_path / "page.html")
+    refused("animate", run, "--to", tmp_path / "film.gif")
+    refused("refine", run)
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize("damage", ENTRIES)
+def test_the_page_refuses_entries_of_another_kind(run: Path, damage: Damage):
+    damage(run)
+    assert "damaged" in refused("report", run)
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize("damage", ARRAYS)
+def test_every_reader_of_arrays_refuses_damaged_ones(run: Path, tmp_path: Path, damage: Damage):
+    damage(run)
+    refused("plot", run)
+    refused("view", run, "--html", tmp_path / "page.html")
+    refused("animate", run, "--to", tmp_path / "film.gif")
+
+
+@pytest.mark.parametrize(
+    "damage", [whole("{"), entry(None, "derived"), entry(1e400, "parameters", "mu_pa", "value")]
+)
+def test_a_damaged_run_is_no_start(run: Path, damage: Damage):
+    damage(run)
+    with pytest.raises(InputError, match="damaged"):
+        Earlier.read(run)
+    assert "damaged" in refused("solve", run / "problem.toml", "--start", run)
+
+
+@pytest.mark.parametrize("command", ["report", "plot", "animate", "refine"])
+def test_a_file_is_no_run_folder(command: str, tmp_path: Path):
+    (tmp_path / "run").write_text("no folder")
+    assert "run" in refused(command, tmp_path / "run")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
+def test_a_pipe_in_a_run_folder_is_not_waited_for(run: Path):
+    (run / "mesh.png").unlink()
+    os.mkfifo(run / "mesh.png")
+    assert run_command("report", run).code == 0
+    (run / "result.json").unlink()
+    os.mkfifo(run / "result.json")
+    assert "is a pipe; expected a regular file" in refused("report", run)
+
+
+@pytest.mark.parametrize("content", ["<", "<a/>", '<a><DataSet timestep="x" file="b"/></a>'])
+def test_damaged_frames_are_refused(run: Path, content: str):
+    (run / "trajectory.pvd").write_text(content)
+    with pytest.raises(InputError, match=r"trajectory.pvd or one of its frames is damaged"):
+        frame_files(run, "swing")
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "[]", '{"runs": []}', '{"runs": [], "tables": [{"heads": ["a"], "rows": [[]]}]}'],
+)
+def test_a_damaged_study_is_refused(tmp_path: Path, content: str):
+    (tmp_path / "summary.json").write_text(content)
+    assert "summary.json is damaged" in refused("report", tmp_path)

@@ -1,0 +1,212 @@
+"""Densities as parameters: derivatives, both methods, simulations, and what fixes their scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checks import assert_derivative
+from problems_small import (
+    bar_let_go,
+    bar_loaded,
+    cube_with_nuisance,
+    hung_cube,
+    measured_with,
+    quadratic_bar,
+)
+from wrenches_small import sensing, with_wrenches
+
+from collocation_sysid.experiment import Experiment, PointMass
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.constants import is_density
+from collocation_sysid.fem.regions import Region
+from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.shooting import adjoint_gradient, simulated
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameters, Unknown
+from collocation_sysid.nlp.simulation import simulate, with_markers
+
+# In the ratio that is stated: then known masses are damped alike.
+DENSITY_KG_M3 = {"density_kg_m3": 36.0, "core.density_kg_m3": 60.0}
+TRUTH = {
+    "lambda_pa": 200.0,
+    "mu_pa": 300.0,
+    "gamma_r_s": 0.009,
+    "gamma_m_1_s": 1.0,
+    "core.gamma_m_1_s": 3.0,
+    **DENSITY_KG_M3,
+}
+GUESS = {
+    "mu_pa": 400.0,
+    "gamma_m_1_s": 0.5,
+    "density_kg_m3": 45.0,
+    "core.density_kg_m3": 35.0,
+}
+
+
+def with_core(experiment: Experiment, **changes) -> Experiment:
+    """The experiment with a body of two parts, whose densities are free."""
+    old = experiment.body
+    core = Region("core", old.mesh.volumes_m3.argsort()[::2][:6], density_kg_m3=50.0)
+    body = Body(
+        old.mesh, density_kg_m3=30.0, element=old.element.name, regions=[core], **changes
+    ).with_free_densities(["", "core"])
+    return replace(experiment, body=body)
+
+
+def weighted(experiment: Experiment) -> Experiment:
+    """The experiment with a known mass on two of its nodes."""
+    here = experiment.free_dofs[[-4, -1]] // 3
+    return replace(experiment, masses=(*experiment.masses, PointMass(here, 0.01)))
+
+
+def parameters(truth=TRUTH, guess=GUESS) -> Parameters:
+    return Parameters.of({n: Unknown(guess[n]) if n in guess else v for n, v in truth.items()})
+
+
+MADE = {
+    "hung cube": lambda: with_core(weighted(hung_cube())),
+    "rayleigh": lambda: with_core(weighted(hung_cube()), damping="rayleigh"),
+    "quadratic": lambda: with_core(weighted(quadratic_bar(6))),
+    "let go": lambda: with_core(bar_let_go()),
+    "loaded": lambda: with_core(bar_loaded(6)),
+    "nuisance": lambda: with_core(weighted(cube_with_nuisance(6))),
+}
+
+
+def test_derivatives_of_the_forces_of_a_body_by_its_densities(rng):
+    body = with_core(hung_cube()).body
+    theta = body.theta(TRUTH)
+    x = body.nodes_m.ravel() + 1e-3 * rng.standard_normal(body.pattern.size)
+    v, w = 0.1 * rng.standard_normal((2, body.pattern.size))
+    tied = np.abs(rng.standard_normal(body.pattern.size)) * 1e-3
+    at = body.linearise(x, v, theta, tied_kg=tied)
+
+    def force(values):
+        return body.force(x, v, values, tied)[0]
+
+    assert_derivative(force, lambda d: at.by_theta[0] @ d, theta, rng, scale=0.1 * theta)
+    found = body.curvature(x, v, w, theta, tied_kg=tied)
+
+    def slope(values):
+        return body.linearise(x, v, values, tied_kg=tied).by_theta[0].T @ w
+
+    assert_derivative(slope, lambda d: found.theta_theta[0] @ d, theta, rng, scale=0.1 * theta)
+
+    def by_velocity(values):
+        matrix = body.linearise(x, v, values, tied_kg=tied).by_velocity[0]
+        return body.pattern.matrix(matrix) @ w
+
+    along = found.velocity_theta[0]
+    assert_derivative(by_velocity, lambda d: along @ d, theta, rng, scale=0.1 * theta)
+
+
+@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
+def test_derivatives_of_the_program_by_densities(name, scheme, rng):
+    experiment = measured_with(MADE[name](), TRUTH)
+    collocation = Collocation([experiment], parameters(), scheme=scheme)
+    z = METHODS["reduced-space"](max_iterations=2)(collocation).z
+    scale = np.concatenate([np.full(collocation.nq, 0.1), np.full(len(z) - collocation.nq, 0.01)])
+    jacobian = collocation.jacobian(z)
+    assert_derivative(
+        collocation.constraint_values, lambda d: jacobian @ d, z, rng, tolerance=1e-7, scale=scale
+    )
+    weights = rng.standard_normal(collocation.constraints)
+    hessian = collocation.hessian(z, 1.0, weights)
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return collocation.gradient(at) + collocation.jacobian(at).T @ weights
+
+    assert_derivative(slope, lambda d: hessian @ d, z, rng, tolerance=1e-7, scale=scale)
+
+
+# The same optimum ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["hung cube", "let go"])
+def test_methods_find_densities_where_a_known_mass_sets_the_scale(name):
+    experiment = measured_with(MADE[name](), TRUTH)
+    collocation = Collocation([experiment], parameters())
+    reduced, interior, shot = (
+        METHODS[m]()(collocation) for m in ("reduced-space", "interior-point", "shooting")
+    )
+    for solution in (reduced, interior, shot):
+        assert solution.status.converged, solution.message
+        for each in GUESS:
+            assert solution.parameters[each] == pytest.approx(TRUTH[each], rel=1e-3)
+    values = [[*solution.parameters.values()] for solution in (reduced, interior)]
+    np.testing.assert_allclose(*values, rtol=1e-5)
+    assert reduced.kkt_residual < 1e-8
+
+
+# Along the equations of motion --------------------------------------------------------------
+
+REMEMBERED = TRUTH | {"prony_1.share": 0.4, "prony_1.tau_s": 0.03}
+TOLD = {name: (make, TRUTH) for name, make in MADE.items()} | {
+    "memory": (lambda: with_core(weighted(hung_cube(6)), prony=["prony_1"]), REMEMBERED)
+}
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
+    make, truth = TOLD[name]
+    collocation = Collocation([noisy_with(make(), truth)], parameters(truth))
+    p = collocation.guess_p
+    z = simulated(collocation, p)
+    adjoint = adjoint_gradient(collocation, z)
+    rows = [segment.grid_rows for segment in collocation.segments]
+    point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
+    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
+
+    def objective(at: np.ndarray) -> float:
+        return collocation.objective(simulated(collocation, at))
+
+    assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
+
+
+@pytest.mark.parametrize("make", [hung_cube, bar_loaded])
+def test_gradients_where_a_wrench_tells_the_density(make, rng):
+    cube = with_wrenches(with_core(sensing(make(8))), [0.01 * rng.standard_normal((9, 6))])
+    collocation = Collocation([noisy_with(cube, TRUTH)], parameters())
+    p = collocation.guess_p
+    z = simulated(collocation, p)
+    adjoint = adjoint_gradient(collocation, z)
+    point = Horizon(collocation, [9]).evaluate(p, collocation.unpack(z)[1])
+    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
+
+    def objective(at: np.ndarray) -> float:
+        return collocation.objective(simulated(collocation, at))
+
+    assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
+
+
+@pytest.mark.parametrize("name", TOLD)
+@pytest.mark.parametrize("integrator", ["newmark", "midpoint"])
+def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
+    make, truth = TOLD[name]
+    free = make()
+    stated = {n: v for n, v in truth.items() if not is_density(n)}
+    rest, core = free.body.parts
+    body = Body(
+        free.body.mesh,
+        density_kg_m3=DENSITY_KG_M3["density_kg_m3"],
+        element=free.body.element.name,
+        damping=rest.damping,
+        prony=rest.prony,
+        regions=[Region("core", core.cells, density_kg_m3=DENSITY_KG_M3["core.density_kg_m3"])],
+    )
+    found = simulate(free, truth, integrator).markers_m
+    expected = simulate(replace(free, body=body), stated, integrator).markers_m
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
+def noisy_with(experiment: Experiment, truth) -> Experiment:
+    made = measured_with(experiment, truth)
+    tracks = made.markers.positions_m
+    noise = 1e-3 * np.random.default_rng(7).normal(size=tracks.shape)
+    return with_markers(made, tracks + noise)

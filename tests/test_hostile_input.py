@@ -1,0 +1,220 @@
+"""Input that nobody means: pipes and devices, endless numbers and tables, studies without end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem_files import replace_cell, replace_text, run_command, settings
+
+from collocation_sysid.check import memory
+from collocation_sysid.output import writers
+
+pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
+
+
+def refused(*words: object) -> str:
+    outcome = run_command(*words)
+    assert outcome.code == 2, f"{outcome.code}: {outcome.out}{outcome.err}"
+    assert len(outcome.err.strip().splitlines()) == 1
+    assert len(outcome.err) < 2000
+    return outcome.err
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+@pipes
+@pytest.mark.parametrize(
+    "file", ["problem.toml", "swing_markers.csv", "swing_motion.csv", "body.vtu"]
+)
+def test_a_pipe_is_refused_rather_than_waited_for(tiny: Path, file: str):
+    (tiny / file).unlink()
+    os.mkfifo(tiny / file)
+    assert "is a pipe; expected a regular file" in refused("check", "problem.toml")
+    assert "is a pipe" in refused("sweep", "problem.toml", "--over", "transcription.substeps=1,2")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no such device here")
+def test_a_device_is_refused_rather_than_read_to_its_end(tiny: Path):
+    assert "expected a regular file" in refused("check", "/dev/zero")
+    assert "expected a regular file" in refused(
+        "check", "problem.toml", *settings('object.mesh="/dev/zero"')
+    )
+
+
+def test_a_c3d_of_random_blocks_is_refused(tiny: Path):
+    pytest.importorskip("ezc3d")
+    rng = np.random.default_rng(0)
+    replace_text('"swing_markers.csv"', '"swing.c3d"')(tiny)
+    for _ in range(20):
+        blocks = bytearray(rng.bytes(512 * 8))
+        blocks[:2] = b"\x02\x50"
+        (tiny / "swing.c3d").write_bytes(blocks)
+        assert "swing.c3d" in refused("check", "problem.toml")
+
+
+# Numbers ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", ["1e308", "-1e300", "9" * 5000])
+@pytest.mark.parametrize("file", ["swing_markers.csv", "swing_motion.csv"])
+def test_a_cell_beyond_all_measures_is_refused(tiny: Path, file: str, number: str):
+    replace_cell(file, 3, 1, number)(tiny)
+    assert "expected a number" in refused("check", "problem.toml")
+
+
+@pytest.mark.parametrize("number", ["1e308", "5e-324", "9" * 5000, "1" + 400 * "0"])
+@pytest.mark.parametrize(
+    "key", ["parameters.mu_pa.guess", "object.density_kg_m3", "experiment.swing.markers.sigma_m"]
+)
+def test_a_number_beyond_all_measures_ends_in_a_message(tiny: Path, key: str, number: str):
+    outcome = run_command("check", "problem.toml", *settings(f"{key}={number}"))
+    assert outcome.code in (0, 1, 2)
+    assert len(outcome.err.strip().splitlines()) <= 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a = " + "[" * 5000 + "]" * 5000, "a = " + "{a = " * 3000 + "1" + "}" * 3000,
+     "[" + "a." * 3000 + "b]", "a = " + "9" * 5000],
+    ids=["lists", "tables", "keys", "digits"],
+)  # fmt: skip
+def test_a_file_of_depths_or_digits_without_end_is_refused(tiny: Path, text: str):
+    with (tiny / "problem.toml").open("a") as file:
+        file.write(f"\n{text}\n")
+    refused("check", "problem.toml")
+    refused("check", "problem.toml", *settings("title=x"))
+
+
+@pytest.mark.parametrize("value", ["[" * 5000 + "]" * 5000, "9" * 5000])
+def test_so_is_such_an_override(tiny: Path, value: str):
+    refused("check", "problem.toml", *settings(f"title={value}"))
+    refused("check", "problem.toml", *settings("a." * 3000 + "b=1"))
+
+
+# Studies ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (("compare", "--methods", "shooting", "--starts", "1000000"), "asks for 1,000,000 starts"),
+        (("compare", "--prony", "0,1000000"), "whole numbers up to 20"),
+        (("sweep", "--over", "solver.huber=1:2:1000000"), "asks for 1,000,000 values"),
+        (("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"), "asks for more than 10"),
+        (
+            (
+                "sweep",
+                "--over",
+                "solver.huber=1:2:900",
+                "--over",
+                "transcription.substeps=1:900:900",
+            ),
+            "asks for 810,000 runs",
+        ),
+        (("sweep", "--over", "solver.huber=1:1e999:3"), "expected first:last:count"),
+    ],
+)
+def test_a_study_without_end_is_refused_with_a_number(tiny: Path, words: tuple, found: str):
+    command, *options = words
+    assert found in refused(command, "problem.toml", *options)
+
+
+# Memory -------------------------------------------------------------------------------------------
+
+
+def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "machine_memory_mb", lambda: 0.2)
+    said = refused("solve", "problem.toml", "--method", "interior-point")
+    assert "interior-point would take about" in said
+    assert 'take method = "reduced-space"' in said or "coarser mesh" in said
+    assert "reduced-space would take" in refused(
+        "solve", "problem.toml", "--method", "reduced-space"
+    )
+
+
+def test_limits_of_containers_count_as_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(memory, "CGROUP_LIMITS", (limit,))
+    machine = memory.machine_memory_mb()
+    limit.write_text("max\n")
+    assert memory.machine_memory_mb() == machine
+    limit.write_text("5000000\n")
+    assert memory.machine_memory_mb() == 5.0
+
+
+# Interrupts ---------------------------------------------------------------------------------------
+
+STARTED = """
+import os, signal, sys
+sys.argv = ["collocation-sysid"]
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "casadi":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+import collocation_sysid
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_an_interrupt_while_modules_are_imported_says_nothing():
+    done = subprocess.run([sys.executable, "-c", STARTED], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("method", ["reduced-space", "interior-point"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_and_sigterm_leave_the_best_result(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch, method: str, number: int
+):
+    from collocation_sysid.methods.recorder import Recorder
+
+    add = Recorder.add
+
+    def interrupted(self, line):
+        add(self, line)
+        if len(self.history) == 3:
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Recorder, "add", interrupted)
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        outcome = run_command("solve", "problem.toml", "--method", method, "--out", "run", "-q")
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    assert outcome.code == 130
+    assert '"status": "interrupted"' in (tiny / "run" / "result.json").read_text()
+    assert "Traceback" not in outcome.err
+    assert not list(tiny.glob(".*.partial"))
+
+
+# Folders ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path):
+    child = subprocess.run(
+        [sys.executable, "-c", "import os, platform; print(f'{platform.node()}-{os.getpid()}')"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    stale = tmp_path / f".run.{child.stdout.strip()}-0a1b2c3d.partial"
+    others = tmp_path / ".walk.elsewhere-1-0a1b2c3d.partial"
+    going_on = tmp_path / f".run.{writers.platform.node()}-{os.getpid()}-0a1b2c3d.partial"
+    for folder in (stale, others, going_on):
+        folder.mkdir()
+    with writers.run_folder(tmp_path / "run") as place:
+        (place / "result.json").write_text("{}")
+    assert not stale.exists()
+    assert others.exists()
+    assert going_on.exists()

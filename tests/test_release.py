@@ -1,0 +1,53 @@
+"""What a release rests on: one version, types, and dependencies that state how old they may be."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import collocation_sysid as cs
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def test_the_version_stands_in_one_place():
+    assert cs.__version__ == PROJECT["version"]
+    assert "version:" not in (ROOT / "CITATION.cff").read_text().replace("cff-version:", "")
+    for file in (ROOT / "collocation_sysid").rglob("*.py"):
+        assert f'"{PROJECT["version"]}"' not in file.read_text()
+
+
+def test_the_package_is_typed():
+    assert (ROOT / "collocation_sysid" / "py.typed").is_file()
+
+
+def test_every_dependency_states_the_lowest_version():
+    lowest = runpy.run_path(str(ROOT / "scripts" / "lowest_dependencies.py"))["lowest"]
+    pins = lowest(PROJECT["dependencies"])
+    assert len(pins) == len(PROJECT["dependencies"])
+    assert all(re.fullmatch(r"[\w-]+==[\d.]+", pin) for pin in pins)
+    with pytest.raises(ValueError, match="no lowest version"):
+        lowest(["numpy"])
+
+
+def test_hosted_checks_run_targets_that_are_there():
+    targets = re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+    called = re.findall(r"run: make ([a-z-]+)", workflow)
+    assert {"check", "test", "docs", "dist"} <= set(called) <= set(targets)
+    stated = [c for c in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", c)]
+    matrix = re.search(r"python: \[(.*)\]", workflow)
+    assert matrix is not None
+    assert [each.rpartition(" ")[2] for each in stated] == re.findall(r"[\d.]+", matrix[1])
+
+
+def test_no_package_host_is_named():
+    for name in ("pyproject.toml", "Makefile", ".github/workflows/ci.yml", "SECURITY.md"):
+        text = (ROOT / name).read_text()
+        assert "index-url" not in text
+        assert "://" not in text
