@@ -22,6 +22,7 @@ from problems_small import (
 from scipy.optimize import brentq
 
 import collocation_sysid as cs
+from collocation_sysid.check import check_problem
 from collocation_sysid.check.derivatives import derivative_errors
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import (
@@ -395,6 +396,13 @@ def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
     found.save(tmp_path / "run")
     assert (tmp_path / "run" / "wrench_press.png").is_file()
     assert not list((tmp_path / "run").glob("tracks_*"))
+
+
+def test_a_test_bench_without_markers_is_checked(tmp_path):
+    findings = check_problem(cs.Problem.read(bench(tmp_path)))
+    assert findings.derivatives_agree
+    assert findings.samples == 0
+    assert not findings.motions
 
 
 @pytest.mark.parametrize(

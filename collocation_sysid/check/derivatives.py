@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
+from ..experiment.markers import Markers
 from ..experiment.wrench import Wrench
 from ..experiment.wrench_files import FEWEST
 from ..nlp.collocation import Collocation
@@ -37,16 +38,17 @@ def first_samples(experiment: Experiment, samples: int) -> Experiment:
         tracks = np.nan_to_num(tracks)  # at least one sample has to be there
     markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
     t_s = experiment.t_s[here]
-    grasps = [replace(g, wrench=_begun(g.wrench, t_s)) for g in experiment.grasps]
+    fewest = 1 if experiment.static else FEWEST
+    grasps = [replace(g, wrench=_begun(g.wrench, t_s, fewest)) for g in experiment.grasps]
     return replace(experiment, t_s=t_s, markers=markers, grasps=grasps)
 
 
-def _begun(wrench: Wrench | None, t_s: Array) -> Wrench | None:
+def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
     """The wrench up to the last of some times, if that leaves enough of it."""
     if wrench is None:
         return None
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
-    if here.sum() < FEWEST or not wrench.present[here].any():
+    if here.sum() < fewest or not wrench.present[here].any():
         return None
     return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
 
@@ -88,9 +90,17 @@ def _gradient_error(collocation: Collocation, z: Array, rng: np.random.Generator
 def _blind(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
     """The program without wrenches, whose second derivatives nothing uses, and a point of it."""
     p, positions = collocation.unpack(z)
-    without = [without_sensors(segment.experiment) for segment in collocation.segments]
+    without = [without_sensors(_marked(segment.experiment)) for segment in collocation.segments]
     blind = replace(collocation, experiments=without)
     return blind, blind.pack(np.append(p[: blind.nq], blind.guess_p[blind.nq :]), positions)
+
+
+def _marked(experiment: Experiment) -> Experiment:
+    """The experiment, with a marker where it has none: something has to be seen."""
+    if experiment.markers.names:
+        return experiment
+    seen, place = np.zeros((len(experiment.t_s), 1, 3)), experiment.body.nodes_m[:1]
+    return replace(experiment, markers=Markers(experiment.t_s, seen, 1.0, places_m=place))
 
 
 def _slopes_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:

@@ -61,15 +61,18 @@ def _missed(part: Part) -> bool:
 
 
 def _from_markers(collocation: Collocation) -> list[Part]:
-    """Every experiment where its markers alone have it; none where that cannot be found."""
-    blind = [without_sensors(segment.experiment) for segment in collocation.segments]
+    """Every experiment with markers where these alone have it; none where that cannot be found."""
+    seen = [s for s in collocation.segments if s.experiment.markers.samples]
+    if not seen:
+        return []
+    blind = [without_sensors(segment.experiment) for segment in seen]
     try:
         alone = replace(collocation, experiments=blind)
         solution = ReducedSpace(max_iterations=MOST_SWEEPS)(alone)
     except (InputError, SimulationError):
         return []
     found = []
-    pairs = zip(collocation.segments, solution.collocation.parts(solution.z), strict=True)
+    pairs = zip(seen, solution.collocation.parts(solution.z), strict=True)
     for segment, part in pairs:
         known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
         phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
