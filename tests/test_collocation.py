@@ -13,6 +13,7 @@ from problems_small import (
     as_theta,
     bar_in_two_hands,
     bar_let_go,
+    bar_loaded,
     cube_with_gaps,
     cube_with_nuisance,
     driven_bar,
@@ -168,6 +169,13 @@ def test_derivatives_of_a_body_that_tendons_and_pressures_drive(scheme: str, rng
 def test_derivatives_where_a_hand_lets_go_and_a_mass_joins(scheme: str, explicit_grasps: bool, rng):
     experiment = measured(bar_let_go(6))
     assert_derivatives(Collocation([experiment], GUESS, scheme, 1, explicit_grasps), rng)
+
+
+@pytest.mark.parametrize("parameters", [GUESS, ALL_FIXED])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_derivatives_by_the_times_of_loads(scheme: str, parameters: Parameters, rng):
+    experiments = [bar_loaded(6), replace(bar_let_go(5), nuisance=Nuisance.none(joining_s=0.003))]
+    assert_derivatives(Collocation(experiments, parameters, scheme), rng)
 
 
 @pytest.mark.parametrize("substeps", [1, 2])

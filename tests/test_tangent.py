@@ -9,6 +9,7 @@ from problems_small import (
     SMALL_EXPERIMENTS,
     TRUTH,
     as_theta,
+    bar_loaded,
     hung_cube,
     measured,
     released_cube,
@@ -25,6 +26,7 @@ from collocation_sysid.nlp.setting import Setting
 from collocation_sysid.nlp.stopwatch import Stopwatch
 from collocation_sysid.nlp.tangent import BlockSolver, Tangent
 
+EXPERIMENTS = SMALL_EXPERIMENTS | {"bar-loaded": bar_loaded}
 LAYOUTS = {
     "bounds": {},
     "explicit-grasps": {"explicit_grasps": True},
@@ -65,13 +67,13 @@ def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tange
 
 
 @pytest.fixture(
-    params=[(name, scheme, "bounds") for name in SMALL_EXPERIMENTS for scheme in SCHEMES]
+    params=[(name, scheme, "bounds") for name in EXPERIMENTS for scheme in SCHEMES]
     + [("hung-cube", scheme, layout) for scheme in SCHEMES for layout in list(LAYOUTS)[1:]],
     ids="-".join,
 )
 def collocation(request: pytest.FixtureRequest) -> Collocation:
     name, scheme, layout = request.param
-    return Collocation([SMALL_EXPERIMENTS[name](5)], GUESS, scheme, **LAYOUTS[layout])
+    return Collocation([EXPERIMENTS[name](5)], GUESS, scheme, **LAYOUTS[layout])
 
 
 def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Collocation):
