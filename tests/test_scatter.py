@@ -45,7 +45,7 @@ def test_a_step_from_the_joint_answer_is_the_fit_to_one_recording():
     rng = np.random.default_rng(3)
     local = rng.normal(size=len(MADE.names)) / np.maximum(MADE.prior_slope, 1e-300)
     truth = np.where(MADE.prior_slope > 0, local, 0.0)
-    for k, ((alone, step), slope) in enumerate(zip(single_fits(fit), MADE.slopes, strict=True)):
+    for k, ((_, alone, step), slope) in enumerate(zip(single_fits(fit), MADE.slopes, strict=True)):
         errors = rng.normal(size=slope.shape[:3])
         rng.normal()
         columns = [0, 1, 2, 3, 4 + k]

@@ -156,7 +156,7 @@ def test_nuisance_parameters_are_taken_over(folder):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (None, "has no result.json; expected the folder of an earlier run"),
+        (None, "is not the folder of an earlier run: it has no result.json"),
         ("{", "is damaged"),
         ('{"parameters": {"x_pa": {"value": 1}}, "derived": {}, "nuisance": {}}', "found x_pa;"),
     ],

@@ -221,16 +221,6 @@ def test_error_bars_are_relative_in_the_logarithm():
     assert uncertainty.notes == ()
 
 
-def test_known_marker_sensitivities_are_used():
-    collocation, z = simulated([measured(hung_cube(4))])
-    halves = [0.5 * s for s in marker_sensitivities(collocation, z)]
-    np.testing.assert_allclose(
-        covariance(collocation, z, halves).covariance,
-        4 * covariance(collocation, z).covariance,
-        rtol=1e-9,
-    )
-
-
 def test_noise_is_estimated_from_the_residuals():
     experiment = measured(hung_cube())
     for sigma_m in (1e-4, 1e-2):  # what is claimed; the noise has 1 mm

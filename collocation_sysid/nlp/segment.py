@@ -317,8 +317,8 @@ class Segment:
         drives = self.nuisance.drives(phi)
         if joining:
             dynamics = dynamics.with_loads(
-                sum(np.outer(load.share[0], load.mass_kg) for load in joining),
-                sum(load.share[0, :, None] * load.force_n for load in joining),
+                np.sum([np.outer(load.share[0], load.mass_kg) for load in joining], axis=0),
+                np.sum([load.share[0, :, None] * load.force_n for load in joining], axis=0),
             )
         if len(moving):
             dynamics = dynamics.driven(drives[0])

@@ -82,13 +82,13 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
 
 
 def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
-    """The first experiment's first timesteps alone: the whole Jacobian may be gigabytes."""
-    part = collocation.parts(z)[0]
+    """The first timesteps alone, without nuisance: the whole Jacobian may be gigabytes."""
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
-    few = first_samples(part.segment.experiment, count)
-    short = replace(collocation, experiments=[few], charts={})
-    p = np.concatenate([part.q, part.phi])
-    return short, short.pack(p, [part.x[: short.segments[0].grid_rows]])
+    few = [first_samples(segment.experiment, count) for segment in collocation.segments]
+    short = replace(collocation, experiments=few, charts={})
+    p = np.concatenate([z[: collocation.nq], *(s.guess_phi for s in short.segments)])
+    pairs = zip(collocation.parts(z), short.segments, strict=True)
+    return short, short.pack(p, [part.x[: segment.grid_rows] for part, segment in pairs])
 
 
 def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
