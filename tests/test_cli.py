@@ -384,8 +384,10 @@ def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
     ]
     assert len(commented) >= 25
     whole = [line.removeprefix("# ") if line in commented else line for line in lines]
-    # A surface takes the place of a mesh, a gripper's markers that of its poses.
-    text = "\n".join(line for line in whole if not line.startswith(("mesh =", "poses =")))
+    # A surface takes the place of a mesh, a gripper's markers that of its poses or displacement; a
+    # motion that of equilibria.
+    left_out = ("mesh =", "poses =", "displacement =", "kind =")
+    text = "\n".join(line for line in whole if not line.startswith(left_out))
     (tmp_path / "all.toml").write_text(text)
     file, _ = read_problem_file(tmp_path / "all.toml")
     assert file.object.surface == "scan.stl"

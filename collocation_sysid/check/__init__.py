@@ -135,7 +135,7 @@ def check_problem(problem: Problem) -> Findings:
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
     whole = with_explicit_memory(collocation)
-    jacobian, hessian = nonzeros(problem)
+    jacobian, hessian = nonzeros(problem, whole)
     method = _name(problem.method)
     found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
     chosen = next((cost for cost in found_costs if cost.method == method), None)

@@ -42,7 +42,7 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
     if there_mb is None or collocation.variables < SMALL:
         return
     if isinstance(method, InteriorPoint):
-        needed_mb = interior_point_mb(sum(nonzeros(problem)))
+        needed_mb = interior_point_mb(sum(nonzeros(problem, with_explicit_memory(collocation))))
         fits = memory_mb(collocation) < there_mb
         remedy = 'method = "reduced-space"' if fits else "a coarser mesh or a shorter window_s"
     elif isinstance(method, ReducedSpace):
@@ -83,9 +83,11 @@ def _limits_mb() -> Iterator[float]:
             yield limit / 1e6
 
 
-def nonzeros(problem: Problem) -> tuple[int, int]:
-    """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many."""
-    whole = with_explicit_memory(problem.collocation())
+def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
+    """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many.
+
+    `whole` is the problem's program as interior point has it.
+    """
     further = whole.further_nonzeros if isinstance(whole, ExplicitMemory) else (0, 0)
     short = shortened(problem, SAMPLES)
     total = few = _counted(short)

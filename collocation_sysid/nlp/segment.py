@@ -346,7 +346,6 @@ class Segment:
                 replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
                 for k, g in enumerate(grasps)
             )
-        gravity, timed = self.nuisance.gravity(phi)[0], self.nuisance.with_times
         off = iter(self.nuisance.drives(phi)[0])
         tendons, pressures = (
             tuple(actuator.off_by(*next(off)) for actuator in actuators)
@@ -354,12 +353,12 @@ class Segment:
         )
         changed = replace(
             self.experiment,
-            gravity_m_s2=gravity,
+            gravity_m_s2=self.nuisance.gravity(phi)[0],
             grasps=grasps,
             tendons=tendons,
             pressures=pressures,
         )
-        return timed(changed, phi)
+        return self.nuisance.with_times(changed, phi)
 
     def grasped(self, x: Array, phi: Array) -> Array:
         """Positions (N, 3n) with the held nodes where their grasps are."""
