@@ -1,10 +1,10 @@
 """What the measured beam says: the joint fit, refinement, cross-validation, and Poisson's ratio.
 
-The problem is problems/srl_beam/problem.toml; every part changes a few of its keys and solves it
-again in the reduced space.
+The problem is one of problems/srl_beam; every part changes a few of its keys and solves it again in
+the reduced space.
 
     python scripts/study_srl_beam.py --from FOLDER              # all: a quarter of an hour
-    python scripts/study_srl_beam.py --from FOLDER --parts joint poisson
+    python scripts/study_srl_beam.py --from FOLDER --problem memory.toml --parts joint validation
 """
 
 from __future__ import annotations
@@ -43,6 +43,23 @@ SUBSTEPS = (1, 2, 4)
 SCHEMES = ("midpoint", "bdf2", "backward-euler")
 
 
+@dataclass(frozen=True)
+class Beam:
+    """A problem file of the beam, and the folder with its recordings."""
+
+    file: str
+    recordings: Path
+
+    def load(self, *overrides: str) -> Problem:
+        """The problem with these recordings, and other values for some keys."""
+        markers = (self.recordings / f"beam_{trial}_V2_a.c3d" for trial in TRIALS)
+        files = [
+            f"experiment.{trial}.markers.file={file}"
+            for trial, file in zip(TRIALS, markers, strict=True)
+        ]
+        return Problem.read(FOLDER / self.file, [*files, *overrides])
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A solved problem with its error bars."""
@@ -58,23 +75,18 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--from", dest="source", type=Path, default=FOLDER, help="the recordings")
+    parser.add_argument("--problem", default="problem.toml", help="a file of problems/srl_beam")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     arguments = parser.parse_args()
     for part in arguments.parts:
         print(f"\n== {part} ==\n", flush=True)
-        parts[part](arguments.source.resolve())
-
-
-def load(source: Path, *overrides: str) -> Problem:
-    """The shipped problem with the recordings of a folder, and other values for some keys."""
-    files = [f"experiment.{t}.markers.file={source / f'beam_{t}_V2_a.c3d'}" for t in TRIALS]
-    return Problem.read(FOLDER / "problem.toml", [*files, *overrides])
+        parts[part](Beam(arguments.problem, arguments.source.resolve()))
 
 
 @cache
-def shipped(source: Path) -> Solution:
+def shipped(beam: Beam) -> Solution:
     """The problem as it is shipped, solved from its own guess."""
-    return solve(load(source))
+    return solve(beam.load())
 
 
 def fit(problem: Problem, solution: Solution | None = None) -> Fit:
@@ -89,9 +101,9 @@ def fit(problem: Problem, solution: Solution | None = None) -> Fit:
 # Parts ----------------------------------------------------------------------------------------
 
 
-def joint(source: Path) -> None:
+def joint(beam: Beam) -> None:
     """One material for the three trials, and everything the report has to say of it."""
-    found = fit(load(source), shipped(source))
+    found = fit(beam.load(), shipped(beam))
     solution, uncertainty = found.solution, found.uncertainty
     print(f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s")
     print(f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)")
@@ -110,51 +122,53 @@ def joint(source: Path) -> None:
     print("\n" + "\n".join(f"- {sentence}" for sentence in (*said, *sentences)))
 
 
-def refinement(source: Path) -> None:
+def refinement(beam: Beam) -> None:
     """The same fit on other meshes, other steps, and with other schemes."""
     print(f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]")
-    near = guesses(shipped(source))
+    near = shipped(beam)
     for substeps in SUBSTEPS:
         for scheme in SCHEMES:
             steps = f"transcription.substeps={substeps}"
-            here = load(source, *near, f"transcription.scheme={scheme}", steps)
+            here = started(beam.load(f"transcription.scheme={scheme}", steps), near)
             report(f"{scheme}, {10 / substeps:g} ms", fit(here))
     with tempfile.TemporaryDirectory() as folder:
         for element, divisions in MESHES:
             mesh = Path(folder) / "beam.vtu"
             box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
-            here = load(source, *near, f"object.mesh={mesh}", f"object.element={element}")
+            here = started(beam.load(f"object.mesh={mesh}", f"object.element={element}"), near)
             bricks = " x ".join(map(str, divisions))
             report(f"{element} {bricks}, {len(here.bodies[0].nodes_m)} nodes", fit(here))
 
 
-def validation(source: Path) -> None:
+def validation(beam: Beam) -> None:
     """Each trial predicted with the material of the other two."""
-    print(f"{'predicted':12}{'E [kPa]':>9}{'γ_r [ms]':>10}{'γ_m [1/s]':>11}", end="")
+    together = shipped(beam)
+    free = [item.name for item in together.collocation.parameters.free]
+    print(f"{'predicted':12}" + "".join(f"{name:>15}" for name in free), end="")
     print(f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'fitted':>9}")
-    together = shipped(source)
     all_three = dict(zip(TRIALS, rms_mm(together), strict=True))
     for trial in TRIALS:
-        problem = load(source, *guesses(together), f"experiment.{trial}.validation=true")
+        problem = started(beam.load(f"experiment.{trial}.validation=true"), together)
         solution = solve(problem)
         with_own, without = predicted_rms_mm(problem, trial, solution)
-        print(f"{trial:12}{material(solution)}", end="")
+        values = "".join(f"{solution.parameters[name]:15.5g}" for name in free)
+        print(f"{trial:12}{values}", end="")
         print(f"{with_own:30.3f}{without:10.3f}{all_three[trial]:9.3f}", flush=True)
 
 
-def poisson(source: Path) -> None:
+def poisson(beam: Beam) -> None:
     """Poisson's ratio estimated too, and fixed at other values."""
-    near = guesses(shipped(source))
+    near = shipped(beam)
     free = "parameters.poisson={ guess = 0.45, lower = 0.05, upper = 0.495 }"
-    found = fit(load(source, *near, free))
+    found = fit(started(beam.load(free), near))
     report("estimated", found)
     ratio = found.uncertainty.estimates["poisson"]
     print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
     said = dict.fromkeys((*found.uncertainty.notes, *verdicts(found.uncertainty)))
     print("\n".join(f"- {sentence}" for sentence in said))
     for value in (0.3, 0.4, 0.45, 0.48, 0.49):
-        here = fit(load(source, *near, f"parameters.poisson={{ fixed = {value} }}"))
-        report(f"fixed at {value}", here)
+        here = started(beam.load(f"parameters.poisson={{ fixed = {value} }}"), near)
+        report(f"fixed at {value}", fit(here))
 
 
 def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
@@ -188,13 +202,6 @@ def report(label: str, found: Fit) -> None:
     )
 
 
-def material(solution: Solution) -> str:
-    young_pa, gamma_r_s, gamma_m_1_s = (
-        solution.parameters[name] for name in ("young_pa", "gamma_r_s", "gamma_m_1_s")
-    )
-    return f"{1e-3 * young_pa:9.1f}{1e3 * gamma_r_s:10.2f}{gamma_m_1_s:11.2f}"
-
-
 def interval(estimate: Estimate) -> str:
     if estimate.ci95 is None:
         return estimate.reason or "fixed"
@@ -211,11 +218,14 @@ def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
     return "\n".join([" " * 14 + "".join(f"{name:>13}" for name in names), *rows])
 
 
-def guesses(solution: Solution) -> list[str]:
-    """Overrides that start from an answer."""
-    free = {item.name for item in solution.collocation.parameters.free}
-    values = solution.parameters
-    return [f"parameters.{name}.guess={values[name]:.6g}" for name in values if name in free]
+def started(problem: Problem, solution: Solution) -> Problem:
+    """The problem with an answer's values as guesses of what both estimate."""
+    found = solution.parameters
+    items = tuple(
+        item if item.fixed or item.name not in found else replace(item, guess=found[item.name])
+        for item in problem.parameters.items
+    )
+    return replace(problem, parameters=replace(problem.parameters, items=items))
 
 
 def rms_mm(solution: Solution) -> list[float]:
