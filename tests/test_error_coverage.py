@@ -15,7 +15,7 @@ from collocation_sysid.statistics.information import information
 from collocation_sysid.statistics.linearised import LinearisedFit
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
-DRAWS = 150
+DRAWS = 60
 PROBLEMS = {
     "one marker, 40 samples": problem((40,), markers=1),
     "two experiments": problem((60, 45), markers=1),
