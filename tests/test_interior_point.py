@@ -54,7 +54,8 @@ def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
 
 
 def test_several_experiments_are_fitted_together():
-    made = [measured(make()) for make in SMALL_EXPERIMENTS.values()]
+    names = ("hung-cube", "bar-let-go", "cube-with-nuisance")
+    made = [measured(SMALL_EXPERIMENTS[name]()) for name in names]
     solution = PRECISE(Collocation(made, GUESS))
     assert np.abs(relative_errors(solution)).max() < 1e-5
 

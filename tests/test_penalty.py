@@ -142,6 +142,7 @@ def test_conjugate_gradients_lower_the_merit_in_every_step():
     assert (changes <= 1e-6 * np.abs(values[:-1])).all()  # what the approximate conditions allow
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_find_the_truth_in_the_end():
     collocation = collocation_of("released-cube", 0.0, 6)
     solution = Penalty(rho=1e2, violation=1e-4, max_time_s=600)(collocation)
