@@ -155,12 +155,13 @@ def test_faults_that_spoil_the_answer_are_doubtful(fault):
     assert judged(fault).trust.verdict == "doubtful"
 
 
-@pytest.mark.parametrize("fault", ["grasp one layer deeper", slow("clock 30 ms late")])
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["clock 30 ms late", "grasp one layer deeper"])
 def test_no_hidden_fault_is_good(fault):
     assert judged(fault).trust.verdict != "good"
 
 
-@pytest.mark.parametrize(("factor", "words"), [(0.3, "as large as"), slow(3.0, "too large")])
+@pytest.mark.parametrize(("factor", "words"), [slow(0.3, "as large as"), (3.0, "too large")])
 def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     problem = twin("block", SOFT, 100)
     (experiment,) = problem.experiments
