@@ -164,12 +164,12 @@ def test_second_derivatives_along_the_motion_are_refused():
 def test_newmark_and_the_schemes_meet_as_the_step_shrinks(kind: str):
     name, changes = KINDS[kind]
     experiment = remembering(name, 6, 2, **changes)
-    fine = simulate(experiment, TWO, "midpoint", substeps=32).positions_m
+    fine = simulate(experiment, TWO, "midpoint", substeps=16).positions_m
     moved = np.abs(fine - fine[0]).max()
-    for integrator, count in (("newmark", 16), ("bdf2", 32)):
+    for integrator, count in (("newmark", 8), ("bdf2", 16)):
         step_s = experiment.timestep_s / count
         found = simulate(experiment, TWO, integrator, timestep_s=step_s, substeps=count)
-        assert np.abs(found.positions_m - fine).max() < 2e-3 * moved
+        assert np.abs(found.positions_m - fine).max() < 8e-3 * moved
 
 
 def test_a_share_of_zero_is_no_memory():
