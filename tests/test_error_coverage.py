@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -53,8 +54,9 @@ def assert_covers(share: float) -> None:
     assert low <= share <= high
 
 
-@pytest.mark.parametrize("phi", [0.0, 0.5, 0.85])
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    ("name", "phi"), [*product(PROBLEMS, (0.0, 0.85)), ("one marker, 40 samples", 0.5)]
+)
 def test_intervals_hold_the_truth_as_often_as_they_say(name, phi):
     assert_covers(coverage(PROBLEMS[name], phi, noise="estimated"))
 
