@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -12,8 +12,17 @@ from problem_files import write_problem
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.output import record
 
 BodyFactory = Callable[..., Body]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _runs_without_pictures() -> Iterator[None]:
+    """Pictures take most of the time of a small run; `problem_files.pictures_drawn` has them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record, "_write_pictures", lambda *_: None)
+        yield
 
 
 @pytest.fixture

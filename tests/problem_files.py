@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from collocation_sysid import cli
 from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.output import record
 from collocation_sysid.problem import Problem
 from collocation_sysid.synthesis import write_data
 
@@ -57,6 +58,7 @@ reference_m = {REFERENCES}
 """
 
 Edit = Callable[[Path], object]
+write_pictures = record._write_pictures  # before the session's fixture leaves them out
 
 
 # Writing ------------------------------------------------------------------------------------------
@@ -161,6 +163,14 @@ def run_command(*arguments: object) -> Outcome:
         ):
             cli.main()
     return Outcome(ended.value.code or 0, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def pictures_drawn() -> Iterator[None]:
+    """Runs that are written in this block have their pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record, "_write_pictures", write_pictures)
+        yield
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:

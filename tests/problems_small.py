@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import cycle, product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +28,7 @@ from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.parameters import Parameter, Parameters
+from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import simulate, with_markers
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -248,6 +250,16 @@ SMALL_EXPERIMENTS = {
     "bar-with-nuisance": bar_with_nuisance,
     "driven-bar": driven_bar,
 }
+# Every experiment and every scheme, and all schemes where the rows they reach back to change; what
+# an experiment has besides is none of the scheme's.
+EXPERIMENTS_AND_SCHEMES = list(
+    dict.fromkeys(
+        [
+            *zip(SMALL_EXPERIMENTS, cycle(SCHEMES)),
+            *product(("hung-cube", "bar-let-go"), SCHEMES),
+        ]
+    )
+)
 
 
 def measured(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Experiment:

@@ -13,19 +13,17 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.nlp.collocation import Collocation
 
-QUICK = sorted(set(SMALL_EXPERIMENTS) - {"quadratic-bar", "cube-with-nuisance", "released-cube"})
-
 
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_the_true_parameters_are_recovered(name: str):
     # A cube that is let go tells little of γ_m: the last digits of the loss tell it.
-    solution = AugmentedLagrangian(tolerance=1e-7)(collocation_of(name))
+    solution = AugmentedLagrangian(tolerance=1e-7)(collocation_of(name, steps=6))
     assert solution.status is Status.CONVERGED
     found = [solution.parameters[key] for key in TRUTH]
     np.testing.assert_allclose(found, list(TRUTH.values()), rtol=2e-3)
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", ["hung-cube", "bar-let-go"])
 def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
     collocation = collocation_of(name, noise_m=1e-3, steps=12)
     solution, reference = AugmentedLagrangian()(collocation), ReducedSpace()(collocation)

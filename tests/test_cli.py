@@ -20,6 +20,7 @@ from problem_files import (
     AT_TRUTH,
     TRUTH,
     contents,
+    pictures_drawn,
     remove,
     run_command,
     settings,
@@ -68,7 +69,8 @@ def frames_in(listing: Path) -> list[Path]:
 def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("three")
     file = write_problem(folder, {"swing": 8, "nod": 12, "twist": 6}, validation="twist")
-    outcome = run_command("solve", file, "--out", folder / "run")
+    with pictures_drawn():
+        outcome = run_command("solve", file, "--out", folder / "run")
     run = folder / "run"
     with np.load(run / "trajectory.npz") as stored:
         arrays = dict(stored)
@@ -192,7 +194,8 @@ def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlie
     (earlier / "result.json").write_text("{}")
     (earlier / "old.png").write_text("old")
     short = settings("solver.interior-point.max_iterations=2")
-    outcome = run_command("solve", "problem.toml", "--out", "run", "--verbose", *short)
+    with pictures_drawn():
+        outcome = run_command("solve", "problem.toml", "--out", "run", "--verbose", *short)
     assert outcome.code == 1
     assert "iteration limit" in outcome.out
     assert "Largest violations" in outcome.out

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 from dataclasses import replace
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -86,8 +87,9 @@ def test_a_part_has_the_layout_of_the_whole():
 # The answer
 
 
-@pytest.mark.parametrize("method", ["reduced-space", "shooting"])
-@pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
+@pytest.mark.parametrize(
+    ("experiment", "method"), zip(SMALL_EXPERIMENTS, cycle(["reduced-space", "shooting"]))
+)
 def test_the_true_parameters_are_recovered(experiment: str, method: str):
     made = measured(SMALL_EXPERIMENTS[experiment](14))
     collocation = Collocation([made], GUESS)

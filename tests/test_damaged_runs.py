@@ -160,7 +160,6 @@ def test_a_file_is_no_run_folder(command: str, tmp_path: Path):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 def test_a_pipe_in_a_run_folder_is_not_waited_for(run: Path):
-    (run / "mesh.png").unlink()
     os.mkfifo(run / "mesh.png")
     assert run_command("report", run).code == 0
     (run / "result.json").unlink()

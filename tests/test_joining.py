@@ -113,9 +113,7 @@ def test_the_estimated_time_acts_as_if_it_were_stated():
 # Finding them
 
 
-@pytest.mark.parametrize(
-    "method", ["reduced-space", "interior-point", "shooting", "augmented-lagrangian"]
-)
+@pytest.mark.parametrize("method", ["reduced-space", "interior-point", "shooting"])
 def test_the_time_is_found_beside_the_material(method: str):
     cube = seen(0.0634, 0.06)
     precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-5))
@@ -128,7 +126,7 @@ def test_the_time_is_found_beside_the_material(method: str):
 
 def test_errors_of_the_time_are_as_large_as_its_deviation_says():
     exact, scores = seen(0.0634, 0.06), []
-    for seed in range(12):
+    for seed in range(5):
         collocation = Collocation([with_noise(exact, seed)], GUESS)
         found = ReducedSpace()(collocation)
         fit = linearised_fit(collocation, found.z)
@@ -136,8 +134,8 @@ def test_errors_of_the_time_are_as_large_as_its_deviation_says():
         (name,) = collocation.segments[0].nuisance.names
         (part,) = collocation.parts(found.z)
         scores.append((part.phi[0] - 0.34) / uncertainty.nuisance[name])
-    # χ² of twelve, beyond which one in a thousand lies on either side.
-    assert 2.2 < np.sum(np.square(scores)) < 32.9
+    # χ² of five, beyond which one in a thousand lies on either side.
+    assert 0.21 < np.sum(np.square(scores)) < 20.5
 
 
 def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
@@ -145,7 +143,7 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
     for k, cube in enumerate(tracks):
         precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 2e-4))
         tracks[k] = with_noise(replace(cube, markers=precise), 1)
-    misled, right = (run(Problem([cube], GUESS)) for cube in tracks)
+    misled, right = (run(Problem([cube], GUESS), seek_causes=False) for cube in tracks)
     assert misled.interval("gamma_r_s")[1] < TRUTH["gamma_r_s"]
     assert misled.trust.verdict != "good"
     assert "residuals are not noise" in misled.trust.reasons[0]

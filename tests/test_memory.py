@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from checks import directional_derivative, relative_error
+from checks import assert_derivative, directional_derivative, relative_error
 from memories_small import ONE, TWO, guesses, recorded, remembering, truth
 
 from collocation_sysid.errors import InputError
@@ -122,24 +122,24 @@ def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation
     assert found == pytest.approx(float(expected), rel=1e-8)
 
 
-def test_the_adjoint_gradient_is_that_of_simulations():
+def test_the_adjoint_gradient_is_that_of_simulations(rng):
     collocation = Collocation([recorded("cube-with-nuisance", 6, 2)], guesses(TWO, 1.2))
     p = some_parameters(collocation)
     found = adjoint_gradient(collocation, simulated(collocation, p))
-    for k in range(len(p)):
-        expected = directional_derivative(
-            lambda at: collocation.objective(simulated(collocation, at)), p, np.eye(len(p))[k]
-        )
-        assert found[k] == pytest.approx(float(expected), rel=1e-6, abs=1e-6 * np.abs(found).max())
+    shared = np.arange(len(p)) < collocation.nq
+
+    def loss(at: np.ndarray) -> float:
+        return collocation.objective(simulated(collocation, at))
+
+    for scale in (shared, ~shared):  # the ones would drown among the others
+        assert_derivative(loss, lambda d: found @ d, p, rng, tolerance=1e-5, scale=scale)
 
 
-@pytest.mark.parametrize("branches", [1, 2])
-def test_the_memory_that_made_a_recording_is_found(branches: int):
-    true = truth(branches)
-    collocation = Collocation([recorded("hung-cube", 40, branches)], guesses(true))
+def test_the_memory_that_made_a_recording_is_found():
+    collocation = Collocation([recorded("hung-cube", 40, 2)], guesses(TWO))
     solution = ReducedSpace()(collocation)
     assert solution.status.converged
-    for name, value in true.items():
+    for name, value in TWO.items():
         assert solution.parameters[name] == pytest.approx(value, rel=1e-5), name
     assert solution.kkt_residual < 1e-8
 
@@ -164,12 +164,12 @@ def test_second_derivatives_along_the_motion_are_refused():
 def test_newmark_and_the_schemes_meet_as_the_step_shrinks(kind: str):
     name, changes = KINDS[kind]
     experiment = remembering(name, 6, 2, **changes)
-    fine = simulate(experiment, TWO, "midpoint", substeps=32).positions_m
+    fine = simulate(experiment, TWO, "midpoint", substeps=16).positions_m
     moved = np.abs(fine - fine[0]).max()
-    for integrator, count in (("newmark", 16), ("bdf2", 32)):
+    for integrator, count in (("newmark", 8), ("bdf2", 16)):
         step_s = experiment.timestep_s / count
         found = simulate(experiment, TWO, integrator, timestep_s=step_s, substeps=count)
-        assert np.abs(found.positions_m - fine).max() < 2e-3 * moved
+        assert np.abs(found.positions_m - fine).max() < 8e-3 * moved
 
 
 def test_a_share_of_zero_is_no_memory():

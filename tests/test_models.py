@@ -76,7 +76,13 @@ def read(run: PlannedRun) -> Problem:
 # Twins ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("steps", [{"a": 40}, {"a": 25, "b": 25}], ids=["one", "two"])
+@pytest.mark.parametrize(
+    "steps",
+    [
+        pytest.param({"a": 40}, id="one", marks=pytest.mark.slow),
+        pytest.param({"a": 25, "b": 25}, id="two"),
+    ],
+)
 def test_yeohs_material_is_recognised_at_large_strain(steps, tmp_path: Path):
     neo_hookean, yeoh = rows = compared(soft_bar(tmp_path / "bar", "yeoh", steps))
     assert yeoh["chosen"]

@@ -14,6 +14,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.any_stiffness import _responses
 from collocation_sysid.nlp.forces import Forces, Mass
 from collocation_sysid.nlp.modes import Modes, natural_modes
 
@@ -129,3 +130,17 @@ def test_fewer_modes_than_wanted_are_no_error():
     modes = natural_modes(body, corners, np.arange(12), ELASTIC, count=20)
     assert len(modes.frequencies_hz) == 6
     assert modes.shapes.shape == (6, 4, 3)
+
+
+@pytest.mark.parametrize("from_rest", [True, False])
+def test_oscillators_answer_loads_that_are_linear_between_samples(from_rest: bool, rng):
+    """Against the state matrix q, q̇, load and its slope, by its exponential."""
+    omega, ratio, step_s, loads = 30.0, 0.2, 0.01, rng.normal(size=20)
+    chain = np.eye(4, k=1)
+    chain[1, :2], chain[2, 3] = [-(omega**2), -2 * ratio * omega], 1 / step_s
+    state, expected = np.array([loads[0] / omega**2 if from_rest else 0.0, 0, 0, 0]), []
+    for now, then in zip(loads, [*loads[1:], 0.0], strict=True):
+        expected.append(state[0])
+        state = scipy.linalg.expm(chain * step_s) @ [*state[:2], now, then - now]
+    found = _responses(np.array([[omega]]), ratio, loads[:, None], step_s, from_rest)
+    np.testing.assert_allclose(found[0, :, 0], expected, rtol=1e-9, atol=1e-15)

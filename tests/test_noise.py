@@ -23,7 +23,9 @@ from study_coverage import CASES, reference, truth, twin
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.statistics.linearised import linearised_fit
 
-DRAWS = 500
+DRAWS = 100
+# What chance makes of a right share in 998 of 1000 such counts.
+LEAST, MOST = binom.ppf([1e-3, 1 - 1e-3], DRAWS, 0.95) / DRAWS
 PROBLEMS = {
     "three markers": problem((60,), markers=3, offsets=False),
     "gaps": problem((100,), markers=3, missing=0.2),
@@ -62,9 +64,8 @@ def test_intervals_hold_the_truth_whatever_sigma_says(name, errors):
         np.abs(wrong) < each.quantiles * np.sqrt(np.diag(each.covariance))
         for each, wrong in found(name, errors)
     ]
-    assert 0.93 <= np.mean(held) <= 0.97
-    lowest = binom.ppf(1e-3, DRAWS, 0.93) / DRAWS
-    assert (np.mean(held, axis=0) > lowest).all()
+    assert LEAST <= np.mean(held) <= MOST
+    assert (np.mean(held, axis=0) >= LEAST).all()
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -92,9 +93,9 @@ def test_variances_of_the_markers_are_found_without_bias():
         levels = [each.level for each, _ in found(name, "one marker three times as noisy")]
         mean = np.mean([level.by_marker for level in levels], axis=0)
         truth = [9.0 if name.endswith("m0") else 1.0 for name in levels[0].names]
-        np.testing.assert_allclose(mean, truth, rtol=0.04)
+        np.testing.assert_allclose(mean, truth, rtol=0.08)
         spread = np.std([level.by_marker for level in levels], axis=0) / truth
-        np.testing.assert_allclose(spread, np.sqrt(2 / levels[0].freedoms), rtol=0.15)
+        np.testing.assert_allclose(spread, np.sqrt(2 / levels[0].freedoms), rtol=0.3)
 
 
 def test_a_common_variance_would_not_do_where_markers_differ():
@@ -190,7 +191,7 @@ def test_intervals_of_a_whole_identification_follow_the_residuals(claimed):
     else:
         deviations[:] = 1 / claimed
     stated = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m / deviations))
-    for seed in range(8):
+    for seed in range(2):
         collocation, _ = twin(stated, x, CASES[0], sigma_m, np.random.default_rng(seed))
         solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
         fit = linearised_fit(collocation, solution.z)
@@ -199,4 +200,4 @@ def test_intervals_of_a_whole_identification_follow_the_residuals(claimed):
         for name, value in truth().items():
             low, high = {**each.estimates, **each.derived}[name].ci95 or (0.0, np.inf)
             held.append(low <= value <= high)
-    assert np.mean(held) >= 0.8  # 95 % of 8 twins, whose quantities are related
+    assert np.mean(held) >= 0.75  # of two twins, whose quantities are related

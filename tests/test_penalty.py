@@ -90,7 +90,7 @@ def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
 
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_newton_steps_at_large_rho_find_the_truth(name: str):
-    solution = replace(NEWTON, rho=1e5, violation=1e-6)(collocation_of(name))
+    solution = replace(NEWTON, rho=1e5, violation=1e-6)(collocation_of(name, steps=6))
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-3
     assert solution.max_violation_relative < 1e-6
@@ -142,6 +142,7 @@ def test_conjugate_gradients_lower_the_merit_in_every_step():
     assert (changes <= 1e-6 * np.abs(values[:-1])).all()  # what the approximate conditions allow
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_find_the_truth_in_the_end():
     collocation = collocation_of("released-cube", 0.0, 6)
     solution = Penalty(rho=1e2, violation=1e-4, max_time_s=600)(collocation)

@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from problem_files import TRUTH, run_command, settings, write_problem
+from problem_files import TRUTH, pictures_drawn, run_command, settings, write_problem
 
 from collocation_sysid.output.remedies import LAST, REMEDIES, remedies_for, remedy_for
 from collocation_sysid.output.report.run_page import verdict
@@ -25,7 +25,8 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_problem(folder, {"swing": 8, "turn": 6})
     out = folder / "run"
     method = settings("solver.method=reduced-space")
-    assert run_command("solve", folder / "problem.toml", *method, "--out", out).code == 0
+    with pictures_drawn():
+        assert run_command("solve", folder / "problem.toml", *method, "--out", out).code == 0
     return out
 
 

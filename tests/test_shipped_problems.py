@@ -39,7 +39,9 @@ def relative_errors(result: dict, truth: dict) -> np.ndarray:
     return np.array([result["parameters"][name]["value"] / truth[name] - 1 for name in truth])
 
 
-@pytest.mark.parametrize("method", ["reduced-space", "interior-point"])
+@pytest.mark.parametrize(
+    "method", ["reduced-space", pytest.param("interior-point", marks=pytest.mark.slow)]
+)
 def test_foam_cylinder_errors_are_consistent_with_the_noise(method: str, tmp_path: Path):
     result = solved(PROBLEMS / "foam_cylinder" / "problem.toml", tmp_path / "run", method)
     assert result["status"] == "converged"
@@ -165,7 +167,7 @@ def test_huber_and_offsets_together_recover_the_truth_from_the_noisy_cylinder(as
 @pytest.mark.parametrize(
     ("huber", "offsets"),
     [
-        pytest.param(False, False, id="plain-least-squares"),
+        pytest.param(False, False, id="plain-least-squares", marks=pytest.mark.slow),
         pytest.param(True, False, id="huber-alone"),
         pytest.param(False, True, id="offsets-alone"),
     ],

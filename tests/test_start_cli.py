@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from problem_files import TRUTH, contents, run_command, settings, write_problem
+from problem_files import TRUTH, contents, pictures_drawn, run_command, settings, write_problem
 
 import collocation_sysid as cs
 from collocation_sysid.earlier import Earlier
@@ -22,7 +22,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("unguessed")
     file = write_problem(place, {"swing": 30})
     options = [*UNGUESSED, "--method", "reduced-space"]
-    outcome = run_command("solve", file, "--out", place / "run", *options)
+    with pictures_drawn():
+        outcome = run_command("solve", file, "--out", place / "run", *options)
     assert outcome.code == 0, outcome.err
     (place / "printed.txt").write_text(outcome.out)
     return place

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from problems_small import (
+    EXPERIMENTS_AND_SCHEMES,
     GUESS,
     SMALL_EXPERIMENTS,
     TRUTH,
@@ -67,7 +68,8 @@ def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tange
 
 
 @pytest.fixture(
-    params=[(name, scheme, "bounds") for name in EXPERIMENTS for scheme in SCHEMES]
+    scope="module",
+    params=[(*pair, "bounds") for pair in [*EXPERIMENTS_AND_SCHEMES, ("bar-loaded", "bdf2")]]
     + [("hung-cube", scheme, layout) for scheme in SCHEMES for layout in list(LAYOUTS)[1:]],
     ids="-".join,
 )

@@ -42,6 +42,11 @@ FOAM_YOUNG_PA = 600 * (3 * 800 + 2 * 600) / (800 + 600)
 OF = problem((80,), markers=3)
 
 
+def slow(*values):
+    """A whole run of which a like one is done every time."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def verdict_of_fit(errors: np.ndarray) -> Trust:
     fit, wrong = OF.fit([errors], np.zeros(len(OF.names)))
     found = uncertainty_of(fit, PARAMETERS, wrong[:4])
@@ -58,8 +63,8 @@ def test_the_gravest_concern_gives_the_verdict():
 
 
 def test_white_residuals_of_the_stated_size_are_good():
-    found = [verdict_of_fit(RNG(seed).normal(size=(80, 3, 3))).verdict for seed in range(300)]
-    assert found.count("good") >= 297
+    found = [verdict_of_fit(RNG(seed).normal(size=(80, 3, 3))).verdict for seed in range(80)]
+    assert found.count("good") >= 79
 
 
 @pytest.mark.parametrize(
@@ -138,24 +143,25 @@ def judged(fault: str, seed: int = 100) -> Run:
     return run(problem, "reduced-space")
 
 
-@pytest.mark.parametrize("seed", [100, 101])
+@pytest.mark.parametrize("seed", [100, slow(101)])
 def test_faultless_twins_are_good(seed):
     found = judged("none", seed)
     assert found.trust == Trust("good")
     assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
 
 
-@pytest.mark.parametrize("fault", ["gravity", "clock 100 ms late", "markers exchanged"])
+@pytest.mark.parametrize("fault", ["clock 100 ms late", slow("gravity"), slow("markers exchanged")])
 def test_faults_that_spoil_the_answer_are_doubtful(fault):
     assert judged(fault).trust.verdict == "doubtful"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["clock 30 ms late", "grasp one layer deeper"])
 def test_no_hidden_fault_is_good(fault):
     assert judged(fault).trust.verdict != "good"
 
 
-@pytest.mark.parametrize(("factor", "words"), [(0.3, "as large as"), (3.0, "too large")])
+@pytest.mark.parametrize(("factor", "words"), [slow(0.3, "as large as"), (3.0, "too large")])
 def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     problem = twin("block", SOFT, 100)
     (experiment,) = problem.experiments
@@ -171,7 +177,7 @@ def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     assert not any("as noise should be" in sentence for sentence in said)
 
 
-@pytest.mark.parametrize(("substeps", "good"), [(1, False), (2, True)])
+@pytest.mark.parametrize(("substeps", "good"), [(1, False), slow(2, True)])
 def test_a_step_too_coarse_for_the_error_bars_is_not_good(substeps, good):
     problem = replace(Problem.read(FOAM_CYLINDER), substeps=substeps)
     found = run(problem, "reduced-space")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from problem_files import pictures_drawn
 from problems_small import GUESS, TRUTH, hung_cube, relative_errors
 from wrenches_small import SIGMA_N, SIGMA_NM, sensing
 
@@ -129,7 +130,8 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     problem = Problem([experiment], UNKNOWN, rollout=cs.RolloutOptions(integrator="scheme"))
     run = cs.run(problem, method="reduced-space", seek_causes=False)
     assert run.trust.verdict == "good", run.trust.reasons
-    folder = run.save(tmp_path / "run", frames=False)
+    with pictures_drawn():
+        folder = run.save(tmp_path / "run", frames=False)
     result = json.loads((folder / "result.json").read_text())
     assert result["fit"]["wrench_rms_n"] == pytest.approx(SIGMA_N, rel=0.3)
     assert result["fit"]["wrench_rms_nm"] == pytest.approx(SIGMA_NM, rel=0.3)

@@ -22,10 +22,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
 
 from ..arrays import Array
 from .autocovariance import along_time, autocorrelation, autoregression, lagged_products
+from .distributions import chi2_sf, normal_isf
 from .information import Information
 from .linearised import FitBlock, LinearisedFit
 from .noise import ROUNDING
@@ -63,7 +63,7 @@ class Dependence:
     @property
     def in_time(self) -> bool:
         """The errors persist, significantly and noticeably."""
-        limit = float(norm.isf(SIGNIFICANCE / 2)) * self.lag1_deviation
+        limit = float(normal_isf(SIGNIFICANCE / 2)) * self.lag1_deviation
         return abs(self.lag1) > max(limit, NOTICEABLE)
 
     @property
@@ -129,7 +129,7 @@ def _shared_p(fit: LinearisedFit) -> float:
         correlation = (scaled.T @ scaled)[used] / counts[used]
         statistic += float(np.sum((counts[used] - 1) * correlation**2))
         pairs += int(used.sum())
-    return float(chi2.sf(statistic, pairs)) if pairs else 1.0
+    return float(chi2_sf(statistic, pairs)) if pairs else 1.0
 
 
 def error_processes(fit: LinearisedFit, information: Information) -> tuple[ErrorProcess, ...]:

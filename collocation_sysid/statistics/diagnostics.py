@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
 
 from ..arrays import Array
+from .distributions import chi2_isf, normal_isf
 from .information import information
 from .linearised import FitBlock, LinearisedFit
 from .noise import Extra, NoiseLevel, noise_level
@@ -178,8 +178,8 @@ def _suggestion(
     size = f"{1e3 * found.rms_m:.2g} mm RMS"
     if found.rms_m < ROUNDING_M:
         return f"{name}: fits to rounding"
-    persistent = pairs > 0 and abs(found.lag1) > norm.isf(SIGNIFICANCE / 2) / np.sqrt(3 * pairs)
-    shifted = found.constant_share > chi2.isf(SIGNIFICANCE, 3) / (3 * found.samples)
+    persistent = pairs > 0 and abs(found.lag1) > normal_isf(SIGNIFICANCE / 2) / np.sqrt(3 * pairs)
+    shifted = found.constant_share > chi2_isf(SIGNIFICANCE, 3) / (3 * found.samples)
     if not persistent and not shifted:
         return f"{name}: {size}, {_white(found)}"
     if found.constant_share > DOMINANT:
@@ -211,7 +211,7 @@ def _suggestion(
 
 def _white(found: MarkerDiagnosis) -> str:
     """White residuals, by their size; a few samples may differ from σ by chance."""
-    factor, chance = found.noise_factor, norm.isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
+    factor, chance = found.noise_factor, normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
     if factor > max(AS_STATED, 1 + chance):
         return f"white, but {factor:.2g} times as large as sigma_m says"
     if factor < min(1 / AS_STATED, 1 - chance):

@@ -18,9 +18,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
 from ..arrays import Array
+from .distributions import chi2_cdf, chi2_sf
 from .information import Information
 from .linearised import FitBlock, LinearisedFit
 
@@ -227,8 +227,8 @@ def _level(
         freedoms=freedoms,
         pooled=float(pooled),
         freedom=freedom,
-        larger_p=float(chi2.sf(statistic, freedom)) if tested else 1.0,
-        smaller_p=float(chi2.cdf(statistic, freedom)) if tested else 1.0,
+        larger_p=float(chi2_sf(statistic, freedom)) if tested else 1.0,
+        smaller_p=float(chi2_cdf(statistic, freedom)) if tested else 1.0,
         unequal_p=_bartlett(squares * freedoms / np.maximum(means, 1e-300), freedoms)
         if tested
         else 1.0,
@@ -247,7 +247,7 @@ def _bartlett(squares: Array, freedoms: Array) -> float:
     pooled = squares[used].sum() / total
     statistic = total * np.log(pooled) - np.sum(each * np.log(squares[used] / each))
     correction = 1 + (np.sum(1 / each) - 1 / total) / (3 * (count - 1))
-    return float(chi2.sf(statistic / correction, count - 1))
+    return float(chi2_sf(statistic / correction, count - 1))
 
 
 def shortened(block: FitBlock) -> float:
@@ -258,4 +258,4 @@ def shortened(block: FitBlock) -> float:
     if not block.wild.any():
         return 1.0
     squared = float(np.sum(block.residual[block.wild] ** 2, axis=1).max())
-    return float(squared * chi2.sf(squared, 3) / 3 + chi2.cdf(squared, 5))
+    return float(squared * chi2_sf(squared, 3) / 3 + chi2_cdf(squared, 5))

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
+from .distributions import chi2_isf
 
 SolveFixed = Callable[[str, float], float]
 
-THRESHOLD = float(chi2.ppf(0.95, 1))
+THRESHOLD = float(chi2_isf(0.05, 1))
 # The ends are found to this share of their distance from the best value, in the logarithm.
 PRECISION = 0.02
 MOST_SOLVES = 20

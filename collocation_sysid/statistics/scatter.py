@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ..arrays import Array
+from .distributions import chi2_sf
 from .linearised import LinearisedFit
 
 # Probability that recordings without such an error are said to disagree, for all parameters.
@@ -63,7 +63,7 @@ class Scatter:
     def disagreeing(self) -> NDArray[np.bool_]:
         """(nq,) parameters on which the recordings disagree more than by chance."""
         freedom = self.freedom
-        p = chi2.sf(self.chi_squared, np.maximum(freedom, 1))
+        p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
     def widened(self, variances: Array) -> Array:

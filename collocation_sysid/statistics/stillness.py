@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.stats import chi2
 
 from ..experiment.experiment import Experiment
 from ..fem.constants import is_damping
 from ..nlp.parameters import Parameters
+from .distributions import chi2_isf
 
 # Probability of noise of sigma_m that moves markers more than still ones move.
 RARE = 1e-3
@@ -38,7 +38,7 @@ def motionless(experiment: Experiment) -> bool:
     away = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
     # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
     freedom = 3 * float(np.maximum(present.sum(axis=0) - 1, 0).sum())
-    return bool(np.sum(away**2) <= chi2.isf(RARE, max(freedom, 1.0)))
+    return bool(np.sum(away**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 
 def stillness_notes(experiments: Iterable[Experiment], parameters: Parameters) -> list[str]:

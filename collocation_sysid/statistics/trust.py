@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import norm
 
 from ..arrays import Array
 from .cause import Cause
 from .diagnostics import MOST_WILD, MarkerDiagnosis
+from .distributions import normal_isf
 from .estimates import Estimate
 from .noise import NoiseLevel
 from .numerical import Refinement
@@ -94,7 +94,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """The residuals against sigma_m and against white noise."""
     level, found = uncertainty.level, uncertainty.dependence
     factor = float(np.sqrt(level.pooled))
-    limit = float(norm.isf(RARE / 2)) * found.lag1_deviation
+    limit = float(normal_isf(RARE / 2)) * found.lag1_deviation
     persistent = abs(found.lag1) > max(PERSISTENT, limit)
     shared = found.shared_p < RARE
     matters = uncertainty.errors == "autocorrelated" and (persistent or shared)
@@ -211,7 +211,7 @@ def nuisance_concerns(
 ) -> list[Concern]:
     """Nuisance parameters φ in deviations of their priors: far from these, or at their limits."""
     items = [*zip(names, deviations, low, high, strict=True)]
-    far = max(FAR, float(norm.isf(RARE / 2 / max(1, len(items))))) if items else FAR
+    far = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
         if not lowest + 1e-3 < phi < highest - 1e-3:

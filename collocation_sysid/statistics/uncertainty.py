@@ -21,7 +21,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t
 
 from ..arrays import Array
 from ..errors import InputError
@@ -30,6 +29,7 @@ from ..nlp.collocation import Collocation
 from ..nlp.lapack import one_blas_thread
 from ..nlp.parameters import Parameters
 from .autocorrelation import Dependence, dependence, error_processes, score_covariance
+from .distributions import student_ppf
 from .estimates import (
     UNDETERMINED,
     Estimate,
@@ -225,7 +225,7 @@ def uncertainty_of(
             factors = np.sqrt(scatter.widened(np.diag(of_q)) / np.diag(of_q))
         factors = np.where(scatter.disagreeing, factors, 1.0)
         of_q *= np.outer(factors, factors)
-        of_few = t.ppf(0.975, np.maximum(scatter.freedom, 1))
+        of_few = student_ppf(0.975, np.maximum(scatter.freedom, 1))
         quantiles = np.where(scatter.disagreeing, np.maximum(quantiles, of_few), quantiles)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
     sizes = relative_slopes(parameters, q)
@@ -312,7 +312,7 @@ def _independent(
 ) -> tuple[Array, Array]:
     """Covariance of all parameters, and the quantiles of the shared ones."""
     of_score, freedom = level.score_covariance(kind, factored, fit.shared)
-    return factored.covariance(of_score), t.ppf(0.975, freedom)
+    return factored.covariance(of_score), student_ppf(0.975, freedom)
 
 
 def _expected(
@@ -363,7 +363,7 @@ def _autocorrelated(
         values, vectors = np.linalg.eigh((over + over.T) / 2)
         wide = root @ vectors
         of_score = (wide * np.maximum(values, 1.0)) @ wide.T
-    return factored.covariance(of_score), t.ppf(0.975, freedom)
+    return factored.covariance(of_score), student_ppf(0.975, freedom)
 
 
 def _widens(fit: LinearisedFit, correlated: tuple[Array, Array], independent: Array) -> bool:
