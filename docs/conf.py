@@ -19,11 +19,27 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "sphinx_gallery.gen_gallery",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build"]
 html_theme = "furo"
+
+# Scripts with a recorded object in them run where its data have been fetched.
+_measured = {"measured_beam": "srl_beam/beam_gravity_V2_a.c3d"}
+_here = Path(__file__).parent
+_fetched = [name for name, file in _measured.items() if (_here / "../problems" / file).is_file()]
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "generated/gallery",
+    "filename_pattern": "/(plot_|" + "|".join(f"{name}$" for name in _fetched or ["$^"]) + ")",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "show_memory": False,
+}
 html_math_renderer = "mathml"  # which browsers draw themselves, without a network
 html_title = f"collocation_sysid {release}"
 

@@ -77,6 +77,9 @@ assert low < truth["young_pa"] < high
 # ``save`` writes what the command writes: result.json, the trajectory, plots, frames for ParaView.
 run.save(folder / "run", frames=False)
 print(*sorted(file.name for file in (folder / "run").iterdir()), sep="\n")
-plt.imshow(plt.imread(folder / "run" / "tracks_swing.png"))
-plt.axis("off")
+plt.plot(t_s, 1e3 * tracks_m[:, 0, 0], ".", label="tip_1, as tracked")
+plt.plot(t_s, 1e3 * run.solution.readings_m[0][:, 0, 0], label="as fitted")
+plt.xlabel("time [s]")
+plt.ylabel("x [mm]")
+plt.legend()
 plt.show()

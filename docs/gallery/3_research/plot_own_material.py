@@ -2,7 +2,7 @@
 A material of your own
 ======================
 
-A material is its energy density, a function of the deformation gradient and of constants with names.
+A material is its energy density, a function of the deformation gradient and of named constants.
 Derivatives, compiled kernels and estimates follow from it.
 """
 

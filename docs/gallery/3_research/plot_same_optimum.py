@@ -33,7 +33,7 @@ for name, method in (
     ("reduced space", cs.ReducedSpace()),
     ("interior point", cs.InteriorPoint()),
     ("augmented Lagrangian", cs.AugmentedLagrangian()),
-    ("penalty", cs.Penalty(solver="levenberg-marquardt")),
+    ("penalty", cs.Penalty(inner="levenberg-marquardt")),
 ):
     solution = cs.solve(problem, method)
     found[name] = solution

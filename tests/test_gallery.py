@@ -1,0 +1,35 @@
+"""The gallery's scripts run, and what they assert holds."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import pytest
+
+GALLERY = Path(__file__).parents[1] / "docs" / "gallery"
+SCRIPTS = sorted(GALLERY.glob("*/plot_*.py"))
+# Their causes of a misfit take refits.
+LONG = ("plot_late_clock", "plot_memory")
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        pytest.param(script, id=script.stem, marks=[pytest.mark.slow] * (script.stem in LONG))
+        for script in SCRIPTS
+    ],
+)
+def test_a_script_of_the_gallery_runs_and_draws_a_picture(script, tmp_path, monkeypatch):
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    drawn = []
+    monkeypatch.setattr(plt, "show", lambda: drawn.append(plt.gcf()))
+    try:
+        runpy.run_path(str(script))
+    finally:
+        plt.close("all")
+    assert len(drawn) == 1
+    assert drawn[0].axes
