@@ -13,7 +13,6 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.nlp.collocation import Collocation
 
-
 # Their bands are wide; a penalty of the same steps finds the truth of these every time.
 DEAR = ("quadratic-bar", "cube-with-nuisance", "bar-with-nuisance", "driven-bar")
 
