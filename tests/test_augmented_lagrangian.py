@@ -13,8 +13,14 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.nlp.collocation import Collocation
 
+# Their bands are wide; a penalty of the same steps finds the truth of these every time.
+DEAR = ("quadratic-bar", "cube-with-nuisance", "bar-with-nuisance", "driven-bar")
 
-@pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in DEAR else n for n in SMALL_EXPERIMENTS],
+)
 def test_the_true_parameters_are_recovered(name: str):
     # A cube that is let go tells little of γ_m: the last digits of the loss tell it.
     solution = AugmentedLagrangian(tolerance=1e-7)(collocation_of(name, steps=6))
