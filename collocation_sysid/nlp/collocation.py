@@ -12,7 +12,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by experiment
 =================  =========================================================================
 
-The memory of bodies follows from them, or is among them, see `nlp.explicit_memory`.
+The memory of bodies follows from them, or is among them, see `nlp.explicit`.
 
 Constraints g, in this order:
 
