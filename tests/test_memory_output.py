@@ -16,7 +16,7 @@ from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit_memory import ExplicitMemory, with_explicit_memory
+from collocation_sysid.nlp.explicit import Explicit, made_explicit
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -117,8 +117,8 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     MEMORY(tiny)
     problem = Problem.read(tiny / "problem.toml", [GUESSED])
     findings = check_problem(problem)
-    program = with_explicit_memory(problem.collocation())
-    assert isinstance(program, ExplicitMemory)
+    program = made_explicit(problem.collocation())
+    assert isinstance(program, Explicit)
     assert findings.overstresses == program.overstresses
     assert findings.variables + findings.overstresses == program.variables
     assert findings.constraints + findings.overstresses == program.constraints

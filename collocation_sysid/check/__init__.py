@@ -15,7 +15,7 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import started
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
-from ..nlp.explicit_memory import with_explicit_memory
+from ..nlp.explicit import made_explicit
 from ..nlp.factorisation import Choice
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
@@ -134,7 +134,7 @@ def check_problem(problem: Problem) -> Findings:
     z, start_notes = initial_variables(collocation)
     short = shortened(problem, SAMPLES).collocation()
     jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
-    whole = with_explicit_memory(collocation)
+    whole = made_explicit(collocation)
     jacobian, hessian = nonzeros(problem, whole)
     method = _name(problem.method)
     found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))

@@ -12,7 +12,7 @@ from ..experiment.markers import Markers
 from ..experiment.wrench import Wrench
 from ..experiment.wrench_files import FEWEST
 from ..nlp.collocation import Collocation
-from ..nlp.explicit_memory import ExplicitMemory, carried_over, with_explicit_memory
+from ..nlp.explicit import Explicit, carried_over, made_explicit
 from ..nlp.sensor import without_sensors
 from ..problem import Problem
 
@@ -60,8 +60,8 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     if any(segment.sensors for segment in collocation.segments):
         of_sensors = _gradient_error(collocation, z, rng)
         collocation, z = _blind(collocation, z)
-    program = with_explicit_memory(collocation)
-    if isinstance(program, ExplicitMemory):
+    program = made_explicit(collocation)
+    if isinstance(program, Explicit):
         through_memory = _slopes_error(collocation, z, rng)
         if sum(program.further_nonzeros) > LAID_OUT:
             return max(through_memory, of_sensors), 0.0

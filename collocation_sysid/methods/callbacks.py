@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..nlp.collocation import Collocation
-from ..nlp.explicit_memory import carried_over
+from ..nlp.explicit import carried_over
 from .recorder import Recorder
 
 HessianValues = Callable[[Array, float, Array, Array], None]

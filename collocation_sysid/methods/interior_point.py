@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -55,9 +55,6 @@ IPOPT_STATUS = {
 }
 
 
-# Steps that a limited-memory Hessian is made of where wrenches have none: IPOPT's own six are too
-# few for them.
-HISTORY = 60
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
 
@@ -69,8 +66,7 @@ class InteriorPoint(Options):
     Attributes
     ----------
     hessian : {"exact", "gauss-newton", "limited-memory"}
-        Second derivatives of the Lagrangian: all of them, the loss's only, or IPOPT's own. Measured
-        wrenches have first ones only: "limited-memory" is taken with them.
+        Second derivatives of the Lagrangian: all of them, the loss's only, or IPOPT's own.
     warm_up : float
         While an iteration still changes a parameter by more than this share, an exact Hessian is
         replaced by Gauss–Newton's with Levenberg's damping, which keeps every parameter within
@@ -114,17 +110,6 @@ class InteriorPoint(Options):
             If IPOPT does not know an option.
         """
         recorder = Recorder(self.name, collocation, watch)
-        sensed = any(segment.sensors for segment in collocation.segments)
-        if sensed and self.hessian != "limited-memory":
-            recorder.notes.append(
-                "hessian = 'limited-memory' was taken: wrenches have first derivatives only"
-            )
-            options = {"limited_memory_max_history": HISTORY, **self.ipopt}
-            remembering = replace(self, hessian="limited-memory", ipopt=options)
-            return remembering._solved(recorder, start)
-        return self._solved(recorder, start)
-
-    def _solved(self, recorder: Recorder, start: Array | None) -> Solution:
 
         def hessian(program: Collocation) -> _DampedHessian:
             return _DampedHessian(program, self)

@@ -4,7 +4,7 @@
 
 with loss and rows in the scaling of the NLP and y = 0 for a penalty. Grasped nodes are variables
 too, tied by rows of their own; variables whose bounds are equal, such as a given start, are not.
-So is what bodies with memory carry, see `explicit_memory`.
+So is what bodies with memory carry, and wrenches, see `explicit`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from ..arrays import Array, Index
 from ..nlp.collocation import Collocation
-from ..nlp.explicit_memory import carried_over, with_explicit_memory
+from ..nlp.explicit import carried_over, made_explicit
 from ..nlp.stopwatch import Stopwatch
 
 
@@ -32,7 +32,7 @@ class Unconstrained:
     Attributes
     ----------
     nlp : Collocation
-        With explicit grasps, and explicit memory.
+        With explicit grasps, memory and wrenches.
     lower, upper : (variables,) bounds
     free : (variables,) bool, what is not given
     bounded : (k,) positions of the free variables p that may have bounds: q and φ
@@ -44,7 +44,7 @@ class Unconstrained:
         with self.stopwatch.building():
             explicit = collocation.explicit_grasps
             grasped = collocation if explicit else replace(collocation, explicit_grasps=True)
-            self.nlp = with_explicit_memory(grasped)
+            self.nlp = made_explicit(grasped)
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraints, self.nlp.variables)
             self._entries = np.zeros(len(indices))
@@ -54,7 +54,7 @@ class Unconstrained:
         self.free = self.lower != self.upper
         of_p = np.zeros(self.nlp.variables, dtype=bool)
         of_p[: self.nlp.nq] = True
-        of_p[self.nlp.variables - self.nlp.nphi :] = True
+        of_p[self.nlp.of_phi] = True
         self.bounded: Index = np.flatnonzero(of_p & self.free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:

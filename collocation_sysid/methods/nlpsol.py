@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..nlp.explicit_memory import carried_over, with_explicit_memory
+from ..nlp.explicit import carried_over, made_explicit
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .recorder import Recorder
 from .solution import Status
@@ -64,7 +64,7 @@ def solve(
 ) -> Outcome:
     """Solve the recorder's collocation; Ctrl-C ends it after the iteration.
 
-    The solver gets the program with the memory of bodies as variables, see `explicit_memory`.
+    The solver gets the program with the memory of bodies as variables, see `explicit`.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def solve(
     errors: list[BaseException] = []
     with watch.building():
         start = recorder.start(start)
-        program = with_explicit_memory(collocation)
+        program = made_explicit(collocation)
         functions = NlpFunctions(program, hessian(program), errors)
         monitor = Monitor(recorder, program, errors)
         given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}

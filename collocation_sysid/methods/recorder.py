@@ -8,38 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError, SimulationError
+from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.stopwatch import Stopwatch
 from .method import Watch
 from .solution import Iteration, Solution, Status, Timing
 from .start import initial_variables
-
-# Methods in whose programs a wrench may depend on all that a body with memory has been through.
-THROUGH_MEMORY = ("reduced-space", "shooting", "continuation")
-
-
-def _refuse_sensors(method: str, collocation: Collocation) -> None:
-    """Refuse measured wrenches where the method needs slopes that they do not have.
-
-    Raises
-    ------
-    InputError
-        If it does.
-    """
-    if not any(segment.sensors for segment in collocation.segments):
-        return
-    if method.startswith("casadi:"):
-        raise InputError(
-            f"method '{method}' needs second derivatives, which measured wrenches (grasp.wrench) "
-            "do not have; expected reduced-space, shooting, continuation, interior-point, penalty "
-            "or augmented-lagrangian"
-        )
-    if collocation.remembers and method not in THROUGH_MEMORY:
-        raise InputError(
-            f"method '{method}' cannot have both materials with memory (prony) and measured "
-            f"wrenches (grasp.wrench); expected {', '.join(THROUGH_MEMORY)}"
-        )
 
 
 class Ended(Exception):
@@ -76,7 +50,6 @@ class Recorder:
         watch: Watch | None = None,
         max_time_s: float = np.inf,
     ) -> None:
-        _refuse_sensors(method, collocation)
         self.began = time.perf_counter()
         self.method, self.collocation, self.watch = method, collocation, watch
         self.max_time_s = max_time_s

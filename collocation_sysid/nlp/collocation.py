@@ -12,7 +12,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by experiment
 =================  =========================================================================
 
-The memory of bodies follows from them, or is among them, see `nlp.explicit_memory`.
+The memory of bodies follows from them, or is among them, see `nlp.explicit`.
 
 Constraints g, in this order:
 
@@ -38,10 +38,11 @@ import scipy.sparse as sp
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
+from ..fem.body import Linearisation
 from .charts import Chart
 from .parameters import Parameters
 from .schemes import Scheme
-from .segment import First, Segment
+from .segment import First, Segment, Weights
 from .sensing import Sensing
 from .setting import Setting
 
@@ -75,6 +76,8 @@ class Part:
     x : (N, 3n) positions [m], or its first rows
     brought : (N, …) or None
         What the evaluations bring from the past, where it is given; see `Dynamics`.
+    felt : bool
+        Whether its loss has the wrenches that follow from x.
     """
 
     segment: Segment
@@ -82,6 +85,7 @@ class Part:
     phi: Array
     x: Array
     brought: Array | None = None
+    felt: bool = True
 
     @cached_property
     def setting(self) -> Setting:
@@ -99,7 +103,14 @@ class Part:
     @property
     def loss(self) -> float:
         """Of markers and wrenches, without priors."""
-        return self.segment.observation.loss(self.x, self.phi) + self.sensing.loss(self.x)
+        seen = self.segment.observation.loss(self.x, self.phi)
+        return seen + (self.sensing.loss(self.x) if self.felt else 0.0)
+
+    @cached_property
+    def forces(self) -> Linearisation:
+        """Those of the evaluations with their slopes, valid until others are formed."""
+        rows = self.segment.linearisation_rows
+        return self.setting.dynamics.linearise(self.x, self.setting.theta, rows)
 
     @property
     def residual_n(self) -> Array:
@@ -215,7 +226,13 @@ class Collocation:
 
     def parameters_of(self, z: Array) -> Array:
         """All estimated parameters p = (q, φ_1, φ_2, …)."""
-        return np.concatenate([z[: self.nq], z[self.variables - self.nphi :]])
+        return np.concatenate([z[: self.nq], z[self.of_phi]])
+
+    @property
+    def of_phi(self) -> slice:
+        """The nuisance parameters in z."""
+        first = self.segments[-1].after.x
+        return slice(first, first + self.nphi)
 
     def parts(self, z: Array) -> list[Part]:
         """Every experiment at z."""
@@ -314,13 +331,17 @@ class Collocation:
 
     def gradient(self, z: Array) -> Array:
         """∂objective/∂z."""
-        residuals, slopes = self.prior(self.parameters_of(z))
+        return self.gradient_of(self.parts(z), self.parameters_of(z))
+
+    def gradient_of(self, parts: Sequence[Part], p: Array) -> Array:
+        """The same where the experiments are."""
+        residuals, slopes = self.prior(p)
         by_p, by_x = 2 * residuals * slopes, []
-        for part in self.parts(z):
+        for part in parts:
             of_x, of_phi = part.segment.observation.gradient(part.x, part.phi)
             by_x.append(of_x.ravel() * part.segment.length_m)
             by_p[part.segment.places[self.nq :]] += of_phi
-            if part.segment.sensors:
+            if part.felt and part.segment.sensors:
                 through_x, of_p = part.sensing.gradient(part.x)
                 by_x[-1] += through_x.ravel() * part.segment.length_m
                 by_p[part.segment.places] += of_p
@@ -369,7 +390,7 @@ class Collocation:
         for part in parts:
             segment = part.segment
             here = values[used : used + segment.jacobian.nnz]
-            found, by_p = segment.constraints_and_jacobian(part.x, part.setting, here)
+            found, by_p = segment.constraints_and_jacobian(part.x, part.setting, part.forces, here)
             rows[segment.rows], columns[:, segment.rows] = found, by_p[:, : self.nq].T
             by_phi.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
@@ -439,13 +460,14 @@ class Collocation:
         self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
     ) -> Array:
         """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
-        return self.curved(self.parts(z), loss_weight, multipliers, out)
+        weights = [segment.weights(multipliers[segment.rows]) for segment in self.segments]
+        return self.curved(self.parts(z), loss_weight, weights, out)
 
     def curved(
         self,
         parts: Sequence[Part],
         loss_weight: float,
-        multipliers: Array,
+        weights: Sequence[Weights],
         out: Array | None = None,
         memory_weights: Mapping[int, Sequence[Array]] | None = None,
     ) -> Array:
@@ -454,8 +476,7 @@ class Collocation:
         With weights of the memory's equations, by the number of the experiment, see `Segment`.
         """
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
-        used = self.nq * (self.nq + 1) // 2
-        phi = used + sum(segment.hessian_layout.x_entries for segment in self.segments)
+        used, phi = self.nq * (self.nq + 1) // 2, self._first_hessian_phi
         by_q = np.zeros((self.nq, self.nq))
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
@@ -463,12 +484,11 @@ class Collocation:
             of_x = segment.hessian_layout.x_entries
             of_phi = segment.hessian_layout.entries - of_x
             here = np.empty(of_x + of_phi) if of_phi else values[used : used + of_x]
-            of_rows = multipliers[segment.rows]
             by_q += segment.hessian_values(
                 part.x,
                 part.phi,
                 part.setting,
-                of_rows,
+                weights[number],
                 weight,
                 here,
                 (memory_weights or {}).get(number, ()),
@@ -483,6 +503,18 @@ class Collocation:
         values[: len(rows)] = by_q[rows[order], columns[order]]
         return values
 
+    @property
+    def _first_hessian_phi(self) -> int:
+        """Where the columns of φ begin in the values of the Hessian."""
+        of_x = sum(segment.hessian_layout.x_entries for segment in self.segments)
+        return self.nq * (self.nq + 1) // 2 + of_x
+
+    def hessian_phi(self, number: int) -> Index:
+        """Places in the values of the Hessian of an experiment's φ by φ, `np.triu_indices`."""
+        layouts = [segment.hessian_layout for segment in self.segments[: number + 1]]
+        before = sum(len(layout.phi_indices) for layout in layouts[:-1])
+        return self._first_hessian_phi + before + layouts[-1].phi - layouts[-1].x_entries
+
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Largest violation of the first-order conditions of the whole NLP, in its scaling.
 
@@ -494,7 +526,7 @@ class Collocation:
         lower, upper = self.bounds()
         slope[lower == upper] = 0
         near = 1e-6
-        for part in (slice(self.nq), slice(self.variables - self.nphi, None)):
+        for part in (slice(self.nq), self.of_phi):
             at_lower, at_upper = (z - lower)[part] < near, (upper - z)[part] < near
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)

@@ -12,24 +12,20 @@ those by x and m are further entries: 18 numbers of a point and node each.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..fem.memory import Branch, branches_of
+from .addition import Addition
+from .collocation import Part
 from .memory import CHUNK, History
-from .segment import Segment
+from .reaction_rows import Reactions
+from .segment import Weights
 from .setting import Setting
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where in z and g the variables m and the equations r of a segment begin."""
-
-    variable: int
-    row: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +47,30 @@ class _Lag:
 
 
 @dataclass(frozen=True, eq=False)
-class Overstress:
-    """The m of one experiment.
+class _Moved:
+    """Rows of motion: of which slopes (K,), what number each has at its time, and where all begin.
+
+    `taken` (N, 3n) says of which dofs no force counts.
+    """
+
+    slopes: Index
+    number: Index
+    first: int
+    per_time: int
+    taken: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Overstress(Addition):
+    """The m of one experiment, of a body with memory.
 
     Attributes
     ----------
-    segment : Segment
-        Of a body with memory.
-    places : Places
+    reactions : Reactions, optional
+        Further rows of motion, where the program has them.
     """
 
-    segment: Segment
-    places: Places
+    reactions: Reactions | None = None
 
     @cached_property
     def branches(self) -> list[Branch]:
@@ -84,21 +92,6 @@ class Overstress:
         """Number of variables, and of equations."""
         return self.shape[0] * self.shape[1]
 
-    @property
-    def variables(self) -> slice:
-        """They in z."""
-        return slice(self.places.variable, self.places.variable + self.count)
-
-    @property
-    def rows(self) -> slice:
-        """Their equations in g."""
-        return slice(self.places.row, self.places.row + self.count)
-
-    @property
-    def after(self) -> Places:
-        """Where those of the next segment begin."""
-        return Places(self.variables.stop, self.rows.stop)
-
     @cached_property
     def unit_pa(self) -> Array:
         """(width,) S̄: the normal entries of dS/dε of an even stretch, on average over the part."""
@@ -114,18 +107,18 @@ class Overstress:
 
     # Values -------------------------------------------------------------------------------------
 
-    def following(self, x: Array, setting: Setting) -> Array:
+    def following(self, part: Part) -> Array:
         """(count,) the variables as they follow from positions and parameters."""
-        return (np.hstack(self._history(x, setting).brought)[1:] / self.unit_pa).ravel()
+        return (np.hstack(self._history(part).brought)[1:] / self.unit_pa).ravel()
 
-    def brought(self, z: Array) -> Array:
-        """(N, width) m_{k−1} at z, as `Dynamics` takes it."""
+    def given(self, part: Part, z: Array) -> Part:
+        """The experiment with m_{k−1} (N, width) at z, as `Dynamics` takes it."""
         later = z[self.variables].reshape(self.shape) * self.unit_pa
-        return np.concatenate([np.zeros((1, self.width)), later])
+        return replace(part, brought=np.concatenate([np.zeros((1, self.width)), later]))
 
-    def values(self, x: Array, setting: Setting) -> Array:
+    def values(self, part: Part, z: Array) -> Array:
         """(count,) r at the m of the setting."""
-        return (self._history(x, setting).gaps / self.unit_pa).ravel()
+        return (self._history(part).gaps / self.unit_pa).ravel()
 
     def weights(self, multipliers: Array) -> list[Array]:
         """μ (N, …) of each branch such that multipliers · r has −Σ μ_k (m_k − d_k m_{k−1} − …)."""
@@ -133,8 +126,8 @@ class Overstress:
         mu[:-1] = -multipliers[self.rows].reshape(self.shape) / self.unit_pa
         return [mu[:, branch.own] for branch in self.branches]
 
-    def _history(self, x: Array, setting: Setting) -> History:
-        history = setting.dynamics.history(x, setting.theta)
+    def _history(self, part: Part) -> History:
+        history = part.setting.dynamics.history(part.x, part.setting.theta)
         assert history is not None
         return history
 
@@ -155,9 +148,19 @@ class Overstress:
         return place, own, dof, number
 
     @cached_property
-    def _moved(self) -> Index:
-        """Those of them whose dof has an equation of motion."""
-        return np.flatnonzero(np.isin(self._slopes[2], self.segment.free_dofs))
+    def _moved(self) -> list[_Moved]:
+        """Rows of motion that m is in, and by which slopes."""
+        segment, dofs = self.segment, self._slopes[2]
+        free = np.flatnonzero(np.isin(dofs, segment.free_dofs))
+        number = np.searchsorted(segment.row_dofs, dofs[free])
+        taken = segment.dynamics.taken
+        found = [_Moved(free, number, segment.first.row, segment.rows_per_time, taken)]
+        if self.reactions is not None:
+            sensed = np.flatnonzero(np.isin(dofs, self.reactions.dofs))
+            number = np.searchsorted(self.reactions.dofs, dofs[sensed])
+            first, count = self.reactions.places.row, self.reactions.shape[1]
+            found.append(_Moved(sensed, number, first, count, np.zeros_like(taken)))
+        return found
 
     @cached_property
     def _stress_lags(self) -> list[_Lag]:
@@ -204,7 +207,12 @@ class Overstress:
         )
         by_q = self.segment.nq * self.count
         recursion = (2 * rows - 1) * width
-        jacobian = by_q + recursion + by_x * per_time + by_m * len(self._moved)
+        jacobian = (
+            by_q
+            + recursion
+            + by_x * per_time
+            + by_m * sum(len(each.slopes) for each in self._moved)
+        )
         return jacobian, by_q + mixed * per_time
 
     def jacobian_entries(self) -> tuple[Index, Index]:
@@ -219,21 +227,22 @@ class Overstress:
         for each in self._stress_lags:
             rows.append((self.places.row + each.times * self.width + own).ravel())
             columns.append(self._states(each, dofs))
-        own, dofs = own[self._moved], np.searchsorted(segment.row_dofs, dofs[self._moved])
-        for each in self._force_lags:
-            of_time = each.times + each.lag - segment.dynamics.first_row
-            rows.append((segment.first.row + of_time * segment.rows_per_time + dofs).ravel())
-            columns.append(self._brought(each, own))
+        for moved in self._moved:
+            for each in self._force_lags:
+                of_time = each.times + each.lag - segment.dynamics.first_row
+                rows.append((moved.first + of_time * moved.per_time + moved.number).ravel())
+                columns.append(self._brought(each, own[moved.slopes]))
         return np.concatenate(rows), np.concatenate(columns)
 
-    def jacobian_values(self, x: Array, setting: Setting) -> tuple[Array, Array]:
+    def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
         """r, and the values of these entries."""
-        history = self._history(x, setting)
+        history, setting = self._history(part), part.setting
         sizes = [branch.own.stop - branch.own.start for branch in self.branches]
         fading = -np.repeat([r.d[1:-1] for r in history.recursions], sizes, axis=0).T
         values = [self._by_q(history, setting).ravel(), np.ones(self.count), fading.ravel()]
         values += self._stress_values(history)
-        values += self._force_values(history, setting)
+        for moved in self._moved:
+            values += self._force_values(history, moved)
         return (history.gaps / self.unit_pa).ravel(), np.concatenate(values)
 
     def _by_q(self, history: History, setting: Setting) -> Array:
@@ -264,10 +273,10 @@ class Overstress:
 
         return [values.ravel() for values in self._spread(self._stress_lags, slopes)]
 
-    def _force_values(self, history: History, setting: Setting) -> list[Array]:
+    def _force_values(self, history: History, moved: _Moved) -> list[Array]:
         """Of the motion by m."""
-        place, own, dofs, _ = (each[self._moved] for each in self._slopes)
-        scale, taken = self.unit_pa[own] / self.segment.force_n, setting.dynamics.taken
+        place, own, dofs, _ = (each[moved.slopes] for each in self._slopes)
+        scale, taken = self.unit_pa[own] / self.segment.force_n, moved.taken
 
         def slopes(times: slice) -> Array:
             found = history.body.stresses.force_slopes(history.xi[times], history.theta)
@@ -288,9 +297,12 @@ class Overstress:
             columns.append(self._brought(each, own))
         return np.concatenate(rows), np.concatenate(columns)
 
-    def hessian_values(self, setting: Setting, multipliers: Array) -> Array:
+    def hessian_values(
+        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: Weights
+    ) -> Array:
         """The values of these entries; multipliers are those of all of g."""
-        segment, theta_q = self.segment, setting.theta_q
+        segment, setting = self.segment, part.setting
+        theta_q = setting.theta_q
         by_q = np.zeros((segment.nq, *self.shape))
         recursions = setting.dynamics.recursions(setting.theta)
         for r, mu in zip(recursions, self.weights(multipliers), strict=True):
@@ -299,10 +311,9 @@ class Overstress:
         place, own, _, _ = self._slopes
         scale = segment.length_m * self.unit_pa[own]
         # f_H is linear in x and in H, so that its slope by both is that by H at the weights.
-        weights = segment.force_weights(multipliers[segment.rows])
 
         def slopes(times: slice) -> Array:
-            found = segment.body.stresses.force_slopes(weights[times], setting.theta)
+            found = segment.body.stresses.force_slopes(weights.forces[times], setting.theta)
             return found[:, place] * scale
 
         found = [by_q * self.unit_pa, *self._spread(self._state_lags, slopes)]

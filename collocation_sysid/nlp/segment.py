@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
-from ..fem.body import Body, Curvature
+from ..fem.body import Body, Curvature, Linearisation
 from ..fem.pattern import SymmetricPattern
 from .block_band import Block, BlockBand, Term
 from .charts import Chart
@@ -24,10 +24,10 @@ from .dynamics import Dynamics
 from .held import Grasping, Held
 from .hessian_layout import HessianLayout
 from .joining import Joinings
+from .motion_rows import MotionRows, ahead
 from .nuisance import NuisanceMap
 from .observation import Observation
 from .parameters import Parameters, ThetaMap
-from .passing import PassingGrasps
 from .row import Row
 from .schemes import Scheme
 from .sensor import Grid, Sensor, sensed_dofs, sensors_of
@@ -46,6 +46,22 @@ class First:
     x: int
     phi: int
     row: int
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What each row counts in a Lagrangian.
+
+    Attributes
+    ----------
+    multipliers : (constraints,) of the scaled rows
+    rows : (N, 3n) of c in newtons
+    forces : (N, 3n) of the forces at the evaluations
+    """
+
+    multipliers: Array
+    rows: Array
+    forces: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,89 +411,17 @@ class Segment:
         return self.dynamics.without_taken(residual)[:, self.free_dofs]
 
     @cached_property
+    def motion_rows(self) -> MotionRows:
+        """The structure of ∂c/∂x."""
+        return MotionRows(self.dynamics, self.row_dofs, self.free_dofs, self.length_m, self.force_n)
+
+    @property
     def jacobian(self) -> BlockBand:
-        """Structure of ∂c/∂x; row numbers count within the segment."""
-        return BlockBand(self.dofs, self._row_starts(), self._jacobian_blocks())
-
-    @cached_property
-    def _skew_jacobian(self) -> BlockBand:
-        """The same, to add the skew part of ∂F/∂x to it."""
-        return adding_skew(self.dofs, self._row_starts(), self._jacobian_blocks())
-
-    def _jacobian_blocks(self) -> list[Block]:
-        rows, columns, source = self.pattern.full
-        row_place = np.full(self.dofs, -1)
-        row_place[self.row_dofs] = np.arange(self.rows_per_time)
-        free = np.zeros(self.dofs, dtype=bool)
-        free[self.free_dofs] = True
-        whole = free[rows]
-        scale = self.length_m / self.force_n
-        blocks = []
-        for lag in range(self.dynamics.reach + 1):
-            terms = [
-                # Column time t has the block of row t + lag, whose coefficients are at t + lag.
-                Term(
-                    lag - j - self.dynamics.first_row,
-                    scale * _ahead(a, lag),
-                    scale * _ahead(b, lag),
-                )
-                for j, a, b in self.dynamics.block_terms(lag)
-            ]
-            kept = whole.copy() if terms else whole & (rows == columns)
-            if lag == 0 and self.grasps_have_rows:
-                kept |= ~free[rows] & (rows == columns)
-            # Grasp rows hold constants only: they are written after the terms.
-            entries = row_place[rows[kept]], columns[kept], source[kept]
-            blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
-        return blocks
-
-    def _inertia_rows(self, lag: int) -> Index:
-        """Grid times whose rows have inertia at a lag."""
-        rows = np.arange(max(self.dynamics.first_row, lag), self.grid_rows)
-        return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
-
-    @cached_property
-    def _jacobian_constants(self) -> tuple[Index, Index]:
-        """Positions of the inertia, and of the unit grasp entries."""
-        row_place = np.searchsorted(self.row_dofs, self.free_dofs)
-        positions = [np.zeros(0, dtype=np.int64)]
-        for lag in range(self.dynamics.reach + 1):
-            columns = self._inertia_rows(lag) - lag
-            places = self.jacobian.positions(columns, lag, row_place, self.free_dofs)
-            positions.append(places.ravel())
-        grasps = [np.zeros(0, dtype=np.int64)]
-        if self.grasps_have_rows:
-            rows = np.arange(self.dynamics.first_row, self.grid_rows)
-            grasps.append(self.jacobian.positions(rows, 0, self.held_dofs, self.held_dofs).ravel())
-        return np.concatenate(positions), np.concatenate(grasps)
-
-    def _inertia(self, dynamics: Dynamics, theta: Array) -> Array:
-        """∂c/∂x of the inertia, in the order of its positions."""
-        mass = dynamics.mass.at(theta)[:, self.free_dofs] * self.length_m / self.force_n
-        values = [np.zeros(0)]
-        for lag in range(self.dynamics.reach + 1):
-            rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
-            values.append((coefficient[rows, None] * mass[rows]).ravel())
-        return np.concatenate(values)
-
-    @cached_property
-    def _known_inertia(self) -> Array:
-        """The same where it does not depend on (q, φ)."""
-        return self._inertia(self.dynamics, np.zeros(0))
-
-    @cached_property
-    def _passing(self) -> PassingGrasps:
-        return PassingGrasps.of(
-            self.dynamics,
-            self.jacobian,
-            self._row_starts(),
-            self.pattern,
-            self.row_dofs,
-            self.length_m / self.force_n,
-        )
+        """Its entries; row numbers count within the segment."""
+        return self.motion_rows.band
 
     def constraints_and_jacobian(
-        self, x: Array, setting: Setting, values: Array
+        self, x: Array, setting: Setting, forces: Linearisation, values: Array
     ) -> tuple[Array, Array]:
         """Write ∂c/∂x into `values` (jacobian.nnz,), at the memory as it is.
 
@@ -485,6 +429,8 @@ class Segment:
         ----------
         x : (N, 3n) metres
         setting : Setting
+        forces : Linearisation
+            Of the evaluations of x.
 
         Returns
         -------
@@ -492,18 +438,7 @@ class Segment:
         by_p : (constraints, len(moving)) ∂c/∂(q, φ), where it is not zero
         """
         dynamics = setting.dynamics
-        forces = dynamics.linearise(x, setting.theta, self.linearisation_rows)
-        self.jacobian.fill(values, forces.by_position, forces.by_velocity, self.body.threads)
-        positions, grasps = self._jacobian_constants
-        if setting.mass_moves:
-            values[positions] += self._inertia(dynamics, setting.theta)
-        else:
-            values[positions] += self._known_inertia
-        skew = skew_values(self.pattern, forces.by_position_skew)
-        if skew.size:
-            self._skew_jacobian.fill(values, skew, skew, self.body.threads)
-        self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
-        values[grasps] = 1.0
+        self.motion_rows.fill(values, forces, dynamics, setting.theta, setting.mass_moves)
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
         rows, nu = slice(dynamics.first_row, None), dynamics.evaluation_states(x)[1]
         by_p[rows] = setting.force_slopes(rows, forces.by_theta, nu)
@@ -520,23 +455,23 @@ class Segment:
         rows = self._rows(x, dynamics.assemble_residual(x, setting.theta, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
-    def _row_weights(self, multipliers: Array) -> Array:
-        """(N, 3n) derivative of multipliers · c by the rows in newtons."""
-        dynamics = self.dynamics
-        row_weights = np.zeros((self.grid_rows, self.dofs))
+    def weights(self, multipliers: Array, of_reactions: Array | float = 0.0) -> Weights:
+        """Those of multipliers · c, and of rows (N, 3n) where no force counts as taken."""
+        dynamics, t = self.dynamics, self.dynamics.tables
+        rows = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
-        row_weights[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
-        row_weights[:, self.held_dofs] = 0
-        return dynamics.without_taken(row_weights)
-
-    def force_weights(self, multipliers: Array) -> Array:
-        """(N, 3n) derivative of multipliers · c by the forces at the evaluations."""
-        dynamics, row_weights = self.dynamics, self._row_weights(multipliers)
-        return dynamics.without_taken(dynamics.combine_transposed(dynamics.tables.w, row_weights))
+        rows[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
+        rows[:, self.held_dofs] = 0
+        rows = dynamics.without_taken(rows)
+        forces = dynamics.without_taken(dynamics.combine_transposed(t.w, rows))
+        if isinstance(of_reactions, np.ndarray):
+            rows = rows + of_reactions
+            forces = forces + dynamics.combine_transposed(t.w, of_reactions)
+        return Weights(multipliers, rows, forces)
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
         """Derivatives of multipliers · c through the memory, by scaled x (N, 3n) and by q."""
-        by_x, by_q = self.pulled_through_memory(x, setting, self.force_weights(multipliers))
+        by_x, by_q = self.pulled_through_memory(x, setting, self.weights(multipliers).forces)
         return self.length_m * by_x, by_q
 
     def pulled_through_memory(
@@ -552,7 +487,7 @@ class Segment:
 
     @cached_property
     def linearisation_rows(self) -> Array:
-        """Work space of `constraints_and_jacobian`."""
+        """Work space of linearisations."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
         return np.zeros((self.constraint_times, self.dynamics.forces.linearisation_width))
 
@@ -600,7 +535,7 @@ class Segment:
             xx = scale * p[:, i] * p[:, other]
             xv = scale * (p[:, i] * q[:, other] + q[:, i] * p[:, other]) / step
             if xx.any() or xv.any():
-                yield Term(i, _ahead(xx, i), _ahead(xv, i))
+                yield Term(i, ahead(xx, i), ahead(xv, i))
 
     def _skew_terms(self, distance: int) -> Iterator[Term]:
         """The same of the skew part of ∂²φ/∂x∂v."""
@@ -610,19 +545,19 @@ class Segment:
             other = i + distance
             skew = scale * (t.p[:, other] * t.q[:, i] - t.q[:, other] * t.p[:, i])
             if skew.any():
-                yield Term(i, _ahead(skew, i), np.zeros(len(skew)))
+                yield Term(i, ahead(skew, i), np.zeros(len(skew)))
 
     def hessian_values(
         self,
         x: Array,
         phi: Array,
         setting: Setting,
-        multipliers: Array,
+        weights: Weights,
         loss_weight: float,
         values: Array,
         memory_weights: Sequence[Array] = (),
     ) -> Array:
-        """Write the columns of x, then of φ, of ∇²(loss_weight · L + multipliers · c).
+        """Write the columns of x, then of φ, of ∇²(loss_weight · L + weights · c).
 
         Parameters
         ----------
@@ -636,9 +571,7 @@ class Segment:
         """
         dynamics, band = setting.dynamics, self.hessian
         first = dynamics.first_row
-        by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
-        weights = self.force_weights(multipliers)
-        curvature = self._curvature(x, setting, weights, memory_weights)
+        curvature = self._curvature(x, setting, weights.forces, memory_weights)
         layout = self.hessian_layout
         of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)
         band.fill(
@@ -651,7 +584,7 @@ class Segment:
         by_nu = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
         by_theta = dynamics.combine_transposed(dynamics.state_weights, by_xi)
         by_theta += dynamics.combine_transposed(dynamics.tables.q, by_nu)
-        by_theta -= (by_inertia := self._inertia_curvature(x, setting, multipliers))[0]
+        by_theta -= (by_inertia := self._inertia_curvature(x, setting, weights.rows))[0]
         of_band[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
         if layout.band is not None:
             values[: layout.x_entries] = 0
@@ -663,20 +596,21 @@ class Segment:
             of_x = dynamics.combine_transposed(dynamics.state_weights, of_drives)
             values[layout.driven] += self.length_m * of_x.ravel()
         mass_kg = dynamics.forces.mass.at(setting.theta)
-        pull = (weights * mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
+        pull = (weights.forces * mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
         by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
             "i,ijk->jk", pull, setting.gravity_phi_phi
         )
         if setting.held.moves:
             of_goals = np.zeros((self.grid_rows, self.dofs))
+            by_time = weights.multipliers.reshape(self.constraint_times, self.rows_per_time)
             of_goals[first:, self.row_dofs] = -by_time / self.length_m
             grasped = ~np.isnan(setting.held.positions_m)
             of_goals = np.where(grasped, of_goals[:, setting.held.dofs], 0.0)
             by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
                 phi, of_goals
             )
-        by_phi += self._add_coupling(x, setting, weights, multipliers, values)
+        by_phi += self._add_coupling(x, setting, weights, values)
         by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
         theta_theta = curvature.theta_theta.sum(axis=0)
@@ -720,13 +654,13 @@ class Segment:
         return setting.gravity_phi[:, self._tilts].T @ by_q
 
     def _inertia_curvature(
-        self, x: Array, setting: Setting, multipliers: Array
+        self, x: Array, setting: Setting, weights: Array
     ) -> tuple[Array | float, Array | float]:
-        """Of multipliers · M a: second derivatives by x and q, (N, 3n, nq), and the first by θ."""
+        """Of weights · M a: second derivatives by x and q, (N, 3n, nq), and the first by θ."""
         slopes, dynamics = self.body.mass_slopes, self.dynamics
         if not slopes:
             return 0.0, 0.0
-        weights, of_theta = self._row_weights(multipliers), np.zeros(len(setting.theta))
+        of_theta = np.zeros(len(setting.theta))
         pulled = dynamics.combine_transposed(dynamics.tables.s, weights) / dynamics.step_s**2
         acceleration, of_x = dynamics.acceleration(x), 0.0
         for density, slope in slopes.items():
@@ -734,18 +668,15 @@ class Segment:
             of_x = of_x + (pulled * slope)[..., None] * setting.theta_q[density]
         return of_x, of_theta
 
-    def _add_coupling(
-        self, x: Array, setting: Setting, force_weights: Array, multipliers: Array, values: Array
-    ) -> Array:
+    def _add_coupling(self, x: Array, setting: Setting, weights: Weights, values: Array) -> Array:
         """Second derivatives by what turns gravity, and by when loads join, and by q and x.
 
         They go into `values`; those (k, k) of the loads by φ are returned.
         """
         by_phi = np.zeros((len(self.nuisance.moving),) * 2)
-        row_weights = self._row_weights(multipliers)
-        coupled = [self._weight_curvature(force_weights, setting).ravel()]
+        coupled = [self._weight_curvature(weights.forces, setting).ravel()]
         for load in setting.joining:
-            by_q, by_x, own = setting.curvature(load, x, force_weights, row_weights)
+            by_q, by_x, own = setting.curvature(load, x, weights.forces, weights.rows)
             coupled += [by_q, self.length_m * by_x[:, load.dofs].ravel()]
             by_phi[load.column] += own
             by_phi[:, load.column] += np.where(np.arange(len(own)) == load.column, 0.0, own)
@@ -788,16 +719,3 @@ class Segment:
             self._coupled,
             self.nuisance.of_drives,
         )
-
-    # Structure --------------------------------------------------------------------------------
-
-    def _row_starts(self) -> Index:
-        starts = (np.arange(self.grid_rows) - self.dynamics.first_row) * self.rows_per_time
-        return np.maximum(starts, -1) if self.dynamics.first_row else starts
-
-
-def _ahead(values: Array, steps: int) -> Array:
-    """values[t + steps] at t, zero beyond the end."""
-    shifted = np.zeros_like(values)
-    shifted[: len(values) - steps] = values[steps:]
-    return shifted

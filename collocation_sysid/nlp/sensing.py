@@ -128,16 +128,7 @@ class Sensing:
         if not self.segment.sensors:
             return 0.0
         found = self.linearised(self.at(x), NOTHING)
-        return float(sum(self._rho(residual)[0].sum() for residual, _ in found))
-
-    def _rho(self, residual: Array) -> tuple[Array, Array]:
-        """ρ (S, 2) of residuals (S, 2, 3), and its slopes by them."""
-        huber, square = self.segment.huber, np.sum(residual**2, axis=2)
-        if huber is None:
-            return square, 2 * residual
-        length = np.sqrt(np.maximum(square, huber**2))
-        rho = np.where(square > huber**2, 2 * huber * length - huber**2, square)
-        return rho, 2 * residual * (huber / length)[..., None]
+        return float(sum(robust(residual, self.segment.huber)[0].sum() for residual, _ in found))
 
     def gradient(self, x: Array) -> tuple[Array, Array]:
         """∂L_w/∂x (N, 3n) and ∂L_w/∂(q, φ) (nq + k,)."""
@@ -146,7 +137,7 @@ class Sensing:
         for sensor, (residual, slope) in zip(
             self.segment.sensors, self.linearised(forced, NOTHING), strict=True
         ):
-            of_residual = self._rho(residual)[1]
+            of_residual = robust(residual, self.segment.huber)[1]
             by_p += np.einsum("sfa,sfap->p", of_residual, slope)
             pull = of_residual.reshape(-1, 6) * sensor.present / sensor.wrench.sigmas
             by_force, by_place = sensor.arms(forced)
@@ -190,3 +181,24 @@ class Sensing:
         of_memory, of_q = segment.pulled_through_memory(x, setting, whole)
         by_p[: segment.nq] += of_q
         return by_x + of_memory, by_p
+
+
+def robust(residual: Array, huber: float | None) -> tuple[Array, Array]:
+    """ρ (S, 2) of residuals (S, 2, 3), and its slopes by them."""
+    square = np.sum(residual**2, axis=2)
+    if huber is None:
+        return square, 2 * residual
+    length = np.sqrt(np.maximum(square, huber**2))
+    rho = np.where(square > huber**2, 2 * huber * length - huber**2, square)
+    return rho, 2 * residual * (huber / length)[..., None]
+
+
+def robust_curvature(residual: Array, huber: float | None) -> Array:
+    """(S, 2, 3, 3) second derivatives of ρ by the residuals."""
+    found = np.broadcast_to(2 * np.eye(3), (*residual.shape, 3))
+    if huber is None:
+        return found
+    square = np.sum(residual**2, axis=2)[..., None, None]
+    length = np.sqrt(np.maximum(square, huber**2))
+    along = residual[..., :, None] * residual[..., None, :] / length**2
+    return huber / length * (found - 2 * np.where(square > huber**2, along, 0.0))

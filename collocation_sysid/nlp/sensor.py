@@ -108,18 +108,96 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """What a tool takes on the grid, (n, 6), and its slopes.
+    """What a tool takes on the grid, and how: at the force `pull` a kilogram, `arm` off the point.
 
     Attributes
     ----------
-    value, by_mass : (n, 6)
-    by_centre, by_gravity : (n, 6, 3)
+    mass_kg : float
+    pull, arm : (n, 3)
+    axes : (n, 3, 3) Q, of the sensor
+    turns, turn_rates : (n, 3, 3) of the grasp, and their second derivatives
     """
 
-    value: Array
-    by_mass: Array
-    by_centre: Array
-    by_gravity: Array
+    mass_kg: float
+    pull: Array
+    arm: Array
+    axes: Array
+    turns: Array
+    turn_rates: Array
+
+    @property
+    def value(self) -> Array:
+        """(n, 6)."""
+        return self.mass_kg * self._unit
+
+    @property
+    def _unit(self) -> Array:
+        return self._both(self.pull[:, :, None])[:, :, 0]
+
+    def _both(self, force: Array) -> Array:
+        axes = np.swapaxes(self.axes, 1, 2)
+        return np.concatenate([axes @ force, axes @ _cross(self.arm) @ force], axis=1)
+
+    @property
+    def slopes(self) -> Array:
+        """(n, 6, 7) by mass, centre and gravity."""
+        by_centre = self._both(self.turn_rates)
+        by_centre[:, 3:] -= np.swapaxes(self.axes, 1, 2) @ _cross(self.pull) @ self.turns
+        by_gravity = -self._both(np.broadcast_to(np.eye(3), self.axes.shape))
+        both = self.mass_kg * np.concatenate([by_centre, by_gravity], axis=2)
+        return np.concatenate([self._unit[..., None], both], axis=2)
+
+    def curvature(self, weights: Array) -> Array:
+        """(7, 7) second derivatives of Σ weights (n, 6) · value by the same."""
+        force, torque = (
+            np.einsum("kij,kj->ki", self.axes, each) for each in np.split(weights, 2, axis=1)
+        )
+        lever = force + np.cross(torque, self.arm)
+        crossed = _cross(torque) @ self.turns
+        found = np.zeros((7, 7))
+        found[0, 1:4] = np.einsum("kij,ki->j", self.turn_rates, lever)
+        found[0, 1:4] += np.einsum("kij,ki->j", self.turns, np.cross(self.pull, torque))
+        found[0, 4:] = -lever.sum(axis=0)
+        found[1:4, 4:] = -self.mass_kg * crossed.sum(axis=0).T
+        found[1:4, 1:4] = self.mass_kg * np.einsum("kij,kil->jl", self.turn_rates, crossed)
+        return found + found.T
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolation:
+    """Lagrange's weights (S, u) of samples at values `around` (S, u); zero where not covered.
+
+    `slopes` and `curvatures` are their derivatives by the samples' times.
+    """
+
+    around: Index
+    values: Array
+    slopes: Array
+    curvatures: Array
+
+    @classmethod
+    def of(cls, at_s: Array, t_s: Array, most: int, covered: NDArray[np.bool_]) -> Interpolation:
+        """From the values at `most` of the times `t_s` (n,) around each of `at_s` (S,)."""
+        count, used = len(t_s), min(most, len(t_s))
+        first = np.searchsorted(t_s, at_s, side="right") - 1 - (used - 1) // 2
+        around = np.clip(first, 0, count - used)[:, None] + np.arange(used)
+        found = np.zeros((3, len(at_s), used))
+        for i in range(used):
+            # Of a product with two derivatives, as a polynomial in a shift of its factors.
+            found[0, :, i] = 1.0
+            for j in range(used):
+                if j != i:
+                    span = t_s[around[:, i]] - t_s[around[:, j]]
+                    factor, slope = (at_s - t_s[around[:, j]]) / span, 1 / span
+                    found[2, :, i] = found[2, :, i] * factor + 2 * found[1, :, i] * slope
+                    found[1, :, i] = found[1, :, i] * factor + found[0, :, i] * slope
+                    found[0, :, i] *= factor
+        return cls(around, *(found * covered[:, None]))
+
+    def matrix(self, weights: Array, count: int) -> sp.csr_array:
+        """(S, count) from weights (S, u), any of the three."""
+        rows = np.repeat(np.arange(len(weights)), weights.shape[1])
+        return sp.csr_array((weights.ravel(), (rows, self.around.ravel())), (len(weights), count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,25 +312,23 @@ class Sensor:
         if not len(self.phi_places("tool-mass")):
             return None
         (mass,), off = self._value("tool-mass", phi), self._value("tool-centre", phi)
-        k = self.grid[:count]
-        turns, points = (each[:count] for each in self.frames)
-        pose, shift = self._poses(k)
-        turn_rate, shift_rate = self._accelerations(count)
+        axes, points = (each[:count] for each in self.frames)
+        turns, shifts = self._poses(self.grid[:count])
+        turn_rates, shift_rates = self._accelerations(count)
         about = self.wrench.frame == "grasp"
         centre = self.wrench.point_m if about else self.nuisance.grasp_pivot_m
         centre = centre + off if len(off) else centre
-        pull = turn_rate @ centre + shift_rate - gravity_m_s2  # (n, 3)
-        arm = pose @ centre + shift - points
-        axes, crossed = np.swapaxes(turns, 1, 2), _cross(arm)
+        pull = turn_rates @ centre + shift_rates - gravity_m_s2
+        arm = turns @ centre + shifts - points
+        return Tool(float(mass), pull, arm, axes, turns, turn_rates)
 
-        def both(force: Array) -> Array:
-            return np.concatenate([axes @ force, axes @ crossed @ force], axis=1)
-
-        unit = both(pull[:, :, None])[:, :, 0]
-        by_centre = mass * both(turn_rate)
-        by_centre[:, 3:] -= mass * axes @ _cross(pull) @ pose
-        by_gravity = -mass * both(np.broadcast_to(np.eye(3), crossed.shape))
-        return Tool(mass * unit, unit, by_centre, by_gravity)
+    def tool_by_phi(self, gravity_phi: Array) -> Array:
+        """(7, k) derivatives of the tool's mass and centre, and of gravity (3, k), by φ."""
+        found = np.concatenate([np.zeros((4, gravity_phi.shape[1])), gravity_phi])
+        for first, kind in ((0, "tool-mass"), (1, "tool-centre")):
+            here = self.phi_places(kind)
+            found[first + np.arange(len(here)), here] = self.nuisance.scales[here]
+        return found
 
     def _accelerations(self, count: int) -> tuple[Array, Array]:
         """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
@@ -268,22 +344,41 @@ class Sensor:
 
     # At the samples ---------------------------------------------------------------------------
 
+    def interpolation(self, phi: Array, count: int) -> Interpolation:
+        """ℓ, of the first `count` times of the grid."""
+        shift = self._value("sensor-time", phi)
+        covered = self.covered(int(self.grid[count - 1]) + self.late + 1)
+        at_s = self.wrench.t_s + (float(shift[0]) if len(shift) else 0.0)
+        used = 2 if self.on.static else NEIGHBOURS
+        return Interpolation.of(at_s, self.on.t_s[self.grid[:count]], used, covered)
+
+    def lag_s(self, phi: Array) -> float | None:
+        """T of the low-pass, None where there is none."""
+        lag = self._value("sensor-lag", phi)
+        return float(lag[0]) if len(lag) else None
+
     def kernels(self, phi: Array, count: int) -> tuple[sp.csr_array, sp.csr_array, Array]:
         """From the grid to the samples (S, n): ℓ L, its slope by the shift, and that by the lag.
 
         The last is of shape (0, 0) where no lag is estimated.
         """
-        shift = self._value("sensor-time", phi)
-        covered = self.covered(int(self.grid[count - 1]) + self.late + 1)
-        at_s = self.wrench.t_s + (float(shift[0]) if len(shift) else 0.0)
-        used = 2 if self.on.static else NEIGHBOURS
-        value, slope = _interpolation(at_s, self.on.t_s[self.grid[:count]], used, covered)
-        lag = self._value("sensor-lag", phi)
-        if not len(lag):
+        around, lag_s = self.interpolation(phi, count), self.lag_s(phi)
+        value, slope = (around.matrix(each, count) for each in (around.values, around.slopes))
+        if lag_s is None:
             return value, slope, np.zeros((0, 0))
-        smoothing, by_lag = low_pass(float(lag[0]), self.on.step_s, count)
+        smoothing, by_lag = low_pass(lag_s, self.on.step_s, count)
         smooth = (sp.csr_array(np.asarray(each @ smoothing)) for each in (value, slope))
         return next(smooth), next(smooth), np.asarray(value @ by_lag)
+
+    def with_tare(self, read: Array, phi: Array) -> Array:
+        """Readings (S, 6), in place."""
+        read[:, self.tared] += self._value("tare", phi)
+        return read
+
+    @property
+    def tared(self) -> Index:
+        """The components of its tares."""
+        return np.flatnonzero(self.wrench.measured)[: len(self.phi_places("tare"))]
 
     def read(
         self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
@@ -305,12 +400,7 @@ class Sensor:
         first = size - len(phi)
         if (tool := self.tool(gravity[0], phi, len(value))) is not None:
             value = value + tool.value
-            scales = self.nuisance.scales
-            slope[..., first:] += tool.by_gravity @ gravity[1]
-            (mass,), centre = self.phi_places("tool-mass"), self.phi_places("tool-centre")
-            slope[..., first + mass] += scales[mass] * tool.by_mass
-            if len(centre):
-                slope[..., first + centre] += scales[centre] * tool.by_centre
+            slope[..., first:] += tool.slopes @ self.tool_by_phi(gravity[1])
         if not len(value):
             return np.zeros((len(self.wrench.t_s), 6)), np.zeros((len(self.wrench.t_s), 6, size))
         return self._sampled(value, slope, phi, first)
@@ -325,10 +415,8 @@ class Sensor:
             for place in self.phi_places(kind):
                 of_read[..., first + place] += scales[place] * (own @ value)
         tare = self.phi_places("tare")
-        components = np.flatnonzero(self.wrench.measured)[: len(tare)]
-        read[:, components] += self._value("tare", phi)
-        of_read[:, components, first + tare] += scales[tare]
-        return read, of_read
+        of_read[:, self.tared, first + tare] += scales[tare]
+        return self.with_tare(read, phi), of_read
 
     def readings(self, forced: Forced, phi: Array, gravity_m_s2: Array) -> Array:
         """ŷ (S, 6), NaN where it is not known."""
@@ -387,34 +475,9 @@ def _by_component(blocks: Array) -> Array:
     return blocks.transpose(0, 2, 1, 3).reshape(count, 6, 3 * nodes)
 
 
-def _interpolation(
-    at_s: Array, t_s: Array, most: int, covered: NDArray[np.bool_]
-) -> tuple[sp.csr_array, sp.csr_array]:
-    """Lagrange's weights (S, n) of values at `t_s` (n,) for those at covered times, and slopes."""
-    count, used = len(t_s), min(most, len(t_s))
-    first = np.searchsorted(t_s, at_s, side="right") - 1 - (used - 1) // 2
-    around = np.clip(first, 0, count - used)[:, None] + np.arange(used)
-    values, slopes = np.zeros((2, len(at_s), used))
-    for i in range(used):
-        others = np.delete(around, i, axis=1)
-        spans = t_s[around[:, [i]]] - t_s[others]
-        factors = (at_s[:, None] - t_s[others]) / spans
-        values[:, i] = factors.prod(axis=1)
-        for m in range(used - 1):
-            slopes[:, i] += np.delete(factors, m, axis=1).prod(axis=1) / spans[:, m]
-    rows = np.repeat(np.arange(len(at_s)), used)
-    both = [
-        sp.csr_array(
-            ((weights * covered[:, None]).ravel(), (rows, around.ravel())), (len(at_s), count)
-        )
-        for weights in (values, slopes)
-    ]
-    return both[0], both[1]
-
-
 def low_pass(lag_s: float, step_s: float, count: int) -> tuple[Array, Array]:
     """L (n, n) of y' = (W − y) / T, W linear between grid times and steady before, and ∂L/∂T."""
-    e, a, b = _fading(lag_s, step_s)
+    e, a, b = fading(lag_s, step_s)[:, :2]
     value, slope = np.zeros((2, count, count))
     value[0, 0] = 1.0
     for k in range(1, count):
@@ -425,15 +488,17 @@ def low_pass(lag_s: float, step_s: float, count: int) -> tuple[Array, Array]:
     return value, slope
 
 
-def _fading(
-    lag_s: float, step_s: float
-) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-    """e, a and b of y_k = e y_{k−1} + a W_{k−1} + b W_k, each with its slope by T."""
+def fading(lag_s: float, step_s: float) -> Array:
+    """(3, 3) e, a and b of y_k = e y_{k−1} + a W_{k−1} + b W_k, each with two slopes by T."""
     if lag_s < 1e-6 * step_s:
-        return (0.0, 0.0), (0.0, 1 / step_s), (1.0, -1 / step_s)
+        return np.array([[0.0, 0.0, 0.0], [0.0, 1 / step_s, 0.0], [1.0, -1 / step_s, 0.0]])
     share = lag_s / step_s
     e = float(np.exp(-1 / share))
     by_e = e / (share * lag_s)
+    twice = by_e * (1 / share - 2) / lag_s
     a = share * (1 - e) - e
     by_a = (1 - e) / step_s - share * by_e - by_e
-    return (e, by_e), (a, by_a), (1 - e - a, -by_e - by_a)
+    twice_a = -2 * by_e / step_s - (share + 1) * twice
+    return np.array(
+        [[e, by_e, twice], [a, by_a, twice_a], [1 - e - a, -by_e - by_a, -twice - twice_a]]
+    )

@@ -28,7 +28,6 @@ class Widened:
     def of(
         cls,
         structure: tuple[Index, Index],
-        columns: Index,
         count: int,
         rows: Index,
         further: Index,
@@ -37,17 +36,18 @@ class Widened:
 
         Parameters
         ----------
-        structure : column pointers and row indices of the smaller matrix, in the larger one's rows
-        columns : which of the larger one's columns each of its columns is, ascending
+        structure : column pointers and row indices of the smaller matrix, the first columns
         count : columns of the larger one
         rows, further : (k,) rows and columns of the entries added
         """
         indptr, indices = structure
         before = np.zeros(count, dtype=np.int64)
-        before[columns] = np.diff(indptr)
+        before[: len(indptr) - 1] = np.diff(indptr)
         more = np.bincount(further, minlength=count)
         starts = np.concatenate([[0], np.cumsum(before + more)])
-        kept = np.arange(len(indices)) + np.repeat(starts[columns] - indptr[:-1], np.diff(indptr))
+        kept = np.arange(len(indices)) + np.repeat(
+            starts[: len(indptr) - 1] - indptr[:-1], np.diff(indptr)
+        )
         order = np.lexsort((rows, further))
         first = starts[:-1] + before - np.concatenate([[0], np.cumsum(more)[:-1]])
         added = np.empty(len(rows), dtype=np.int64)

@@ -1,0 +1,120 @@
+"""What a program has as variables, with an equation each, that follows from its other variables.
+
+The equations come after all rows of the program given, the variables after all of its variables.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Array, Index
+from .collocation import Part
+from .segment import Segment, Weights
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where in z and g the variables and the equations of an addition begin."""
+
+    variable: int
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class Addition(ABC):
+    """Variables of one experiment and as many equations.
+
+    Attributes
+    ----------
+    segment : Segment
+    number : int
+        Of the segment.
+    first_phi : int
+        Where in z the φ of all experiments begin.
+    places : Places
+    """
+
+    segment: Segment
+    number: int
+    first_phi: int
+    places: Places
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number of variables, and of equations."""
+
+    @property
+    def variables(self) -> slice:
+        """They in z."""
+        return slice(self.places.variable, self.places.variable + self.count)
+
+    @property
+    def rows(self) -> slice:
+        """Their equations in g."""
+        return slice(self.places.row, self.places.row + self.count)
+
+    @property
+    def after(self) -> Places:
+        """Where the next begins."""
+        return Places(self.variables.stop, self.rows.stop)
+
+    @property
+    def phi_columns(self) -> Index:
+        """(k,) where in z the experiment's φ are."""
+        first = self.first_phi + self.segment.first.phi - self.segment.nq
+        return first + np.arange(self.segment.nuisance.size)
+
+    def given(self, part: Part, z: Array) -> Part:
+        """The experiment with what it takes of these variables."""
+        return part
+
+    @abstractmethod
+    def following(self, part: Part) -> Array:
+        """(count,) the variables as they follow from what the program given has."""
+
+    @abstractmethod
+    def values(self, part: Part, z: Array) -> Array:
+        """(count,) the equations."""
+
+    @abstractmethod
+    def jacobian_entries(self) -> tuple[Index, Index]:
+        """Rows and columns of the further entries of ∂g/∂z, in the order of their values."""
+
+    @abstractmethod
+    def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
+        """The equations, and the values of these entries."""
+
+    def hessian_entries(self) -> tuple[Index, Index]:
+        """The same of the upper triangle of the Lagrangian's Hessian, in columns of variables."""
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+
+    def hessian_values(
+        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: Weights
+    ) -> Array:
+        """The values of these entries; multipliers are those of all of g."""
+        return np.zeros(0)
+
+    @property
+    def nonzeros(self) -> tuple[int, int]:
+        """How many further entries Jacobian and Hessian have."""
+        return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
+
+    # What the loss has of the variables ---------------------------------------------------------
+
+    def loss(self, part: Part, z: Array) -> float:
+        """Its value, over and above that of the program given."""
+        return 0.0
+
+    def gradient(self, part: Part, z: Array) -> tuple[Array, Array]:
+        """∂loss by the variables (count,) and by φ (k,)."""
+        return np.zeros(self.count), np.zeros(len(part.phi))
+
+    def phi_curvature(
+        self, part: Part, z: Array, loss_weight: float, multipliers: Array
+    ) -> Array | float:
+        """Second derivatives (k, k) by φ of loss_weight · loss + multipliers · g."""
+        return 0.0

@@ -1,0 +1,221 @@
+"""The same program with all that follows as variables, for methods that want it as matrices.
+
+What the points of a body with memory carry follows from positions and parameters, so that without
+it ∂g/∂z would be filled below the diagonal; and a measured wrench is a function of what grasps
+give, so that the loss would be one of all that moves around them. Here both stand in z behind what
+the program has, and their equations in g after all other rows, see `overstress`, `reaction_rows`
+and `sensor_rows`: ∂g/∂z and the Lagrangian's Hessian are sparse, and exact. Eliminating both leads
+back to the program as it is given, with the same optimum and the same multipliers of its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import Array, Index
+from .addition import Addition, Places
+from .collocation import Collocation, Part
+from .overstress import Overstress
+from .reaction_rows import Reactions
+from .segment import Segment, Weights
+from .sensor_rows import SensorRows
+from .widened import Widened
+
+
+def made_explicit(collocation: Collocation) -> Collocation:
+    """The program with memory and wrenches as variables; itself where it has neither."""
+    if not (collocation.remembers or any(s.sensors for s in collocation.segments)):
+        return collocation
+    options = {f.name: getattr(collocation, f.name) for f in fields(collocation)}
+    made = Explicit(**options)
+    vars(made)["plain"] = collocation
+    return made
+
+
+def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
+    """Variables of one of the two programs as the other has them."""
+    return z if of.variables == to.variables else to.pack(*of.unpack(z))
+
+
+class Explicit(Collocation):
+    """A collocation NLP that has the memory of its bodies, and wrenches, among its variables."""
+
+    @cached_property
+    def plain(self) -> Collocation:
+        """The program as it is given."""
+        return Collocation(**{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @cached_property
+    def segments(self) -> tuple[Segment, ...]:
+        """One of each experiment that is fitted."""
+        return self.plain.segments
+
+    @cached_property
+    def additions(self) -> tuple[Addition, ...]:
+        """What is added, experiment by experiment."""
+        found: list[Addition] = []
+        places = Places(self.plain.variables, self.plain.constraints)
+        for number, segment in enumerate(self.segments):
+            reactions, here = None, (segment, number, self.of_phi.start)
+            sensors = [sensor for sensor in segment.sensors if len(sensor.grid)]
+            if sensors:
+                reactions = Reactions(*here, places)
+                found.append(reactions)
+                places = reactions.after
+            if segment.body.remembers:
+                found.append(Overstress(*here, places, reactions))
+                places = found[-1].after
+            for sensor in sensors:
+                assert reactions is not None
+                found.append(SensorRows(*here, places, sensor, reactions))
+                places = found[-1].after
+        return tuple(found)
+
+    def added(self, *kinds: type[Addition]) -> int:
+        """Number of the variables of some kinds, and of their equations."""
+        return sum(each.count for each in self.additions if isinstance(each, kinds))
+
+    @property
+    def further_nonzeros(self) -> tuple[int, int]:
+        """Entries that Jacobian and Hessian have for all this."""
+        both = [each.nonzeros for each in self.additions]
+        return sum(each for each, _ in both), sum(each for _, each in both)
+
+    @property
+    def variables(self) -> int:
+        """Length of z."""
+        return self.plain.variables + self.added(Addition)
+
+    @property
+    def constraints(self) -> int:
+        """Length of g."""
+        return self.plain.constraints + self.added(Addition)
+
+    @property
+    def remembers(self) -> bool:
+        """Nothing that is not in z."""
+        return False
+
+    def pack(self, p: Array, positions: Sequence[Array]) -> Array:
+        """Variables z from parameters and positions, the others as they follow from them."""
+        parts = self.plain.parts_at(p, positions)
+        following = [each.following(parts[each.number]) for each in self.additions]
+        return np.concatenate([self.plain.pack(p, positions), *following])
+
+    def parts(self, z: Array) -> list[Part]:
+        """Every experiment at z, with the memory there, and wrenches left to what is added."""
+        parts = [replace(part, felt=False) for part in super().parts(z)]
+        for each in self.additions:
+            parts[each.number] = each.given(parts[each.number], z)
+        return parts
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of z; equal for what is given."""
+        lower, upper = self.plain.bounds()
+        free = np.full(self.added(Addition), np.inf)
+        return np.concatenate([lower, -free]), np.concatenate([upper, free])
+
+    def objective(self, z: Array) -> float:
+        """L divided by the number of measurements."""
+        parts = self.parts(z)
+        further = sum(each.loss(parts[each.number], z) for each in self.additions)
+        return super().objective(z) + self.loss_scale * further
+
+    def gradient(self, z: Array) -> Array:
+        """∂objective/∂z."""
+        parts = self.parts(z)
+        found = np.zeros(self.variables)
+        found[: self.plain.variables] = self.plain.gradient_of(parts, self.parameters_of(z))
+        for each in self.additions:
+            own, by_phi = each.gradient(parts[each.number], z)
+            found[each.variables] = self.loss_scale * own
+            found[each.phi_columns] += self.loss_scale * by_phi
+        return found
+
+    def constraint_values(self, z: Array) -> Array:
+        """g, scaled."""
+        parts = self.parts(z)
+        found = [each.values(parts[each.number], z) for each in self.additions]
+        return np.concatenate([super().constraint_values(z), *found])
+
+    # Matrices -----------------------------------------------------------------------------------
+
+    @cached_property
+    def _jacobian(self) -> Widened:
+        entries = [each.jacobian_entries() for each in self.additions]
+        return self._with(self.plain.jacobian_structure, entries)
+
+    @cached_property
+    def _hessian(self) -> Widened:
+        entries = [each.hessian_entries() for each in self.additions]
+        return self._with(self.plain.hessian_structure, entries)
+
+    def _with(
+        self, structure: tuple[Index, Index], entries: Sequence[tuple[Index, Index]]
+    ) -> Widened:
+        rows, columns = (np.concatenate(each) for each in zip(*entries, strict=True))
+        return Widened.of(structure, self.variables, rows, columns)
+
+    @cached_property
+    def jacobian_structure(self) -> tuple[Index, Index]:
+        """Column pointers and row indices of ∂g/∂z by compressed columns."""
+        return self._jacobian.indptr, self._jacobian.indices
+
+    def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
+        """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
+        values = np.empty(len(self._jacobian.indices)) if out is None else out
+        parts = self.parts(z)
+        rows, plain = self.plain.linearised(parts)
+        found = [each.jacobian_values(parts[each.number], z) for each in self.additions]
+        self._jacobian.fill(values, plain, np.concatenate([further for _, further in found]))
+        return np.concatenate([rows, *(own for own, _ in found)]), values
+
+    @cached_property
+    def hessian_structure(self) -> tuple[Index, Index]:
+        """The same of the upper triangle of ∇²_z (w L + yᵀ g)."""
+        return self._hessian.indptr, self._hessian.indices
+
+    @cached_property
+    def hessian_diagonals(self) -> tuple[Index, Index]:
+        """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        return self.plain.hessian_diagonals
+
+    def hessian_values(
+        self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
+    ) -> Array:
+        """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
+        values = np.empty(len(self._hessian.indices)) if out is None else out
+        parts, weights = self.parts(z), self._weights(multipliers)
+        of_memory = {
+            each.number: each.weights(multipliers)
+            for each in self.additions
+            if isinstance(each, Overstress)
+        }
+        plain = self.plain.curved(parts, loss_weight, weights, memory_weights=of_memory)
+        scaled, further = loss_weight * self.loss_scale, [np.zeros(0)]
+        for each in self.additions:
+            here = parts[each.number], z, scaled, multipliers
+            further.append(each.hessian_values(*here, weights[each.number]))
+            of_phi = np.triu_indices(each.segment.nuisance.size)
+            curvature = np.broadcast_to(
+                each.phi_curvature(*here), (len(parts[each.number].phi),) * 2
+            )
+            plain[self.plain.hessian_phi(each.number)] += curvature[of_phi]
+        self._hessian.fill(values, plain, np.concatenate(further))
+        return values
+
+    def _weights(self, multipliers: Array) -> list[Weights]:
+        """Of the rows of each experiment, those of its reactions among them."""
+        of_reactions = {
+            each.number: each.weights(multipliers)
+            for each in self.additions
+            if isinstance(each, Reactions)
+        }
+        return [
+            segment.weights(multipliers[segment.rows], of_reactions.get(number, 0.0))
+            for number, segment in enumerate(self.segments)
+        ]

@@ -1,0 +1,171 @@
+"""Wrenches as variables: derivatives of that program, and what methods find with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from memories_small import ONE, TWO, guesses, recorded, remembering
+from problems_small import GUESS, TRUTH, bar_let_go, bar_loaded, driven_bar, hung_cube
+from test_explicit import assert_derivatives, explicit
+from test_static import ELASTIC_ONLY, HANGING, block
+from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
+
+from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.methods.casadi_nlp import SqpMethod
+from collocation_sysid.methods.continuation import Continuation
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Solution
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.explicit import carried_over
+from collocation_sysid.nlp.parameters import Parameters, Unknown
+from collocation_sysid.nlp.reaction_rows import Reactions
+from collocation_sysid.nlp.sensor_rows import SensorRows
+from collocation_sysid.nlp.simulation import simulate, with_markers
+
+DENSE = TRUTH | {"density_kg_m3": 30.0}
+ALL_UNKNOWN = Nuisance.none(
+    tare=10.0,
+    sensor_time_s=0.004,
+    sensor_lag_s=0.01,
+    tool_kg=0.2,
+    tool_m=0.05,
+    gravity_rad=0.1,
+    hand_eye_m=1e-3,
+    hand_eye_rad=0.02,
+)
+
+
+def free_density() -> Parameters:
+    return Parameters.of({name: Unknown(1.1 * value) for name, value in DENSE.items()})
+
+
+def felt_memory(name: str, steps: int = 5, branches: int = 2, **changes) -> Experiment:
+    return sensing(recorded(name, steps, branches, **changes))
+
+
+def several() -> list[Experiment]:
+    """One with memory between two that feel, so that every place in z and g is shifted."""
+    first = wristed_cube(4, ALL_UNKNOWN, frame="grasp")
+    last = sensing(replace(hung_cube(4), name="last"))
+    between = replace(felt_memory("hung-cube", 4), name="between")
+    return [first, between, last]
+
+
+MADE: dict[str, Callable[[], Collocation]] = {
+    "known": lambda: Collocation([wristed_cube(5)], GUESS),
+    "all unknown": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN, frame="grasp")], GUESS),
+    "huber": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN)], GUESS, huber=1.5),
+    "bdf2": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN)], GUESS, "bdf2"),
+    "substeps": lambda: Collocation([wristed_cube(3)], GUESS, "backward-euler", substeps=2),
+    "rows for grasps": lambda: Collocation([wristed_cube(5)], GUESS, explicit_grasps=True),
+    "density": lambda: Collocation([wristed_cube(5, ALL_UNKNOWN)], free_density()),
+    "loads": lambda: Collocation([sensing(bar_loaded(6))], GUESS),
+    "let go": lambda: Collocation([sensing(bar_let_go(8))], GUESS),
+    "driven": lambda: Collocation([sensing(driven_bar(5))], GUESS),
+    "static": lambda: Collocation([sensing(block("xyz", gravity_m_s2=HANGING))], GUESS),
+    "memory": lambda: Collocation([felt_memory("cube-with-nuisance")], guesses(TWO, 1.1)),
+    "memory let go": lambda: Collocation([felt_memory("bar-let-go", 8)], guesses(TWO, 1.1)),
+    "several": lambda: Collocation(several(), guesses(TWO, 1.1)),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_derivatives(name: str, rng):
+    assert_derivatives(explicit(MADE[name]()), rng)
+
+
+def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):
+    collocation = MADE["all unknown"]()
+    program, p = explicit(collocation), collocation.guess_p
+    p[collocation.nq :] = 0.1
+    positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_rows, 1)) for s in program.segments]
+    positions[0] += 1e-3 * rng.normal(size=positions[0].shape)
+    z, given = program.pack(p, positions), collocation.pack(p, positions)
+    rows = program.constraint_values(z)[collocation.constraints :]
+    np.testing.assert_allclose(rows, 0.0, atol=1e-13)
+    assert program.objective(z) == pytest.approx(collocation.objective(given), rel=1e-12)
+    np.testing.assert_allclose(carried_over(z, program, collocation), given, rtol=1e-14)
+    (sensor,) = collocation.segments[0].sensors
+    assert program.added(SensorRows) == 12 * len(sensor.grid)
+    assert program.added(Reactions) == 6 * len(sensor.places)
+
+
+# What methods find ------------------------------------------------------------------------------
+
+
+def noisy(experiment: Experiment, seed: int = 0) -> Experiment:
+    """The experiment with noise of a tenth of what its sigmas say, so that there is a residual."""
+    rng, tracks = np.random.default_rng(seed), experiment.markers.positions_m
+    seen = with_markers(experiment, tracks + 1e-4 * rng.normal(size=tracks.shape))
+    felt = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    values = [w.values + 0.1 * w.sigmas * rng.normal(size=w.values.shape) for w in felt]
+    return with_wrenches(seen, values)
+
+
+def pressed() -> Experiment:
+    """The block pressed at several heights, with the wrenches of both platens."""
+    static = sensing(block("xyz", gravity_m_s2=HANGING))
+    found = simulate(static, TRUTH)
+    return with_wrenches(with_markers(static, found.markers_m), found.wrenches)
+
+
+def remembered() -> Experiment:
+    """A cube with a memory, in a hand with a sensor."""
+    cube = sensing(remembering("hung-cube", 14))
+    found = simulate(cube, ONE, "midpoint")
+    return with_wrenches(with_markers(cube, found.markers_m), found.wrenches)
+
+
+TARED = Nuisance.none(tare=10.0, tool_kg=0.01, sensor_lag_s=0.005)
+PROBLEMS: dict[str, Callable[[], Collocation]] = {
+    "density": lambda: Collocation([noisy(sensed(wristed_cube(12)))], free_density()),
+    "static": lambda: Collocation([noisy(pressed())], ELASTIC_ONLY),
+    "memory": lambda: Collocation([noisy(remembered())], guesses(ONE, 1.1)),
+    "sensor": lambda: Collocation([noisy(sensed(wristed_cube(12, TARED)))], GUESS),
+}
+
+
+@cache
+def problem(name: str) -> tuple[Collocation, Solution]:
+    """One of them, and what reduced space finds."""
+    collocation = PROBLEMS[name]()
+    return collocation, ReducedSpace(tolerance=1e-10)(collocation)
+
+
+METHODS = [
+    *((name, InteriorPoint(tolerance=1e-10), 1e-6) for name in PROBLEMS),
+    ("memory", InteriorPoint(hessian="gauss-newton"), 1e-5),
+    ("density", Continuation(), 1e-4),
+    ("static", SqpMethod(), 1e-5),
+    ("sensor", SqpMethod(), 1e-5),
+    ("density", AugmentedLagrangian(tolerance=1e-4), 1e-4),
+    ("memory", AugmentedLagrangian(tolerance=1e-4), 1e-4),
+    ("static", Penalty(inner="levenberg-marquardt", rho=1e6, tolerance=1e-4), 1e-2),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "tolerance"), METHODS, ids=lambda given: getattr(given, "name", str(given))
+)
+def test_methods_find_the_optimum_of_reduced_space(name: str, method, tolerance: float):
+    collocation, expected = problem(name)
+    found = method(collocation)
+    assert found.status.converged, found.message
+    assert found.collocation is collocation
+    for parameter, value in expected.parameters.items():
+        assert found.parameters[parameter] == pytest.approx(value, rel=tolerance), parameter
+    assert found.max_violation_relative < max(1e-6, tolerance)
+
+
+def test_the_multipliers_are_those_of_the_program_given():
+    collocation, expected = problem("sensor")
+    found = InteriorPoint(tolerance=1e-10)(collocation)
+    assert found.kkt_residual < 1e-8
+    scale = np.abs(expected.multipliers).max()
+    np.testing.assert_allclose(found.multipliers, expected.multipliers, atol=1e-4 * scale)
