@@ -223,6 +223,10 @@ def compare(
         str | None,
         typer.Option(metavar="NAME", help="Region that has them; by default all the body does."),
     ] = None,
+    with_: Annotated[
+        list[Path] | None,
+        typer.Option("--with", metavar="FILE", help="Another problem of the same recordings."),
+    ] = None,
     starts: Annotated[int, typer.Option(help="Starts; the first is the file's guess.")] = 1,
     spread: Annotated[float, typer.Option(help="Starts are within this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
@@ -243,9 +247,9 @@ def compare(
 ) -> None:
     """Run methods side by side from many starts, or fit several models and say which to use.
 
-    With --materials or --prony each model is fitted to all recordings, and to all but each of them,
-    which it then predicts; of one recording the last third is held out. In a body with regions all
-    of it has the model, or --region.
+    With --materials, --prony or --with each model is fitted to all recordings, and to all but each
+    of them, which it then predicts; of one recording the last third is held out. In a body with
+    regions all of it has the model, or --region. --with takes other problem files as models.
 
     Finished runs are kept in the output folder: the same command resumes.
     """
@@ -257,14 +261,18 @@ def compare(
     names = parse_methods(methods) if methods is not None else ()
     limits = Limits(workers, scheduler, time_limit)
     loaded = Problem.read(problem, set_ or (), allow_code)
-    if materials is not None or prony is not None:
+    if with_ and (materials is not None or prony is not None):
+        raise InputError(
+            "found --materials or --prony too; expected other files alone", None, "--with"
+        )
+    if with_ or materials is not None or prony is not None:
         choices = materials, prony, region
-        planned = _planned_models(loaded, choices, names, set_ or (), allow_code)
+        planned = _planned_models(loaded, choices, with_ or (), names, set_ or (), allow_code)
         study = _Study("models", problem, planned, Yardstick(), out)
         _study(study, limits, dry_run, as_json, quiet)
         return
     if not names:
-        raise InputError("nothing to compare; expected --methods, --materials or --prony")
+        raise InputError("nothing to compare; expected --methods, --materials, --prony or --with")
     free = [item.name for item in loaded.parameters.free]
     yardstick = Yardstick(read_truth(truth or (), loaded.parameters.names, free), within)
     options = starts, spread, seed, yardstick.truth, allow_code
@@ -276,15 +284,16 @@ def compare(
 def _planned_models(
     problem: Problem,
     choices: tuple[str | None, str | None, str | None],
+    files: Sequence[Path],
     methods: Sequence[str],
     overrides: Sequence[str],
     allow_code: bool,
 ) -> list[PlannedRun]:
-    """The runs that compare models: materials and branches, of a region."""
+    """The runs that compare models: materials and branches, of a region, or whole files."""
     materials, prony, region = choices
     from .problem import Problem
     from .study import plan_models
-    from .study.variants import parse_branches, parse_materials, variants
+    from .study.variants import file_variants, parse_branches, parse_materials, variants
 
     if len(methods) > 1:
         raise InputError(
@@ -293,6 +302,10 @@ def _planned_models(
             None,
             "--methods",
         )
+    if files:
+        problems = [problem, *(Problem.read(file, overrides, allow_code) for file in files)]
+        found = file_variants(problems, overrides)
+        return plan_models(problem, found, methods[0] if methods else None, allow_code)
     named = parse_materials(materials) if materials is not None else ()
     counts = parse_branches(prony) if prony is not None else ()
     fitted = [e for e in problem.experiments if not e.validation]

@@ -115,9 +115,12 @@ def step_changes(
 ) -> dict[str, float] | None:
     """Change of every parameter and modulus that a finer step would bring, to first order.
 
-    A Gauss–Newton step towards the roll-outs; None where these are missing or no finer.
+    A Gauss–Newton step towards the roll-outs; None where these are missing or no finer, and where
+    all is static.
     """
     apart: list[Array] = []
+    if all(segment.experiment.static for segment in solution.collocation.segments):
+        return None
     parts = zip(solution.collocation.segments, solution.readings_m, strict=True)
     for segment, readings in parts:
         experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)

@@ -13,12 +13,14 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from .arrays import root_mean
 from .check import BodyFinding, Findings, Recording
 from .check.hold import hold_sentence
 from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
 from .nlp.collocation import Part
 from .nlp.parameters import Parameter
+from .nlp.segment import Segment
 from .output.remedies import remedies_for
 from .problem import Problem
 from .rollout import Rollout
@@ -46,6 +48,7 @@ SENSORS = (
     ("sensor-lag", "lag of the sensor", 1e3, "ms"),
     ("tool-mass", "tool of", 1e3, "g"),
     ("tool-centre", "its centre off by", 1e3, "mm"),
+    ("zero", "zero of a displacement off by", 1e3, "mm"),
 )
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
@@ -376,22 +379,27 @@ def _residuals(finished: Run) -> list[Text]:
 
 def _verdict(finished: Run) -> list[Text]:
     solution = finished.solution
-    lines = [
+    violated = (
+        f"dynamics violated by at most {solution.max_violation_n:.1e} N "
+        f"({solution.max_violation_relative:.1e} of the largest force)"
+    )
+    marked = any(s.experiment.markers.samples for s in solution.collocation.segments)
+    markers = (
         f"markers: {solution.rms_m * 1e3:.3f} mm RMS, {finished.noise_rms_m * 1e3:.3f} mm from "
-        "noise alone; dynamics violated by at most "
-        f"{solution.max_violation_n:.1e} N ({solution.max_violation_relative:.1e} of the largest "
-        "force)"
-    ]
-    for name, (force, torque) in solution.wrench_rms.items():
-        sizes = [
-            f"{_short(value)} {unit}" for value, unit in ((force, "N"), (torque, "N m")) if value
-        ]
-        lines.append(f"wrench of '{name}': {', '.join(sizes)} RMS")
+        "noise alone; "
+    )
+    lines = [f"{markers if marked else ''}{violated}"]
+    for segment in solution.collocation.segments:
+        found = solution.wrench_rms.get(segment.experiment.name, (None, None))
+        if sizes := _wrench_sizes(found):
+            lines.append(f"wrench of '{segment.experiment.name}': {sizes}{_sigmas(segment)}")
     for experiment in finished.problem.experiments:
         rollout = finished.rollouts[experiment.name]
         kind = "validation" if experiment.validation else "roll-out"
         if isinstance(rollout, Rollout):
-            found = f"{rollout.rms_m * 1e3:.3f} mm RMS, at most {rollout.max_m * 1e3:.2f} mm"
+            tracks = f"{rollout.rms_m * 1e3:.3f} mm RMS, at most {rollout.max_m * 1e3:.2f} mm"
+            said = (tracks if experiment.markers.samples else "", _wrench_sizes(rollout.wrench_rms))
+            found = "; ".join(each for each in said if each)
         else:
             found = f"failed: {rollout}"
         lines.append(f"{kind} '{experiment.name}': {found}")
@@ -401,6 +409,22 @@ def _verdict(finished: Run) -> list[Text]:
         f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
     )
     return [Text(line) for line in lines]
+
+
+def _wrench_sizes(rms: tuple[float | None, float | None]) -> str:
+    """Forces and torques in words, "" where none is measured."""
+    sizes = [f"{_short(size)} {unit}" for size, unit in zip(rms, ("N", "N m"), strict=True) if size]
+    return f"{', '.join(sizes)} RMS" if sizes else ""
+
+
+def _sigmas(segment: Segment) -> str:
+    """What is stated of the sensors' noise."""
+    sigmas = {"N": [], "N m": []}
+    for sensor in segment.sensors:
+        for k in np.flatnonzero(sensor.wrench.measured):
+            sigmas["N" if k < 3 else "N m"].append(sensor.wrench.sigmas[k])
+    said = [f"{_short(root_mean(np.square(v)))} {unit}" for unit, v in sigmas.items() if v]
+    return f" (sigma {', '.join(said)})"
 
 
 def check_table(findings: Findings) -> RenderableType:
@@ -463,6 +487,8 @@ def _body_section(body: BodyFinding) -> RenderableType:
 
 
 def _motion_section(findings: Findings) -> list[RenderableType]:
+    if not findings.motions:  # equilibria only
+        return []
     motion, *others = findings.motions
     title = f"Modes of '{motion.experiment}' about its {motion.about} (they depend on the guess)"
     heads = ("  Hz", "samples/period", "steps/period", "damping", "scheme adds", "period error")
@@ -496,13 +522,14 @@ def _measurements_section(findings: Findings) -> RenderableType:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
     for hold in findings.holds[:SHOWN_RECORDINGS]:
         rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
-    rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
+    if findings.samples:
+        rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
     return _section("Measurements", rows)
 
 
 def _markers_seen(recording: Recording) -> str:
     if not recording.markers:
-        return "no markers"
+        return "the wrench, no markers"
     far, lost = recording.farthest, recording.least_seen
     missing = (
         f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"

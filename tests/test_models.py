@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +12,24 @@ import numpy as np
 import pytest
 from fits_small import autoregressive, problem
 from problem_files import EXPERIMENT, PROBLEM, run_command, write_problem
-from problems_small import smooth_poses, times
+from problems_small import TRUTH, as_theta, smooth_poses, times
 from test_models_in_files import TWO_REGIONS
+from test_static import block
+from wrenches_small import fitted
 
+from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import write_poses_csv
+from collocation_sysid.experiment import Experiment, Markers, Wrench, write_poses_csv
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.marching import march
+from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.evidence import evidence_of
 from collocation_sysid.study import PlannedRun, plan_models
 from collocation_sysid.study.choice import advice, model_rows
 from collocation_sysid.study.prediction import model_record, without
 from collocation_sysid.study.variants import (
+    file_variants,
     parse_branches,
     parse_materials,
     toml,
@@ -102,8 +109,72 @@ def test_yeohs_is_not_preferred_on_data_of_a_neo_hookean(tmp_path: Path):
     assert neo_hookean["chosen"]
     assert yeoh["delta_aic"] > 0
     # 0.5 mm in three directions
-    assert neo_hookean["held_out_rms_m"] == pytest.approx(5e-4 * np.sqrt(3), rel=0.15)
+    assert neo_hookean["held_out_rms"] == pytest.approx(5e-4 * np.sqrt(3), rel=0.15)
     assert advice(rows).startswith("Use neo-hookean: it misses what is held out by")
+
+
+# Forces alone -----------------------------------------------------------------------------------
+
+
+def pressed_block(platen: str, name: str, z_m: np.ndarray, load_n: np.ndarray) -> Experiment:
+    """A block pressed between platens that hold it along some axes; its load alone is measured."""
+    pressing = block(platen, np.arange(float(len(z_m))), z_m)
+    values = np.full((len(z_m), 3), np.nan)
+    values[:, 2] = load_n
+    lower, upper, *sides = pressing.grasps
+    upper = replace(upper, wrench=Wrench(pressing.t_s, values, sigma_n=0.003))
+    grasps = (lower, upper, *sides)
+    return replace(pressing, name=name, grasps=grasps, markers=Markers.none(pressing.t_s))
+
+
+def load_n(experiment: Experiment) -> np.ndarray:
+    """What the upper platen gives, by the truth."""
+    collocation = fitted(experiment, Parameters.of(TRUTH))
+    x = march(experiment, collocation.segments[0].dynamics, as_theta(TRUTH))
+    (part,) = collocation.parts_at(np.zeros(0), [x])
+    return part.sensing.readings(x)[0][:, 2]
+
+
+def test_forces_rank_the_platens_where_there_are_no_markers():
+    """Those that stick made the load; lubricated ones are made up for by a stiffer material."""
+    rng, found = np.random.default_rng(5), {"xyz": [], "z": []}
+    for name, deepest_m in (("a", -0.03), ("b", -0.04)):
+        z_m = np.linspace(0.0, deepest_m, 9)
+        made = load_n(pressed_block("xyz", name, z_m, np.zeros(9)))
+        noisy = made + rng.normal(scale=0.003, size=9)
+        for platen, experiments in found.items():
+            experiments.append(pressed_block(platen, name, z_m, noisy))
+    models = []
+    for platen, experiments in found.items():
+        problem = Problem(experiments, TRUTH | {"mu_pa": Unknown(300.0)})
+        records = {each: model_record(problem, "reduced-space", each) for each in ("", "a", "b")}
+        models.append({"model": platen, "found": records})
+    sticking, sliding = rows = rows_of(*models)
+    assert sticking["chosen"]
+    assert sticking["held_out_rms"] == pytest.approx(0.003, rel=0.5)
+    assert sliding["held_out_rms"] > 3 * sticking["held_out_rms"]
+    assert sliding["delta_aic"] > 10
+    assert sliding["parameters"]["mu_pa"] > 1.05 * sticking["parameters"]["mu_pa"]
+    assert re.search(r"^Use xyz: it misses what is held out by \S+ N, z by \S+ N", advice(rows))
+
+
+def test_of_one_pressing_the_end_of_its_load_is_held_out():
+    pressing = pressed_block("xyz", "a", np.linspace(0.0, -0.03, 9), np.zeros(9))
+    left, start_s = without(Problem([pressing], TRUTH), "a")
+    wrench = left.experiments[0].grasps[1].wrench
+    np.testing.assert_array_equal(np.isnan(wrench.values[:, 2]), wrench.t_s > start_s)
+    assert 0 < np.isnan(wrench.values[:, 2]).sum() < 9
+
+
+def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
+    both, one = (
+        Problem.read(write_problem(tmp_path / name, recordings))
+        for name, recordings in (("both", {"a": 6, "b": 7}), ("one", {"a": 6}))
+    )
+    with pytest.raises(InputError, match="given twice"):
+        file_variants([both, both], ())
+    with pytest.raises(InputError, match=r"it fits 'a' .* expected the same recordings"):
+        file_variants([both, one], ())
 
 
 # Held out ---------------------------------------------------------------------------------------
@@ -313,11 +384,11 @@ def row_of(model: str, free: int, blocks: dict, misfit: float, failure: str = ""
     """Records of a model: fitted, and each recording predicted with these Σ of squares by block."""
     evidence = {"misfit": misfit, "prior": 0.0, "fitted": float(free)}
     evidence |= {"measurements": 900, "independent": 300.0}
-    whole = {"converged": True, "status": "converged", "free": ["p"] * free, "rms_m": 1e-3}
+    whole = {"converged": True, "status": "converged", "free": ["p"] * free, "rms": {"m": 1e-3}}
     found = {"": whole | {"evidence": evidence, "parameters": {}}}
     for name, each in blocks.items():
-        rms_m = float(np.sqrt(np.sum(each) / 100))
-        found[name] = whole | {"prediction": {"rms_m": rms_m, "samples": 100, "blocks_m2": each}}
+        missed = {"rms": float(np.sqrt(np.sum(each) / 100)), "unit": "m", "samples": 100}
+        found[name] = whole | {"prediction": missed | {"blocks": each}}
         if failure:
             found[name] = whole | {"prediction": None, "failure": failure}
     return {"model": model, "found": found}
@@ -397,6 +468,6 @@ def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
 
 def test_there_must_be_something_to_compare(tiny: Path):
     nothing = run_command("compare", "problem.toml")
-    assert (nothing.code, "--methods, --materials or --prony" in nothing.err) == (2, True)
+    assert (nothing.code, "--materials, --prony or --with" in nothing.err) == (2, True)
     several = ("compare", "problem.toml", "--materials", "gent,yeoh", "--methods")
     assert "expected one method" in run_command(*several, "reduced-space,shooting").err

@@ -42,12 +42,14 @@ from collocation_sysid.methods.shooting import Shooting
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.dynamics import Dynamics
+from collocation_sysid.nlp.newton import Solver
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.rest import rest_state
 from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.rollout import Rollout
 from collocation_sysid.run import run
 from collocation_sysid.statistics.stillness import stillness_notes
+from collocation_sysid.terminal import check_table, plain_text, summary
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])
@@ -106,6 +108,19 @@ def test_sticking_platens_hold_every_axis_and_let_the_side_bulge():
     np.testing.assert_allclose(positions[-1, ends, :2], experiment.body.nodes_m[ends, :2])
     middle = np.flatnonzero(np.abs(experiment.body.nodes_m[:, 2] - EDGE_M / 2) < 1e-9)
     assert positions[-1, middle, 0].max() > 1.05 * EDGE_M
+
+
+def test_a_body_goes_along_with_platens_that_press_it_far_at_once(monkeypatch):
+    """Moved alone, the platen's nodes would crush the elements below them."""
+    tried = []
+    newton = Solver.newton
+    monkeypatch.setattr(Solver, "newton", lambda *a, **k: (tried.append(1), newton(*a, **k))[1])
+    experiment = block("xyz", np.array([0.0, 1.0]), np.array([0.0, -0.03]))
+    rubber = TRUTH | {"lambda_pa": 100 * TRUTH["mu_pa"]}
+    far = simulate(experiment, rubber).positions_m[-1]
+    assert len(tried) == 2  # one for each sample
+    near = block("xyz", np.arange(7.0), np.linspace(0.0, -0.03, 7))
+    np.testing.assert_allclose(far, simulate(near, rubber).positions_m[-1], atol=1e-9)
 
 
 def test_each_static_sample_is_the_rest_state_of_its_time():
@@ -400,11 +415,32 @@ def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
     assert not list((tmp_path / "run").glob("tracks_*"))
 
 
+def test_forces_between_equilibria_are_not_read_off_their_chord(tmp_path):
+    thinned = cs.Problem.read(bench(tmp_path), ["experiment.press.every=2"])
+    (experiment,) = thinned.experiments
+    assert experiment.t_s.tolist() == [0.0, 3.0, 8.0]
+    assert experiment.grasps[1].wrench.t_s.tolist() == [0.0, 3.0, 8.0]
+
+
 def test_a_test_bench_without_markers_is_checked(tmp_path):
     findings = check_problem(cs.Problem.read(bench(tmp_path)))
     assert findings.derivatives_agree
     assert findings.samples == 0
     assert not findings.motions
+    said = plain_text(check_table(findings))
+    assert "Modes" not in said
+    assert "markers are missed" not in said
+
+
+def test_a_run_without_markers_speaks_of_forces(tmp_path):
+    found = run(cs.Problem.read(bench(tmp_path)))
+    said = plain_text(summary(found, tmp_path))
+    assert " mm RMS" not in said
+    assert re.search(r"wrench of 'press': \S+ N RMS \(sigma 0.01 N\)", said)
+    assert re.search(r"roll-out 'press': \S+ N RMS", said)
+    assert "a finer step" not in said
+    assert re.search(r"zero of a displacement off by 1(\.0)? mm \(prior 2\)", said)
+    assert found.solution.max_violation_relative < 1e-6
 
 
 @pytest.mark.parametrize(

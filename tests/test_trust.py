@@ -93,6 +93,17 @@ def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
         assert verdict_of_fit(0.02 * errors).verdict != "doubtful"
 
 
+def test_gross_residuals_of_single_samples_are_doubtful():
+    """Nothing tells whether they are noise."""
+    singles = problem((1,) * 8, markers=4, offsets=False)
+    for size, verdict in ((1.0, "good"), (50.0, "doubtful")):
+        errors = [size * RNG(k).normal(size=(1, 4, 3)) for k in range(8)]
+        fit, wrong = singles.fit(errors, np.zeros(len(singles.names)))
+        found = uncertainty_of(fit, PARAMETERS, wrong[:4])
+        assert np.isfinite(found.dependence.lag1)
+        assert Trust.of(fit_concerns(found)).verdict == verdict
+
+
 def test_nuisance_parameters_far_from_their_prior():
     many = [f"n{k}" for k in range(100)]
     nowhere, infinite = np.zeros(100), np.full(100, np.inf)

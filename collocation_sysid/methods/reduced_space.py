@@ -120,9 +120,11 @@ def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) 
         squares = sum(part.loss for part in collocation.parts(z))
         misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
         if misfit > MISFIT:
+            marked = any(s.experiment.markers.samples for s in collocation.segments)
+            size = f" ({1e3 * collocation.rms_m(z):.3g} mm rms)" if marked else ""
             notes.append(
-                f"the markers are missed by {misfit:.3g} of their standard deviations "
-                f"({1e3 * collocation.rms_m(z):.3g} mm rms): sigma_m, the model or the recording "
-                "is off, or a better fit lies elsewhere; another guess may tell"
+                f"the {'markers' if marked else 'wrenches'} are missed by {misfit:.3g} of their "
+                f"standard deviations{size}: {'sigma_m' if marked else 'sigma_n'}, the model or "
+                "the recording is off, or a better fit lies elsewhere; another guess may tell"
             )
     return notes

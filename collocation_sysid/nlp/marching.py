@@ -198,7 +198,10 @@ def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: 
     def solve(near: Array, share: float) -> Array:
         start, step = near.copy(), row.under(share)
         # To the last digit at the end: bounds hold it there.
-        start[solver.held] = held if share == 1 else origin + share * (held - origin)
-        return solver.newton(start, step.residual, step.linearise, row.dynamics.static)
+        goal = held if share == 1 else origin + share * (held - origin)
+        if row.dynamics.static:
+            return solver.newton(start, step.residual, step.linearise, True, goal)
+        start[solver.held] = goal
+        return solver.newton(start, step.residual, step.linearise)
 
     return followed(solve, previous, solver.options.halvings, guess)

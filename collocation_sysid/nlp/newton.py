@@ -84,7 +84,8 @@ class Solver:
         at_start = experiment.held(experiment.t_s[:1])[0]
         holding = at_start if held is None else held
         self.free, self.held = np.flatnonzero(~holding), np.flatnonzero(holding)
-        self.factoriser = Factoriser.of(experiment.pattern, self.free)
+        self.pattern = experiment.pattern
+        self.factoriser = Factoriser.of(self.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
 
     def newton(
@@ -93,6 +94,7 @@ class Solver:
         residual: Residual,
         linearise: Linearise,
         keep_definite: bool = False,
+        goal: Array | None = None,
     ) -> Array:
         """Solve residual(x) = 0 for the free dofs, starting at x (3n,).
 
@@ -105,8 +107,11 @@ class Solver:
         residual : x -> (3n,)
         linearise : x -> residual (3n,), and lower triangles of the symmetric part (m,) and the
             skew part, (m,) or (0,), of −∂r/∂x
+        goal : (held,) ndarray, optional
+            Where the held dofs are to be, if not where they are. The body goes with them as its
+            stiffness at x has it: moved alone, they would crush the elements next to them.
         """
-        x = x.copy()
+        x = x.copy() if goal is None else self._moved(x, goal, linearise)
         self._require_upright(x)
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
@@ -117,6 +122,19 @@ class Solver:
                 return x
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
         raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
+
+    def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
+        """The state with the held dofs at their goal, to first order in equilibrium."""
+        found, way = x.copy(), np.zeros_like(x)
+        way[self.held] = goal - x[self.held]
+        found[self.held] = goal
+        if not self._is_last(way):
+            self._require_upright(x)
+            value, *matrix = self._timed(linearise, x)
+            pulled = self.pattern.products(matrix[0][None], way[None])[0]
+            factor = self._factorise(matrix, x, keep_definite=False)
+            found[self.free] += factor.solve((value - pulled)[self.free])
+        return found
 
     def _backtrack(
         self,
@@ -189,6 +207,8 @@ def followed(
 ) -> Array:
     """Follow x(s), what `solve(near, s)` finds, from x(0) to x(1) in steps that shrink on failure.
 
+    They grow again after two that succeed.
+
     A guess of x(1) is tried first, and the way there is taken where that fails.
 
     Raises
@@ -201,17 +221,19 @@ def followed(
             return solve(guess, 1.0)
         except NewtonFailure:
             pass
-    rate, reached, increment = np.zeros_like(x), 0.0, 1.0
+    rate, reached, increment, easy = np.zeros_like(x), 0.0, 1.0, False
     while reached < 1.0:
         step = min(increment, 1.0 - reached)
         try:
             found = solve(x + step * rate, reached + step)
         except NewtonFailure:
-            increment = step / 2
+            increment, easy = step / 2, False
             if increment < 0.5**halvings:
                 raise
         else:
             x, rate, reached = found, (found - x) / step, reached + step
+            # One step as long as that which failed would fail again.
+            increment, easy = (2 * step if easy else step), True
     return x
 
 

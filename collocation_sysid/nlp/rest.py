@@ -52,9 +52,8 @@ def rest_state(
             at = loaded.linearise(state, still, theta, carried=carried)
             return at.force[0], -at.by_position[0], NONE
 
-        moved = x.copy()
-        moved[solver.held] = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
-        return solver.newton(moved, residual, linearise, keep_definite=True)
+        goal = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
+        return solver.newton(x, residual, linearise, keep_definite=True, goal=goal)
 
     try:
         return followed(solve, shape.ravel(), solver.options.halvings, start)

@@ -35,6 +35,7 @@ from ..experiment import (
     read_tension,
     read_wrench,
 )
+from ..experiment.clock import TIME_TOLERANCE_S
 from ..experiment.loads import Change
 from ..experiment.wrench_files import within
 from ..fem.body import Body
@@ -276,7 +277,10 @@ class RecordingReader:
                 given["sigma_nm"] = section.sigma_nm or 1.0
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **given)
             at_s, values = read_wrench(existing_file(self.folder, section.file, f"{key}.file"))
-            inside = within(at_s, t_s, section.file, self.section.kind == "static")
+            static = self.section.kind == "static"
+            inside = within(at_s, t_s, section.file, static)
+            if static and not self.section.marked:
+                inside &= _among(at_s, t_s)
             self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
             return Wrench(at_s[inside], values[inside], **given)
         except InputError as error:
@@ -455,6 +459,16 @@ def _nuisance(section: NuisanceSection | Literal["none"]) -> Nuisance:
         elif given is not None:
             found |= {field: getattr(given, prior) for field, prior in fields.items()}
     return Nuisance(**found)
+
+
+def _among(at_s: Array, t_s: Array) -> NDArray[np.bool_]:
+    """Which samples are at equilibria: between two, a wrench would be read off their chord.
+
+    All of a sensor that was read at other times.
+    """
+    apart_s = np.abs(at_s[:, None] - t_s).min(axis=1)
+    found = apart_s <= TIME_TOLERANCE_S
+    return found if found.any() else np.ones(len(at_s), dtype=bool)
 
 
 def _reference_sigma(spec: MarkersSection, names: Sequence[str]) -> Array | None:

@@ -51,7 +51,7 @@ class Dependence:
         Autocorrelation of consecutive samples, pooled over all channels, corrected for what the
         fit has taken out of the residuals.
     lag1_deviation : float
-        Its standard deviation if the errors are independent.
+        Its standard deviation if the errors are independent; infinite where it cannot be told.
     shared_p : float
         Probability of correlations among channels as large as found, if they are independent.
     """
@@ -104,6 +104,8 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     """Test the residuals for correlation, in time and among channels."""
     if fit.chi_squared <= ROUNDING**2 * fit.measurements:
         return Dependence(0.0, np.inf, 1.0)
+    if all(len(block.t_s) < 2 for block in fit.blocks):  # nothing follows on anything
+        return Dependence(0.0, np.inf, _shared_p(fit))
     found = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
@@ -111,7 +113,7 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
-        lag1=float(lag1_variance / variance),
+        lag1=float(np.clip(lag1_variance / variance, -1.0, 1.0)),  # corrected, it may be beyond
         lag1_deviation=float(np.sqrt(2 / expected[1, 1])),
         shared_p=_shared_p(fit),
     )

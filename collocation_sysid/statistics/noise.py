@@ -13,7 +13,7 @@ given by samples of it, such as those of `pose_noise`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -56,6 +56,8 @@ class NoiseLevel:
     shares : (G, r, r) G_m
     extra : (r, r)
         What is expected besides adds to the covariance of the score.
+    stated : str
+        What states σ in the problem.
     """
 
     names: tuple[str, ...]
@@ -68,6 +70,7 @@ class NoiseLevel:
     unequal_p: float
     shares: Array = field(repr=False)
     extra: Array = field(repr=False)
+    stated: str = "sigma_m"
 
     @property
     def smaller(self) -> bool:
@@ -146,7 +149,7 @@ def noise_level(
             counts.append(int(block.seen[:, m].sum()))
             shares.append(rows.T @ rows)
     of_score, besides = _besides(fit, information, extra)
-    return _level(
+    level = _level(
         tuple(names),
         np.array(squares),
         np.array(counts, dtype=float),
@@ -155,6 +158,8 @@ def noise_level(
         information.prior,
         of_score,
     )
+    marked = any(block.present.any() for block in fit.blocks if not block.of_sensor)
+    return level if marked else replace(level, stated="sigma_n")
 
 
 def drawn(fit: LinearisedFit, extra: Extra) -> list[Array]:

@@ -110,12 +110,14 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     elif matters:
         concerns.append(("the residuals are not noise: markers or axes share them", "check"))
     if factor > MISFIT and level.larger_p < RARE:
-        gross = factor > GROSS_MISFIT and (persistent or shared)
-        said = f"the residuals are {factor:.2g} times as large as sigma_m says"
+        # Of single samples nothing tells that it is noise.
+        untested = not np.isfinite(found.lag1_deviation)
+        gross = factor > GROSS_MISFIT and (persistent or shared or untested)
+        said = f"the residuals are {factor:.2g} times as large as {level.stated} says"
         concerns.append((said, "doubtful" if gross else "check"))
     elif factor < 1 / MISFIT and level.smaller_p < RARE and not matters:
         concerns.append(
-            (f"sigma_m seems {1 / factor:.2g} times too large for these residuals", "check")
+            (f"{level.stated} seems {1 / factor:.2g} times too large for these residuals", "check")
         )
     return concerns + _uneven_concerns(uncertainty.level) + _scatter_concerns(uncertainty)
 

@@ -417,7 +417,7 @@ def _parameter_notes(
 
 
 def _size_notes(noise: NoiseOption, kind: Noise, level: NoiseLevel, errors: Errors) -> list[str]:
-    """On residuals larger or smaller than sigma_m says."""
+    """On residuals larger or smaller than σ as stated."""
     if noise == "estimated" or level.kind == "given":
         return []
     factor = float(np.sqrt(level.pooled))
@@ -426,31 +426,33 @@ def _size_notes(noise: NoiseOption, kind: Noise, level: NoiseLevel, errors: Erro
     if level.unequal and ratio > NOTEWORTHY**2:
         size = (
             f"the residuals are between {level.factors[low]:.2g} ({low}) and "
-            f"{level.factors[high]:.2g} ({high}) times as large as sigma_m says"
+            f"{level.factors[high]:.2g} ({high}) times as large as {level.stated} says"
         )
     elif factor > NOTEWORTHY:
-        size = f"the residuals are {factor:.2g} times as large as sigma_m says"
+        size = f"the residuals are {factor:.2g} times as large as {level.stated} says"
     elif factor < 1 / NOTEWORTHY:
         size = (
-            f"the residuals are only {factor:.2g} times as large as sigma_m says: it seems "
+            f"the residuals are only {factor:.2g} times as large as {level.stated} says: it seems "
             f"{1 / factor:.2g} times too large"
         )
     else:
         return []
-    return [f"{size}; {_consequence(noise, kind, factor, errors)}"]
+    return [f"{size}; {_consequence(noise, kind, factor, errors, level.stated)}"]
 
 
-def _consequence(noise: NoiseOption, kind: Noise, factor: float, errors: Errors) -> str:
+def _consequence(
+    noise: NoiseOption, kind: Noise, factor: float, errors: Errors, stated: str
+) -> str:
     if kind != "given" or (factor > 1 and errors == "autocorrelated"):
-        return "the error bars follow the residuals. Check sigma_m and the model"
+        return f"the error bars follow the residuals. Check {stated} and the model"
     if factor > 1:
         return (
-            "the error bars are too small by about that much; check sigma_m and the model, or use "
-            "noise = 'auto'"
+            f"the error bars are too small by about that much; check {stated} and the model, or "
+            "use noise = 'auto'"
         )
     if noise == "given":
-        return "the error bars keep to sigma_m, as asked for"
-    return "the residuals are not independent, so the error bars keep to sigma_m"
+        return f"the error bars keep to {stated}, as asked for"
+    return f"the residuals are not independent, so the error bars keep to {stated}"
 
 
 def _correlation_notes(errors: Errors, found: Dependence, forced: bool) -> list[str]:
@@ -461,7 +463,7 @@ def _correlation_notes(errors: Errors, found: Dependence, forced: bool) -> list[
         pattern = "have parts that markers or axes share"
     if errors == "autocorrelated" and found.found:
         return [
-            f"the residuals {pattern}: camera noise seldom does, so something is missing in the "
+            f"the residuals {pattern}: noise seldom does, so something is missing in the "
             "model or in the experiment's description. The error bars are widened by a model of "
             "autocorrelated errors; a bias is not covered"
         ]

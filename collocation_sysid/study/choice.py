@@ -47,15 +47,17 @@ def _row(label: str, found: Mapping[str, Mapping[str, Any]]) -> Row:
     whole = found.get("", {})
     predictions = {name: each.get("prediction") or {} for name, each in found.items() if name}
     evidence, free = whole.get("evidence"), whole.get("free")
+    unit = next((each["unit"] for each in predictions.values() if each), "m")
     return {
         "model": label,
         "status": whole.get("status", "missing"),
         "converged": bool(whole.get("converged")),
         "free": None if free is None else len(free),
-        "rms_m": whole.get("rms_m"),
-        "held_out_rms_m": _pooled([*predictions.values()]),
-        "predictions": {name: each.get("rms_m") for name, each in predictions.items()},
-        "blocks_m2": {name: each.get("blocks_m2") for name, each in predictions.items()},
+        "unit": unit,
+        "rms": (whole.get("rms") or {}).get(unit),
+        "held_out_rms": _pooled([*predictions.values()]),
+        "predictions": {name: each.get("rms") for name, each in predictions.items()},
+        "blocks": {name: each.get("blocks") for name, each in predictions.items()},
         "failures": {n: found[n]["failure"] for n in predictions if found[n].get("failure")},
         "evidence": evidence,
         "parameters": whole.get("parameters") or {},
@@ -64,10 +66,12 @@ def _row(label: str, found: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    if not predictions or any(each.get("rms_m") is None for each in predictions):
+    if not predictions or any(each.get("rms") is None for each in predictions):
         return None
+    if len({each["unit"] for each in predictions}) > 1:
+        return None  # metres and newtons have no common measure
     samples = sum(each["samples"] for each in predictions)
-    return sqrt(sum(each["samples"] * each["rms_m"] ** 2 for each in predictions) / samples)
+    return sqrt(sum(each["samples"] * each["rms"] ** 2 for each in predictions) / samples)
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
@@ -88,11 +92,11 @@ def _add_ratios(rows: Sequence[Row]) -> None:
     best = _best_prediction(rows)
     for row in rows:
         row["log_ratio"] = row["log_ratio_error"] = None
-        if best is None or row["held_out_rms_m"] is None:
+        if best is None or row["held_out_rms"] is None:
             continue
-        names = [name for name, rms_m in best["predictions"].items() if rms_m]
+        names = [name for name, rms in best["predictions"].items() if rms]
         logs = [log(row["predictions"][name] / best["predictions"][name]) for name in names]
-        row["log_ratio"] = log(row["held_out_rms_m"] / best["held_out_rms_m"])
+        row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
         row["log_ratio_error"] = _error(row, best, logs)
 
 
@@ -100,7 +104,7 @@ def _error(row: Row, best: Row, logs: Sequence[float]) -> float:
     """Standard error of the logarithm, from blocks in time or from recordings if that is more."""
     if row is best:
         return 0.0
-    pairs = [(row["blocks_m2"][name], best["blocks_m2"][name]) for name in best["blocks_m2"]]
+    pairs = [(row["blocks"][name], best["blocks"][name]) for name in best["blocks"]]
     missed, least = (np.concatenate(each) for each in zip(*pairs, strict=True))
     change = missed - least
     # d ln √(a/b) = (a − b) / (a + b) to first order
@@ -110,8 +114,8 @@ def _error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    predicted = [r for r in rows if r["converged"] and r["held_out_rms_m"]]
-    return min(predicted, key=lambda r: r["held_out_rms_m"], default=None)
+    predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
+    return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
 
 def chosen_row(rows: Sequence[Row]) -> Row | None:
@@ -127,7 +131,7 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
         and row["log_ratio"] is not None
         and row["log_ratio"] <= max(ALIKE, LIKELY * row["log_ratio_error"])
     ]
-    return min(as_good, key=lambda row: (row["free"], row["held_out_rms_m"]))
+    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
 
 
 def advice(rows: Sequence[Row]) -> str:
@@ -139,7 +143,7 @@ def advice(rows: Sequence[Row]) -> str:
     use = f"Use {chosen['model']}"
     if not others:
         return f"{use}: no other could be fitted."
-    if chosen["held_out_rms_m"] is None:
+    if chosen["held_out_rms"] is None:
         rival = min(others, key=lambda row: row["delta_aic"])
         return (
             f"{use}, by AIC alone, for nothing could be predicted: ΔAIC of {rival['model']} is "
@@ -156,7 +160,7 @@ def advice(rows: Sequence[Row]) -> str:
 
 def _lost(row: Row, chosen: Row) -> str:
     """On a model that what is held out cannot be predicted with."""
-    without = " and ".join(f"'{name}'" for name, rms_m in row["predictions"].items() if not rms_m)
+    without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
     said = f"{row['model']} does not predict {without}"
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
         return f"{said}."
@@ -167,7 +171,7 @@ def _lost(row: Row, chosen: Row) -> str:
 
 
 def _compared(chosen: Row, rival: Row) -> str:
-    missed = f"it misses what is held out by {1e3 * chosen['held_out_rms_m']:.3g} mm"
+    missed = f"it misses what is held out by {_size(chosen)}"
     ratio, error = _between(chosen, rival)
     more = chosen["free"] - rival["free"]
     count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
@@ -175,10 +179,21 @@ def _compared(chosen: Row, rival: Row) -> str:
     support = rival["delta_aic"] - chosen["delta_aic"]
     side = "for it" if support > 0 else "against it"
     return (
-        f"{missed}{size}, {rival['model']} by {1e3 * rival['held_out_rms_m']:.3g} mm, "
+        f"{missed}{size}, {rival['model']} by {_size(rival)}, "
         f"{exp(ratio):.3g} times as much (±{100 * error:.2g} %), and AIC is "
         f"{abs(support):.3g} {side}"
     )
+
+
+def _size(row: Row) -> str:
+    """What a model misses of what is held out."""
+    factor, unit = shown_in(row["unit"])
+    return f"{factor * row['held_out_rms']:.3g} {unit}"
+
+
+def shown_in(unit: str) -> tuple[float, str]:
+    """The factor and the unit that people see metres or newtons in."""
+    return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def _between(chosen: Row, rival: Row) -> tuple[float, float]:

@@ -169,9 +169,10 @@ def plan_models(
     planned = []
     for held_out in ("", *recordings(problem)):
         for variant in variants:
-            file, _ = read_problem_file(path, variant.overrides)
+            own = variant.path or path
+            file, _ = read_problem_file(own, variant.overrides)
             solver, swept = method or file.solver.method, {"model": variant.label}
-            run = _planned(path, file, solver, variant.overrides, 0, swept, held_out)
+            run = _planned(own, file, solver, variant.overrides, 0, swept, held_out)
             planned.append(replace(run, allow_code=allow_code))
     return planned
 

@@ -1,8 +1,9 @@
 """How well a model predicts what it was not fitted to.
 
 One recording is left out, the others are fitted, and it is simulated with what they found, its own
-nuisance parameters fitted. Of a single recording the last third is left out: its markers' samples
-are taken away, and the simulation with what the rest tells goes on into it.
+nuisance parameters fitted. Of a single recording the last third is left out: its samples are taken
+away, and the simulation with what the rest tells goes on into it. What is compared are the markers,
+and the forces where there are none.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
-from ..methods.solution import Solution
+from ..experiment.grasp import Grasp
+from ..methods.solution import Solution, pooled_wrench_rms
 from ..nlp.simulation import with_markers
 from ..problem import Problem, RolloutOptions
 from ..rollout import Rollout, roll_out
@@ -49,7 +50,7 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
     record: dict[str, Any] = {
         "status": solution.status.value,
         "converged": solution.status.converged,
-        "rms_m": solution.rms_m,
+        "rms": {"m": solution.rms_m, "N": pooled_wrench_rms(solution)[0]},
         "parameters": solution.parameters | _derived(solution),
         "free": [item.name for item in problem.parameters.free],
         "time_s": solution.timing.total,
@@ -68,7 +69,7 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
     if not isinstance(rollout, Rollout):
         return record | {"prediction": None, "failure": rollout}
     given = next(e for e in problem.experiments if e.name == held_out)
-    return record | {"prediction": _missed(given, rollout.trajectory.markers_m, start_s)}
+    return record | {"prediction": _missed(given, rollout, start_s)}
 
 
 def without(problem: Problem, name: str) -> tuple[Problem, float]:
@@ -79,21 +80,43 @@ def without(problem: Problem, name: str) -> tuple[Problem, float]:
     else:
         start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
         tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
-        left = with_markers(chosen, tracks)
+        grasps = tuple(_until(grasp, start_s) for grasp in chosen.grasps)
+        left = replace(with_markers(chosen, tracks), grasps=grasps)
     experiments = [left if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
 
 
-def _missed(experiment: Experiment, simulated_m: Array, start_s: float) -> dict[str, Any]:
-    """How far held-out samples are from the simulation (T, M, 3): RMS, number, Σ by block [m²]."""
-    markers = experiment.markers
-    later = experiment.t_s > start_s
-    counted = markers.present & later[:, None]
-    squares = np.where(counted, np.sum((simulated_m - markers.positions_m) ** 2, axis=2), 0.0)
-    samples = int(counted.sum())
-    blocks = [float(np.sum(each)) for each in np.array_split(squares[later], BLOCKS)]
-    rms_m = float(np.sqrt(squares.sum() / samples)) if samples else None
-    return {"rms_m": rms_m, "samples": samples, "blocks_m2": blocks}
+def _until(grasp: Grasp, end_s: float) -> Grasp:
+    """The grasp without what its sensor measured later."""
+    wrench = grasp.wrench
+    if wrench is None:
+        return grasp
+    values = np.where((wrench.t_s > end_s)[:, None], np.nan, wrench.values)
+    return replace(grasp, wrench=replace(wrench, values=values))
+
+
+def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[str, Any]:
+    """How far held-out samples are from the simulation: RMS, number, and Σ of squares by block.
+
+    Of the markers [m], or of the forces [N] where there are none; `unit` says which.
+    """
+    markers, unit = experiment.markers, "m"
+    t_s, apart = experiment.t_s, rollout.trajectory.markers_m - markers.positions_m
+    counted = markers.present
+    if not markers.samples:
+        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+        t_s = np.concatenate([sensor.t_s for sensor in sensors])
+        pairs = zip(rollout.wrenches, sensors, strict=True)
+        apart = np.concatenate([(read - sensor.values)[:, :3] for read, sensor in pairs])
+        order, unit = np.argsort(t_s, kind="stable"), "N"
+        t_s, apart = t_s[order], apart[order, None]
+        counted = np.isfinite(apart).any(axis=2)
+    later = t_s > start_s
+    squares = np.where(counted, np.nansum(apart**2, axis=2), 0.0)[later]
+    samples = int(counted[later].sum())
+    blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
+    rms = float(np.sqrt(squares.sum() / samples)) if samples else None
+    return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}
 
 
 def _derived(solution: Solution) -> dict[str, float]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..fem.constants import symbol_of, unit_of
 from ..output.record import as_json
-from .choice import advice, model_notes, model_rows
+from .choice import advice, model_notes, model_rows, shown_in
 from .plan import PlannedRun, short_keys
 from .plots import comparison_plots, sweep_plots
 from .store import Record, RunStore, write_whole
@@ -39,7 +39,9 @@ WORDS = {
     "total s": "in all [s]",
     "free": "parameters estimated",
     "fit mm": "markers, RMS [mm]",
+    "fit N": "forces, RMS [N]",
     "held out mm": "held out, RMS [mm]",
+    "held out N": "held out, RMS [N]",
     "times best": "held out, times the best",
 }
 UNITS = ("Pa", "s", "1/s", "kg/m³")
@@ -331,11 +333,12 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:
 
 def model_views(rows: Sequence[Row]) -> list[View]:
     """Fit and prediction of every model, and what its small-strain moduli are."""
+    factor, unit = shown_in(rows[0]["unit"])
     numbers: dict[str, Cell] = {
         "free": _number("free", 1, "d"),
-        "fit mm": _number("rms_m", 1e3, ".3g"),
+        f"fit {unit}": _number("rms", factor, ".3g"),
         "ΔAIC": _number("delta_aic", 1, ".1f"),
-        "held out mm": _number("held_out_rms_m", 1e3, ".3g"),
+        f"held out {unit}": _number("held_out_rms", factor, ".3g"),
         "times best": lambda row: _times(row),
         "total s": _number("total_s"),
     }
@@ -347,7 +350,8 @@ def model_views(rows: Sequence[Row]) -> list[View]:
     model = {"": lambda row: "→" if row["chosen"] else "", "model": _text("model")}
     views = [_view("Models", model, numbers, rows)]
     held = {
-        f"'{n}' mm": _held_out(n) for n in dict.fromkeys(n for r in rows for n in r["predictions"])
+        f"'{n}' {unit}": _held_out(n, factor)
+        for n in dict.fromkeys(n for r in rows for n in r["predictions"])
     }
     if len(held) > 1:
         views.append(_view("Recordings held out", {"model": _text("model")}, held, rows))
@@ -363,8 +367,8 @@ def _turned(
     return View(title, ("", *(name(row) for row in rows)), lines)
 
 
-def _held_out(name: str) -> Cell:
-    return lambda row: _value(row["predictions"].get(name), 1e3, ".3g")
+def _held_out(name: str, factor: float) -> Cell:
+    return lambda row: _value(row["predictions"].get(name), factor, ".3g")
 
 
 def _times(row: Row) -> str:

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import InputError, hint_at
 from ..fem.constants import bare
 from ..fem.materials import MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
+from ..problem import Problem
 from ..problem.reading import read_problem_file
 
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
@@ -32,10 +35,13 @@ class Variant:
     ----------
     label : str
     overrides : tuple of "key=value" that make it of the problem file
+    path : Path or None
+        A problem file of its own.
     """
 
     label: str
     overrides: tuple[str, ...]
+    path: Path | None = None
 
 
 def parse_materials(text: str) -> tuple[str, ...]:
@@ -130,6 +136,44 @@ def variants(
             "--materials" if materials else "--prony",
         )
     return found
+
+
+def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[Variant]:
+    """Problem files of the same recordings, a model each, called after the file.
+
+    Raises
+    ------
+    InputError
+        Where what they fit differs: neither misses nor AIC could be compared.
+    """
+    first, *others = map(_measured, problems)
+    for problem, measured in zip(problems[1:], others, strict=True):
+        if measured != first:
+            raise InputError(
+                f"it fits {_listed(measured)}, but {problems[0].path} {_listed(first)}; expected "
+                "the same recordings and samples",
+                problem.path,
+            )
+    paths = [Path(str(problem.path)) for problem in problems]
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise InputError("this file is given twice; expected another", paths[-1], "--with")
+    stems = [path.stem for path in paths]
+    distinct = len(set(stems)) == len(stems)
+    return [Variant(path.stem if distinct else str(path), tuple(overrides), path) for path in paths]
+
+
+def _measured(problem: Problem) -> dict[str, int]:
+    """How many numbers each recording that is fitted has measured."""
+    return {
+        e.name: 3 * e.markers.samples
+        + sum(int(np.isfinite(g.wrench.values).sum()) for g in e.grasps if g.wrench is not None)
+        for e in problem.experiments
+        if not e.validation
+    }
+
+
+def _listed(measured: Mapping[str, int]) -> str:
+    return " and ".join(f"'{name}' ({numbers} numbers)" for name, numbers in measured.items())
 
 
 def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, path: Path) -> None:
