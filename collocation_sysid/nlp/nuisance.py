@@ -312,7 +312,7 @@ class NuisanceMap:
             return self.gravity_m_s2, first, second
         value, slopes, *curvatures = (part.full() for part in self._gravity(phi[own]))
         first[:, own] = slopes
-        second[np.ix_(range(3), own, own)] = curvatures
+        second[:, own[:, None], own] = curvatures
         return value.ravel(), first, second
 
     @cached_property
