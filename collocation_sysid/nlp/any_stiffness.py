@@ -192,4 +192,4 @@ def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_res
     found = [at_rest if from_rest else np.zeros_like(root)]
     for push in pushes:
         found.append(fading * found[-1] + push)
-    return np.stack(found, axis=1).imag / damped[:, None]
+    return np.imag(np.stack(found, axis=1)) / damped[:, None]

@@ -306,18 +306,29 @@ class NuisanceMap:
 
     def gravity(self, phi: Array) -> tuple[Array, Array, Array]:
         """Gravity (3,) in the body's frame, and its derivatives by φ: (3, k) and (3, k, k)."""
-        value, first, *second = self._gravity(phi)
-        return value.full().ravel(), first.full(), np.array([h.full() for h in second])
+        own, first = self.of_gravity, np.zeros((3, self.size))
+        second = np.zeros((3, self.size, self.size))
+        if not len(own):
+            return self.gravity_m_s2, first, second
+        value, slopes, *curvatures = (part.full() for part in self._gravity(phi[own]))
+        first[:, own] = slopes
+        second[:, own[:, None], own] = curvatures
+        return value.ravel(), first, second
+
+    @cached_property
+    def of_gravity(self) -> NDArray[np.int64]:
+        """Positions in φ of what turns gravity, in the body's frame."""
+        return self.places("tilt", "turn")
 
     @cached_property
     def _gravity(self) -> ca.Function:
-        phi = ca.SX.sym("phi", self.size)
-        values = phi * self.scales
-        gravity = ca.DM(self.gravity_m_s2)
-        if len(tilt := self.places("tilt")):
-            gravity = self._tilted(values[tilt.tolist()])
-        if len(turn := self.places("turn")):
-            gravity = rotation(values[turn.tolist()]).T @ gravity
+        phi = ca.SX.sym("phi", len(self.of_gravity))
+        values = phi * self.scales[self.of_gravity]
+        kinds, gravity = [self.kinds[k] for k in self.of_gravity], ca.DM(self.gravity_m_s2)
+        if tilt := [k for k, kind in enumerate(kinds) if kind == "tilt"]:
+            gravity = self._tilted(values[tilt])
+        if turn := [k for k, kind in enumerate(kinds) if kind == "turn"]:
+            gravity = rotation(values[turn]).T @ gravity
         gravity = ca.SX(gravity)
         second = [ca.densify(ca.hessian(gravity[i], phi)[0]) for i in range(3)]
         return ca.Function("gravity", [phi], [gravity, ca.jacobian(gravity, phi), *second])

@@ -417,17 +417,25 @@ class ThetaMap:
         q = ca.SX.sym("q", len(parameters.free))
         theta = ca.vertcat(*body.assembled(parameters.expressions(q)))
         self._theta = _with_derivatives("theta", q, theta)
+        self._known: tuple[Array, list[Array]] | None = None
         self.derived_names, derived = _derived(parameters.names, body, theta)
         self._derived = _with_derivatives("derived", q, derived)
 
     def theta(self, q: Sequence[float] | Array) -> Array:
         """(k,) constants at q."""
-        return self._theta(np.asarray(q))[0].full().ravel()
+        return self._at(q)[0].flatten()
 
     def derivatives(self, q: Array) -> tuple[Array, Array]:
         """∂θ/∂q (k, nq) and ∂²θ/∂q² (k, nq, nq)."""
-        _, jacobian, *hessians = self._theta(np.asarray(q))
-        return jacobian.full(), np.array([hessian.full() for hessian in hessians])
+        _, jacobian, *hessians = self._at(q)
+        return jacobian.copy(), np.array(hessians)
+
+    def _at(self, q: Sequence[float] | Array) -> list[Array]:
+        """θ, its Jacobian and its Hessians at q; methods ask for them several times at a point."""
+        q = np.asarray(q, dtype=np.float64)
+        if self._known is None or not np.array_equal(self._known[0], q):
+            self._known = q.copy(), [part.full() for part in self._theta(q)]
+        return self._known[1]
 
     def derived(self, q: Array) -> tuple[Array, Array]:
         """Values of `derived_names`, and their derivatives by q."""
