@@ -45,6 +45,11 @@ def free_density() -> Parameters:
     return Parameters.of({name: Unknown(1.1 * value) for name, value in DENSE.items()})
 
 
+def weighed(experiment: Experiment) -> Experiment:
+    """The experiment, its density not known."""
+    return replace(experiment, body=experiment.body.with_free_densities([""]))
+
+
 def felt_memory(name: str, steps: int = 5, branches: int = 2, **changes) -> Experiment:
     return sensing(recorded(name, steps, branches, **changes))
 
@@ -64,7 +69,7 @@ MADE: dict[str, Callable[[], Collocation]] = {
     "bdf2": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN)], GUESS, "bdf2"),
     "substeps": lambda: Collocation([wristed_cube(3)], GUESS, "backward-euler", substeps=2),
     "rows for grasps": lambda: Collocation([wristed_cube(5)], GUESS, explicit_grasps=True),
-    "density": lambda: Collocation([wristed_cube(5, ALL_UNKNOWN)], free_density()),
+    "density": lambda: Collocation([weighed(wristed_cube(5, ALL_UNKNOWN))], free_density()),
     "loads": lambda: Collocation([sensing(bar_loaded(6))], GUESS),
     "let go": lambda: Collocation([sensing(bar_let_go(8))], GUESS),
     "driven": lambda: Collocation([sensing(driven_bar(5))], GUESS),
@@ -124,7 +129,7 @@ def remembered() -> Experiment:
 
 TARED = Nuisance.none(tare=10.0, tool_kg=0.01, sensor_lag_s=0.005)
 PROBLEMS: dict[str, Callable[[], Collocation]] = {
-    "density": lambda: Collocation([noisy(sensed(wristed_cube(12)))], free_density()),
+    "density": lambda: Collocation([weighed(noisy(sensed(wristed_cube(12))))], free_density()),
     "static": lambda: Collocation([noisy(pressed())], ELASTIC_ONLY),
     "memory": lambda: Collocation([noisy(remembered())], guesses(ONE, 1.1)),
     "sensor": lambda: Collocation([noisy(sensed(wristed_cube(12, TARED)))], GUESS),
