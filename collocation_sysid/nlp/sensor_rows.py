@@ -214,12 +214,21 @@ class SensorRows(Addition):
         both = np.flatnonzero(upper), np.arange(18)
         return [(apart, both[apart > 0]) for apart in range(used)]
 
+    @cached_property
+    def _crossing(self) -> list[tuple[int, int, Index]]:
+        """Axes of x and of R that a torque multiplies, and of which nodes: those held along it.
+
+        Other grasps may hold these nodes along other axes.
+        """
+        crossed = zip(*np.nonzero(~np.eye(3, dtype=bool)), strict=True)
+        return [(b, c, np.flatnonzero(self.sensor.held[c::3])) for b, c in crossed]
+
     def hessian_entries(self) -> tuple[Index, Index]:
         """The same of the Hessian: x by R, φ by Y, Y by Y, and T by W and Y."""
         given, phi = self.places.variable + self._given, self.phi_columns
         pairs = []
-        for b, c in zip(*np.nonzero(~np.eye(3, dtype=bool)), strict=True):
-            pairs.append((self._placed[:, b::3], self._pulling[:, c::3]))
+        for b, c, nodes in self._crossing:
+            pairs.append((self._placed[:, b::3][:, nodes], self._pulling[:, c::3][:, nodes]))
         pairs.append((phi[self._reading], given[..., None]))
         for apart, kept in self._bands:
             count = len(given) - apart
@@ -239,11 +248,8 @@ class SensorRows(Addition):
         segment, of_rows = self.segment, self._of_rows(multipliers)
         turned = np.einsum("kij,kj->ki", self.sensor.frames[0], of_rows[0][:, 3:])
         crossed = -np.einsum("abc,ka->kbc", LEVI_CIVITA, turned)
-        held = self.sensor.held * segment.length_m * segment.force_n
-        found = [
-            crossed[:, [b], c] * held[c::3]
-            for b, c in zip(*np.nonzero(~np.eye(3, dtype=bool)), strict=True)
-        ]
+        scale = segment.length_m * segment.force_n
+        found = [np.repeat(crossed[:, b, c], len(nodes)) * scale for b, c, nodes in self._crossing]
         read = self._read(part, z)
         found += [loss_weight * each for each in self._loss_curvature(read)]
         if len(self._lag):
