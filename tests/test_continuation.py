@@ -88,7 +88,7 @@ def test_a_part_has_the_layout_of_the_whole():
 
 
 @pytest.mark.parametrize(
-    ("experiment", "method"), zip(SMALL_EXPERIMENTS, cycle(["reduced-space", "shooting"]))
+    ("experiment", "method"), [*zip(SMALL_EXPERIMENTS, cycle(["reduced-space", "shooting"]))]
 )
 def test_the_true_parameters_are_recovered(experiment: str, method: str):
     made = measured(SMALL_EXPERIMENTS[experiment](14))

@@ -185,7 +185,7 @@ def test_gradients_where_a_wrench_tells_the_density(make, rng):
     assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
 
 
-@pytest.mark.parametrize(("name", "integrator"), zip(TOLD, cycle(["newmark", "midpoint"])))
+@pytest.mark.parametrize(("name", "integrator"), [*zip(TOLD, cycle(["newmark", "midpoint"]))])
 def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
     make, truth = TOLD[name]
     free = make()
