@@ -1,0 +1,50 @@
+"""An answer near incompressibility is looked for from another Poisson's ratio too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+from problems_small import hung_cube
+
+import collocation_sysid as cs
+from collocation_sysid.run import _from_elsewhere
+from collocation_sysid.second_start import NEARLY_INCOMPRESSIBLE, second_start
+
+KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
+TRUTH = {"young_pa": 600.0, "poisson": 0.46, **KNOWN}
+
+
+@cache
+def answer(*free: str) -> cs.Solution:
+    """That of a cube with a Poisson's ratio near one half, of which only some numbers are free."""
+    swung = hung_cube()
+    tracks_m = cs.simulate(swung, TRUTH, "midpoint").markers_m
+    estimated = {name: cs.Unknown(TRUTH[name]) for name in free}
+    return cs.solve(cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated}))
+
+
+def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
+    first = answer("young_pa", "poisson", "gamma_r_s")
+    assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
+    start = second_start(first)
+    assert start is not None
+    guesses = {item.name: item.guess for item in start.free}
+    assert guesses["poisson"] == 0.3
+    assert guesses["young_pa"] == pytest.approx(first.parameters["young_pa"])
+    assert guesses["gamma_r_s"] == pytest.approx(first.parameters["gamma_r_s"])
+
+
+def test_a_ratio_that_is_known_gives_no_second_start():
+    assert second_start(answer("young_pa")) is None
+
+
+def test_the_better_of_two_answers_counts():
+    first = answer("young_pa", "poisson", "gamma_r_s")
+    same = _from_elsewhere(cs.ReducedSpace(), first, None)
+    assert same is first
+    worse = replace(first, history=(replace(first.history[-1], loss=first.history[-1].loss + 5),))
+    better = _from_elsewhere(cs.ReducedSpace(), worse, None)
+    assert "χ² lower by 5" in better.notes[0]
+    assert better.parameters["poisson"] == pytest.approx(first.parameters["poisson"], rel=1e-3)
