@@ -36,10 +36,11 @@ np.savetxt(
 body = cs.Body(mesh, density_kg_m3=40.0)
 hand = cs.Grasp(cs.Box((-1, -1, 0.179), (1, 1, 1)), poses)
 places_m = [(0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (0.06, 0.06, 0.045), (0.0, 0.06, 0.09)]
-seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=5e-4, places_m=places_m)
-truth = {"young_pa": 4000.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
-tracks_m = cs.simulate(cs.Experiment(body, t_s, [hand], seen), truth, "midpoint").markers_m
-tracks_m += np.random.default_rng(5).normal(scale=5e-4, size=tracks_m.shape)
+seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m)
+truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
+swing = cs.Experiment(body, t_s, [hand], seen)
+tracks_m = cs.simulate(swing, truth, "midpoint", substeps=2).markers_m
+tracks_m += np.random.default_rng(5).normal(scale=1e-3, size=tracks_m.shape)
 columns = [f"{name}_{axis}" for name in ("tip_1", "tip_2", "low", "middle") for axis in "xyz"]
 np.savetxt(
     folder / "markers.csv",
@@ -63,10 +64,13 @@ poisson = { fixed = 0.3 }
 gamma_r_s = {}
 gamma_m_1_s = {}
 
+[transcription]
+substeps = 2
+
 [[experiment]]
 name = "swing"
 grasp = { nodes = { box_m = [[-1, -1, 0.179], [1, 1, 1]] }, poses = "poses.csv" }
-markers = { file = "markers.csv", sigma_m = 0.0005 }
+markers = { file = "markers.csv", sigma_m = 0.001 }
 """)
 run = cs.run(cs.Problem.read(folder / "problem.toml"))
 print(run.table())
