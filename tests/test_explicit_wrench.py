@@ -73,6 +73,7 @@ MADE: dict[str, Callable[[], Collocation]] = {
     "loads": lambda: Collocation([sensing(bar_loaded(6))], GUESS),
     "let go": lambda: Collocation([sensing(bar_let_go(8))], GUESS),
     "driven": lambda: Collocation([sensing(driven_bar(5))], GUESS),
+    "driven memory": lambda: Collocation([felt_memory("driven-bar", 4)], guesses(TWO, 1.1)),
     "static": lambda: Collocation([sensing(block("xyz", gravity_m_s2=HANGING))], GUESS),
     "memory": lambda: Collocation([felt_memory("cube-with-nuisance")], guesses(TWO, 1.1)),
     "memory let go": lambda: Collocation([felt_memory("bar-let-go", 8)], guesses(TWO, 1.1)),
