@@ -552,6 +552,11 @@ def _solve_section(findings: Findings) -> RenderableType:
             f"{findings.overstresses:,} more variables and constraints for interior-point, the "
             "overstress of every point, in these nonzeros"
         )
+    if findings.wrenches:
+        rows["wrenches"] = (
+            f"{findings.wrenches:,} more variables and constraints for interior-point, what grasps "
+            "with a sensor give, in these nonzeros"
+        )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         rows[cost.method] = f"about {_duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"

@@ -8,9 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from memories_small import ONE, TWO, guesses, recorded, remembering
+from memories_small import ONE, TWO, guesses, recorded
 from problems_small import GUESS, TRUTH, bar_let_go, bar_loaded, driven_bar, hung_cube
-from test_explicit import assert_derivatives, explicit
+from test_explicit import assert_derivatives, explicit, of_branches
 from test_static import ELASTIC_ONLY, HANGING, block
 from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
 
@@ -73,6 +73,7 @@ MADE: dict[str, Callable[[], Collocation]] = {
     "loads": lambda: Collocation([sensing(bar_loaded(6))], GUESS),
     "let go": lambda: Collocation([sensing(bar_let_go(8))], GUESS),
     "driven": lambda: Collocation([sensing(driven_bar(5))], GUESS),
+    "driven memory": lambda: Collocation([felt_memory("driven-bar", 4)], guesses(TWO, 1.1)),
     "static": lambda: Collocation([sensing(block("xyz", gravity_m_s2=HANGING))], GUESS),
     "memory": lambda: Collocation([felt_memory("cube-with-nuisance")], guesses(TWO, 1.1)),
     "memory let go": lambda: Collocation([felt_memory("bar-let-go", 8)], guesses(TWO, 1.1)),
@@ -127,7 +128,7 @@ def pressed() -> Experiment:
 
 def remembered() -> Experiment:
     """A cube with a memory, in a hand with a sensor."""
-    cube = sensing(remembering("hung-cube", 10))
+    cube = sensing(replace(hung_cube(12, (1, 1, 2)), body=of_branches(1)))
     found = simulate(cube, ONE, "midpoint")
     return with_wrenches(with_markers(cube, found.markers_m), found.wrenches)
 

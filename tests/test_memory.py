@@ -22,6 +22,7 @@ KINDS = {
     "undeformed": ("released-cube", {}),
     "let-go": ("bar-let-go", {}),
     "off-in-its-grasp": ("bar-with-nuisance", {}),
+    "driven": ("driven-bar", {}),
 }
 
 

@@ -17,6 +17,7 @@ from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.explicit import Explicit, made_explicit
+from collocation_sysid.nlp.overstress import Overstress
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -119,7 +120,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     findings = check_problem(problem)
     program = made_explicit(problem.collocation())
     assert isinstance(program, Explicit)
-    assert findings.overstresses == program.overstresses
+    assert findings.overstresses == program.added(Overstress)
     assert findings.variables + findings.overstresses == program.variables
     assert findings.constraints + findings.overstresses == program.constraints
     assert findings.jacobian_nonzeros == len(program.jacobian_structure[1])

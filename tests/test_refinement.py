@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems_small import EDGE_M, bar_let_go, box, cube_with_gaps, hung_cube
+from problems_small import EDGE_M, bar_let_go, box, cube_with_gaps, driven_bar, hung_cube
 
 from collocation_sysid.experiment import Grasp
 from collocation_sysid.experiment.refinement import refined as refined_experiment
@@ -114,3 +114,22 @@ def test_a_given_start_is_carried_over():
         finer.start_positions_m, finer.body.nodes_m * [1.0, 1.0, 1.1], atol=1e-12
     )
     np.testing.assert_allclose(finer.start_velocities_m_s, 0.1 * finer.start_positions_m)
+
+
+@pytest.mark.parametrize("faces", ["selected", "numbered"])
+def test_tendons_and_pressures_drive_the_finer_body_alike(faces: str):
+    bar = driven_bar()
+    if faces == "numbered":
+        (pressure,) = bar.pressures
+        numbers = pressure.on(bar.body).measure.faces[:, :3]
+        bar = replace(bar, pressures=[replace(pressure, faces=numbers, placed=None)])
+    finer = refined_experiment(bar, refined(bar.body))
+    stretch = np.array([[1.1, 0.1, 0.0], [0.0, 0.9, 0.2], [0.1, 0.0, 1.0]])
+    for coarse, fine in zip(
+        (*bar.tendons, *bar.pressures), (*finer.tendons, *finer.pressures), strict=True
+    ):
+        at = [(e.body.nodes_m @ stretch.T).reshape(1, -1) for e in (bar, finer)]
+        values = coarse.measure.value(at[0]), fine.measure.value(at[1])
+        np.testing.assert_allclose(values[1], values[0], rtol=1e-9)
+        assert values[0] != pytest.approx(coarse.measure.value(bar.body.nodes_m.reshape(1, -1)))
+        np.testing.assert_array_equal(fine.amplitude(bar.t_s), coarse.amplitude(bar.t_s))

@@ -15,6 +15,7 @@ import pytest
 from collocation_sysid import Problem, run, solve
 from collocation_sysid.experiment import Nuisance
 from collocation_sysid.methods.solution import Solution
+from collocation_sysid.nlp.sensor import without_sensors
 from collocation_sysid.run import Run
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
@@ -63,6 +64,31 @@ def test_table1_recovers_the_truth(file: str, within: float, method: str, tmp_pa
     assert result["status"] == "converged"
     assert np.abs(relative_errors(result, TABLE1)).max() < within
     assert result["rollout"]["max_m"] < 0.001 < PAPER_TIP_ERROR_M
+
+
+WRIST = {"young_pa": 2.5e4, "density_kg_m3": 120.0}
+
+
+@pytest.mark.parametrize("felt", [True, False], ids=["with the sensor", "without"])
+def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
+    coarser = ["transcription.substeps=1", "experiment.swing.window_s=[0.0, 0.6]"]
+    problem = Problem.read(PROBLEMS / "wrist_sensor" / "problem.toml", coarser)
+    if not felt:
+        problem = replace(problem, experiments=tuple(map(without_sensors, problem.experiments)))
+    finished = run(problem, seek_causes=False)
+    assert finished.solution.status.converged
+    estimates = finished.uncertainty.estimates
+    if felt:
+        for name, true in WRIST.items():
+            low, high = estimates[name].ci95
+            assert low < true < high, name
+            assert estimates[name].std_error < 0.05 * true, name
+        return
+    assert {estimates[name].std_error for name in WRIST} == {None}
+    ratio = estimates["young_pa"].value / estimates["density_kg_m3"].value
+    assert ratio == pytest.approx(WRIST["young_pa"] / WRIST["density_kg_m3"], rel=0.03)
+    assert finished.trust.verdict == "doubtful"
+    assert any("can be told (E/ρ)" in reason for reason in finished.trust.reasons)
 
 
 # The measured beam -----------------------------------------------------------------------------

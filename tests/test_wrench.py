@@ -23,7 +23,8 @@ from problems_small import (
     vertex_markers,
     with_papers_damping,
 )
-from wrenches_small import sensing, with_wrenches, wristed_cube
+from scipy.spatial.transform import Rotation
+from wrenches_small import fitted, sensing, with_wrenches, wristed_cube
 
 from collocation_sysid.experiment import (
     Experiment,
@@ -39,7 +40,7 @@ from collocation_sysid.nlp.collocation import Collocation, Part
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.sensor import low_pass
+from collocation_sysid.nlp.sensor import Forced, low_pass
 from collocation_sysid.nlp.simulation import simulate
 
 EVERYTHING = Nuisance(
@@ -308,3 +309,22 @@ def test_a_platen_gives_what_the_plate_and_the_weight_take():
 
 def test_slopes_of_a_static_experiment():
     assert_slopes(Collocation([noisy_wrenches(pressed(nuisance=Nuisance()))], GUESS))
+
+
+def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
+    (segment,) = fitted(noisy_wrenches(wristed_cube(8, frame="grasp")), GUESS).segments
+    (sensor,) = segment.sensors
+    poses, rows, dofs = sensor.grasp.poses, segment.grid_rows, len(segment.sensed_dofs)
+    forced = Forced.still(rng.normal(size=(rows, dofs)), rng.normal(size=(rows, dofs)))
+    shift, turn = rng.normal(size=(2, 3))
+
+    def residual(size: float) -> np.ndarray:
+        turned = Rotation.from_rotvec(size * turn) * Rotation.from_quat(poses.quaternions_xyzw)
+        off = PoseSequence(poses.t_s, poses.positions_m + size * shift, turned.as_quat())
+        other = replace(sensor, grasp=replace(sensor.grasp, poses=off))
+        still = np.zeros(3), np.zeros((3, 0))
+        return other.linearised(forced, np.zeros(0, dtype=int), np.zeros(0), still, 0)[0]
+
+    given = [np.tile(each, (rows, 1, 1)) for each in (shift, turn)]
+    found = sensor.frame_response(forced, np.zeros(0), *given)[..., 0]
+    assert relative_error(found, (residual(1e-4) - residual(-1e-4)) / 2e-4) < 1e-5

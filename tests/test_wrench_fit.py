@@ -14,6 +14,7 @@ from problems_small import GUESS, TRUTH, hung_cube, relative_errors
 from wrenches_small import SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
+from collocation_sysid.check import check_problem
 from collocation_sysid.check.derivatives import derivative_errors, shortened
 from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.methods.horizon import Horizon
@@ -22,6 +23,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.explicit import made_explicit
 from collocation_sysid.nlp.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -151,18 +153,7 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     assert any(file.name.startswith("wrench") for file in redraw(folder, tmp_path / "again"))
 
 
-def test_interior_point_finds_the_same_optimum():
-    collocation = Collocation([swung(steps=12)], GUESS)
-    reduced = ReducedSpace()(collocation)
-    found = InteriorPoint(max_iterations=300)(collocation)
-    assert found.status.converged
-    np.testing.assert_allclose(found.q, reduced.q, atol=1e-6)
-    assert any("limited-memory" in note for note in found.notes)
-
-
-def test_methods_that_need_second_derivatives_refuse_wrenches():
-    with pytest.raises(cs.InputError, match="needs second derivatives"):
-        cs.SqpMethod()(Collocation([swung(steps=12)], GUESS))
+def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches():
     exact = ReducedSpace(hessian="exact")
     with pytest.raises(cs.InputError, match="second derivatives of measured wrenches"):
         exact(Collocation([swung(steps=12)], GUESS))
@@ -173,14 +164,22 @@ def test_check_compares_the_slopes_of_wrenches():
     short = shortened(problem, 12).collocation()
     jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
     assert jacobian < 1e-6
-    assert hessian < 1e-6
+    assert 0 < hessian < 1e-6
+
+
+def test_check_tells_the_variables_that_a_wrench_brings():
+    problem = Problem([swung(steps=12)], UNKNOWN)
+    collocation = problem.collocation()
+    findings, program = check_problem(problem), made_explicit(collocation)
+    assert findings.wrenches == program.variables - collocation.variables > 0
+    assert findings.hessian_nonzeros == len(program.hessian_structure[1])
 
 
 def test_interior_point_finds_the_body_in_its_grasp_too():
     nuisance = Nuisance.none(tare=10.0, gravity_rad=0.02, hand_eye_m=1e-3, sensor_time_s=0.001)
     collocation = Collocation([swung(nuisance=nuisance, steps=12)], GUESS)
     reduced = ReducedSpace()(collocation)
-    found = InteriorPoint(max_iterations=500)(collocation)
+    found = InteriorPoint()(collocation)
     assert found.status.converged
     np.testing.assert_allclose(found.q, reduced.q, atol=1e-5)
 

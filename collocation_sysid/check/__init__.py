@@ -15,9 +15,12 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import started
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
-from ..nlp.explicit import made_explicit
+from ..nlp.explicit import Explicit, made_explicit
 from ..nlp.factorisation import Choice
+from ..nlp.overstress import Overstress
+from ..nlp.reaction_rows import Reactions
 from ..nlp.schemes import as_scheme
+from ..nlp.sensor_rows import SensorRows
 from ..problem import Problem
 from ..statistics.cause import Cause
 from ..statistics.scale import scale_notes
@@ -65,10 +68,10 @@ class Findings:
     recordings : tuple of Recording, one for each experiment
     motions : tuple of Motion, one for each fitted experiment that moves
     variables, constraints : int
-        Of the program, without memory.
-    overstresses : int
-        As many of either are there beside them, of bodies with memory, for interior point and
-        others that see the whole program.
+        Of the program, without memory and wrenches.
+    overstresses, wrenches : int
+        As many of either are there beside them, of bodies with memory and of sensors, for interior
+        point and others that see the whole program.
     jacobian_nonzeros, hessian_nonzeros : int
         With these.
     method : str
@@ -94,6 +97,7 @@ class Findings:
     variables: int
     constraints: int
     overstresses: int
+    wrenches: int
     jacobian_nonzeros: int
     hessian_nonzeros: int
     method: str
@@ -182,7 +186,8 @@ def check_problem(problem: Problem) -> Findings:
         motions=motions,
         variables=collocation.variables,
         constraints=collocation.constraints,
-        overstresses=whole.constraints - collocation.constraints,
+        overstresses=whole.added(Overstress) if isinstance(whole, Explicit) else 0,
+        wrenches=whole.added(Reactions, SensorRows) if isinstance(whole, Explicit) else 0,
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
         method=method,

@@ -8,18 +8,16 @@ import numpy as np
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
-from ..experiment.markers import Markers
 from ..experiment.wrench import Wrench
 from ..experiment.wrench_files import FEWEST
 from ..nlp.collocation import Collocation
 from ..nlp.explicit import Explicit, carried_over, made_explicit
-from ..nlp.sensor import without_sensors
 from ..problem import Problem
 
 # All kinds of rows are among these samples; derivatives do not depend on how many follow.
 SAMPLES = 12
 STEP = 1e-5
-# With more entries the memory of bodies is not laid out as variables, only its slopes are checked.
+# With more entries memory and wrenches are not laid out as variables: their slopes are checked.
 LAID_OUT = 5e6
 
 
@@ -55,16 +53,14 @@ def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
 
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Largest relative deviations of J and H along a random direction at a disturbed start."""
-    rng, through_memory = np.random.default_rng(0), 0.0
-    of_sensors = 0.0
-    if any(segment.sensors for segment in collocation.segments):
-        of_sensors = _gradient_error(collocation, z, rng)
-        collocation, z = _blind(collocation, z)
+    rng, of_given = np.random.default_rng(0), 0.0
     program = made_explicit(collocation)
     if isinstance(program, Explicit):
-        through_memory = _slopes_error(collocation, z, rng)
+        of_given = _gradient_error(collocation, z, rng)
+        if collocation.remembers:
+            of_given = max(of_given, _slopes_error(collocation, z, rng))
         if sum(program.further_nonzeros) > LAID_OUT:
-            return max(through_memory, of_sensors), 0.0
+            return of_given, 0.0
         collocation, z = program, carried_over(z, collocation, program)
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
@@ -77,7 +73,7 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     along = collocation.jacobian(point) @ direction
     first = _deviation(collocation.constraint_values, along, point, direction)
     second = _deviation(lagrangian_gradient, hessian @ direction, point, direction)
-    return max(first, through_memory, of_sensors), second
+    return max(first, of_given), second
 
 
 def _gradient_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:
@@ -85,22 +81,6 @@ def _gradient_error(collocation: Collocation, z: Array, rng: np.random.Generator
     point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
     exact = np.array([collocation.gradient(point) @ direction])
     return _deviation(lambda at: np.array([collocation.objective(at)]), exact, point, direction)
-
-
-def _blind(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
-    """The program without wrenches, whose second derivatives nothing uses, and a point of it."""
-    p, positions = collocation.unpack(z)
-    without = [without_sensors(_marked(segment.experiment)) for segment in collocation.segments]
-    blind = replace(collocation, experiments=without)
-    return blind, blind.pack(np.append(p[: blind.nq], blind.guess_p[blind.nq :]), positions)
-
-
-def _marked(experiment: Experiment) -> Experiment:
-    """The experiment, with a marker where it has none: something has to be seen."""
-    if experiment.markers.names:
-        return experiment
-    seen, place = np.zeros((len(experiment.t_s), 1, 3)), experiment.body.nodes_m[:1]
-    return replace(experiment, markers=Markers(experiment.t_s, seen, 1.0, places_m=place))
 
 
 def _slopes_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:

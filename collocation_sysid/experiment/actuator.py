@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Generic, Protocol, Self, TypeVar
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar, Generic, Self, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
@@ -25,50 +26,67 @@ class Placed(Generic[S]):
     measure: S
 
 
-def measured(placed: Placed[S] | None, name: str) -> S:
-    """The scalar of what has been placed on a body."""
-    if placed is None:
-        raise InputError(f"{name} is not on a body yet; expected one of an experiment")
-    return placed.measure
+@dataclass(frozen=True, eq=False)
+class Actuator(ABC, Generic[S]):
+    """A tendon or a pressure; what is stated of it may be off by a factor and an amount.
 
+    Attributes
+    ----------
+    name : str
+        For messages and reports.
+    t_s : (m,) or None
+    course : Course
+        The tension or pressure as stated.
+    factor : float
+    placed : Placed, optional
+        S, on a body.
+    """
 
-class Actuator(Protocol):
-    """A tendon or a pressure; what is stated of it may be off by a factor and an amount."""
-
-    @property
-    def name(self) -> str:
-        """For messages and reports."""
-        ...
+    name: str
+    t_s: Array | None
+    factor: float
+    placed: Placed[S] | None
+    course: Course = field(init=False, repr=False)
 
     unit: ClassVar[str]  # of the tension or pressure
+    lost: ClassVar[str]  # the field of what is lost
+
+    def on(self, body: Body) -> Self:
+        """The same on a body.
+
+        Raises
+        ------
+        InputError
+            If it does not fit there.
+        """
+        if self.placed is not None and self.placed.body is body:
+            return self
+        return replace(self, placed=Placed(body, self._measure_on(body)))
+
+    @abstractmethod
+    def _measure_on(self, body: Body) -> S:
+        """S of a body."""
 
     @property
-    def course(self) -> Course:
-        """The tension or pressure as stated."""
-        ...
-
-    @property
-    def measure(self) -> Length | Volume:
+    def measure(self) -> S:
         """S, on a body."""
-        ...
+        if self.placed is None:
+            raise InputError(f"{self.name} is not on a body yet; expected one of an experiment")
+        return self.placed.measure
 
     @property
     def off(self) -> tuple[float, float]:
         """Factor, and what is lost."""
-        ...
-
-    def on(self, body: Body) -> Self:
-        """The same on a body."""
-        ...
+        return self.factor, getattr(self, self.lost)
 
     def off_by(self, factor: float, lost: float) -> Self:
         """The same with other ones."""
-        ...
+        return replace(self, factor=factor, **{self.lost: lost})
 
+    @abstractmethod
     def amplitude(self, t_s: Array) -> Array:
         """C at the times `t_s` (T,)."""
-        ...
 
+    @abstractmethod
     def slopes(self, t_s: Array) -> Array:
         """Its derivatives (T, 2) by the factor and by what is lost."""
-        ...

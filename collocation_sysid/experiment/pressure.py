@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..fem.refinement import faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.volume import Volume
-from .actuator import Placed, measured
+from .actuator import Actuator, Placed
 from .course import Course
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ PLANE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Pressure:
+class Pressure(Actuator[Volume]):
     """A pressure on faces of a body's boundary, above that on the rest of it.
 
     Its force follows the faces as they move. It has an energy, and a symmetric stiffness, where
@@ -46,14 +46,10 @@ class Pressure:
 
     faces: Selection | Index
     pressure_pa: Array
-    t_s: Array | None
-    name: str
-    factor: float
     lost_pa: float
-    placed: Placed[Volume] | None
-    course: Course = field(init=False, repr=False)
 
     unit: ClassVar[str] = "Pa"
+    lost: ClassVar[str] = "lost_pa"
 
     def __init__(
         self,
@@ -85,16 +81,7 @@ class Pressure:
             placed=placed,
         )
 
-    def on(self, body: Body) -> Pressure:
-        """The same on the faces of a body.
-
-        Raises
-        ------
-        InputError
-            If they are not on its boundary, or enclose the body instead of a cavity.
-        """
-        if self.placed is not None and self.placed.body is body:
-            return self
+    def _measure_on(self, body: Body) -> Volume:
         mesh = body.mesh
         if isinstance(self.faces, Selection):
             rows = self.faces.resolve_faces(mesh)
@@ -110,7 +97,7 @@ class Pressure:
                 f"{self.name}: the faces surround the body from outside; expected the wall of a "
                 "cavity in it, or an open patch whose rim is held"
             )
-        return replace(self, placed=Placed(body, volume))
+        return volume
 
     def refined(self, body: Body, finer: Body) -> Pressure:
         """The same on a body whose mesh is that of `body`, split in eight."""
@@ -118,20 +105,6 @@ class Pressure:
             return replace(self, placed=None)
         corners = self.on(body).measure.faces[:, :3]
         return replace(self, faces=faces_in_four(corners, body.mesh), placed=None)
-
-    @property
-    def measure(self) -> Volume:
-        """The volume of what is enclosed, on a body."""
-        return measured(self.placed, self.name)
-
-    @property
-    def off(self) -> tuple[float, float]:
-        """Factor, and what is lost."""
-        return self.factor, self.lost_pa
-
-    def off_by(self, factor: float, lost: float) -> Pressure:
-        """The same with another factor, and another pressure lost."""
-        return replace(self, factor=factor, lost_pa=lost)
 
     def amplitude(self, t_s: Array) -> Array:
         """The negative of the pressure at the times `t_s` (T,) [Pa]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.length import Length
-from .actuator import Placed, measured
+from .actuator import Actuator, Placed
 from .arrays import read_only_floats
 from .course import Course
 from .placement import Shape
@@ -24,7 +24,7 @@ FARTHEST = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Tendon:
+class Tendon(Actuator[Length]):
     """A thread through points of a body, straight between them, under a tension.
 
     It slides through its points without friction. A sheath has as many points as it needs to
@@ -45,14 +45,10 @@ class Tendon:
 
     points_m: Array
     tension_n: Array
-    t_s: Array | None
-    name: str
-    factor: float
     lost_n: float
-    placed: Placed[Length] | None
-    course: Course = field(init=False, repr=False)
 
     unit: ClassVar[str] = "N"
+    lost: ClassVar[str] = "lost_n"
 
     def __init__(
         self,
@@ -94,16 +90,7 @@ class Tendon:
             placed=placed,
         )
 
-    def on(self, body: Body) -> Tendon:
-        """The same, embedded in a body.
-
-        Raises
-        ------
-        InputError
-            If a point is too far outside.
-        """
-        if self.placed is not None and self.placed.body is body:
-            return self
+    def _measure_on(self, body: Body) -> Length:
         shape = Shape(body.nodes_m, body)
         found = [shape.embed(point) for point in self.points_m]
         nodes, weights, distances = (np.array(part) for part in zip(*found, strict=True))
@@ -114,21 +101,7 @@ class Tendon:
                 f"{distances[worst]:.4g} m outside the body, more than the mean edge length of "
                 f"{shape.mean_edge_m:.4g} m; expected points_m on the undeformed body, in metres"
             )
-        return replace(self, placed=Placed(body, Length(nodes, weights, len(body.nodes_m))))
-
-    @property
-    def measure(self) -> Length:
-        """The length of its polyline, on a body."""
-        return measured(self.placed, self.name)
-
-    @property
-    def off(self) -> tuple[float, float]:
-        """Factor, and what is lost."""
-        return self.factor, self.lost_n
-
-    def off_by(self, factor: float, lost: float) -> Tendon:
-        """The same with another factor, and another tension lost."""
-        return replace(self, factor=factor, lost_n=lost)
+        return Length(nodes, weights, len(body.nodes_m))
 
     def amplitude(self, t_s: Array) -> Array:
         """The tension at the body at the times `t_s` (T,) [N]."""

@@ -438,6 +438,26 @@ class Sensor:
         slope = weight[..., None] * slope
         return residual.reshape(-1, 2, 3), slope.reshape(len(slope), 2, 3, size)
 
+    def frame_response(self, forced: Forced, phi: Array, shifts: Array, turns: Array) -> Array:
+        """Changes (S, 2, 3, c) of the residuals where poses are off, by the frame carried along.
+
+        Parameters
+        ----------
+        shifts, turns : (N, c, 3) of the poses at the grid times
+        """
+        count = self.reached(len(forced.reaction))
+        if self.wrench.frame != "grasp" or not count:
+            return np.zeros((len(self.wrench.t_s), 2, 3, turns.shape[1]))
+        k, axes = self.grid[:count], self.frames[0][:count]
+        value = self.on_grid(forced)[0].reshape(count, 2, 3)
+        force, torque = np.moveaxis(np.einsum("kij,kbj->kbi", axes, value)[:, :, None], 1, 0)
+        moved = shifts[k] + np.cross(turns[k], (axes @ self.wrench.point_m)[:, None])
+        both = [np.cross(force, turns[k]), np.cross(torque, turns[k]) - np.cross(moved, force)]
+        change = np.concatenate([np.einsum("kji,kcj->kic", axes, each) for each in both], axis=1)
+        read = self.kernels(phi, count)[0] @ change.reshape(count, -1)
+        weight = self.present / self.wrench.sigmas
+        return (weight[..., None] * read.reshape(len(read), 6, -1)).reshape(len(read), 2, 3, -1)
+
 
 def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tuple[Sensor, ...]:
     """The sensors of an experiment's grasps."""

@@ -89,7 +89,7 @@ class SensorRows(Addition):
 
     @cached_property
     def _row_unit(self) -> Array:
-        """(6,) of the equations [N, N m]: between this, and what R and torques are counted in."""
+        """(6,) of the equations [N, N m], between this unit and that of R: solvers want both."""
         of_reactions = self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
         return of_reactions**0.75 * self._unit**0.25
 

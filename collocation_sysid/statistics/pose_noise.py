@@ -2,7 +2,8 @@
 
 A pose that is off for a sample shakes the body, and the markers miss the fit for as long as that
 swings on. To first order the residuals change by D η, η being the noise of all poses and D the
-response of the linearised equations of motion to grasped nodes that move. D is never formed:
+response of the linearised equations of motion to grasped nodes that move, and of a sensor's frame
+that is carried along. D is never formed:
 samples of D η for random η tell its covariance.
 """
 
@@ -119,37 +120,48 @@ def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) ->
     numbers = held.positions_m.size * 8
     count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
     moved = np.zeros((*held.positions_m.shape, count))
+    off = []
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
-        _add_noise(moved, part, grasp, noise, rng)
+        shifts, turns = _poses_drawn(part, grasp, noise, rng, count)
+        _add_noise(moved, part, grasp, shifts, turns)
+        off += [] if grasp.wrench is None else [(shifts, turns)]
     sensing = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), count)
     rows = BlockSolver(segment).response(part.x, part.setting, moved, sensing)
     response = read_along(part, rows, sensing)
     changes = [segment.observation.response(part.x, part.phi, response.markers)]
     if segment.sensors:
         forced = part.sensing.along(part.x, response.held, response.moved)
-        changes += part.sensing.response(forced)
+        of_body = part.sensing.response(forced)
+        for sensor, change, (shifts, turns) in zip(segment.sensors, of_body, off, strict=True):
+            changes.append(change + sensor.frame_response(forced, part.phi, shifts, turns))
     return [np.moveaxis(change, 3, 0) for change in changes]
 
 
-def _add_noise(
-    moved: Array, part: Part, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator
-) -> None:
-    """Add how noise of one grasp moves its nodes to `moved` (N, g, c), in place."""
+def _poses_drawn(
+    part: Part, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator, count: int
+) -> tuple[Array, Array]:
+    """Shifts and turns (N, c, 3) of the poses at grid times, zero where they do not hold."""
+    t_s = part.segment.dynamics.t_s
+    found = np.zeros((2, len(t_s), count, 3))
+    if len(grasp.poses.t_s) > 1:
+        rows = np.flatnonzero(grasp.holds(t_s))
+        white = rng.normal(size=(2, len(grasp.poses.t_s), 3 * count))
+        for own, sigma, values in zip(found, (noise.sigma_m, noise.sigma_rad), white, strict=True):
+            between = _between(grasp.poses, sigma * values, t_s[rows])
+            own[rows] = between.reshape(len(rows), count, 3)
+    return found[0], found[1]
+
+
+def _add_noise(moved: Array, part: Part, grasp: Grasp, shifts: Array, turns: Array) -> None:
+    """Add how poses that are off move a grasp's nodes to `moved` (N, g, c), in place."""
     segment, held = part.segment, part.setting.held
     t_s, count = segment.dynamics.t_s, moved.shape[2]
-    if len(grasp.poses.t_s) < 2:
-        return
     rows = np.flatnonzero(grasp.holds(t_s))
     dofs = np.searchsorted(held.dofs, grasp.dofs)
     arms = grasp.poses.at(t_s[rows])[0] @ segment.body.nodes_m[grasp.nodes].T
     arms = np.moveaxis(arms, 1, 2)
-    white = rng.normal(size=(2, len(grasp.poses.t_s), 3 * count))
-    shifts, turns = (
-        _between(grasp.poses, sigma * values, t_s[rows]).reshape(len(rows), 1, count, 3)
-        for sigma, values in zip((noise.sigma_m, noise.sigma_rad), white, strict=True)
-    )
-    change = shifts + np.cross(turns, arms[:, :, None])  # (rows, nodes, c, 3)
-    change = change[..., grasp.columns]
+    change = shifts[rows, None] + np.cross(turns[rows, None], arms[:, :, None])
+    change = change[..., grasp.columns]  # (rows, nodes, c, axes)
     moved[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(len(rows), len(dofs), count)
 
 
