@@ -419,7 +419,7 @@ def _wrench_sizes(rms: tuple[float | None, float | None]) -> str:
 
 def _sigmas(segment: Segment) -> str:
     """What is stated of the sensors' noise."""
-    sigmas = {"N": [], "N m": []}
+    sigmas: dict[str, list[float]] = {"N": [], "N m": []}
     for sensor in segment.sensors:
         for k in np.flatnonzero(sensor.wrench.measured):
             sigmas["N" if k < 3 else "N m"].append(sensor.wrench.sigmas[k])

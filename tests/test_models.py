@@ -167,14 +167,18 @@ def test_of_one_pressing_the_end_of_its_load_is_held_out():
 
 
 def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
-    both, one = (
-        Problem.read(write_problem(tmp_path / name, recordings))
-        for name, recordings in (("both", {"a": 6, "b": 7}), ("one", {"a": 6}))
-    )
+    both = Problem.read(write_problem(tmp_path, {"a": 6, "b": 7}))
+    other = tmp_path / "other.toml"
+    other.write_text(both.path.read_text())
+    held = Problem.read(other, ["experiment.b.validation=true"])
     with pytest.raises(InputError, match="given twice"):
         file_variants([both, both], ())
     with pytest.raises(InputError, match=r"it fits 'a' .* expected the same recordings"):
-        file_variants([both, one], ())
+        file_variants([both, held], ())
+    assert [each.label for each in file_variants([both, Problem.read(other)], ())] == [
+        "problem",
+        "other",
+    ]
 
 
 # Held out ---------------------------------------------------------------------------------------

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,7 +16,7 @@ import pytest
 
 from collocation_sysid import Problem, run, solve
 from collocation_sysid.experiment import Nuisance
-from collocation_sysid.methods.solution import Solution
+from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.nlp.sensor import without_sensors
 from collocation_sysid.run import Run
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
@@ -148,6 +150,52 @@ def test_memory_explains_the_creep_of_the_measured_beam():
     limits_m = {"gravity": 0.00016, "load52": 0.00036, "load101": 0.00071}
     for name, rms_m in solution.rms_by_experiment_m.items():
         assert rms_m < limits_m[name]
+
+
+# Equilibria of measured bodies -----------------------------------------------------------------
+
+
+def measured(
+    name: str, variable: str, file: str = "problem.toml", changes: Sequence[str] = ()
+) -> Problem:
+    """A problem with the files that its script has written, next to it or where told, or skip."""
+    path = PROBLEMS / name / file
+    text, folder = path.read_text(), Path(os.environ.get(variable, path.parent)).resolve()
+    if not all((folder / each).is_file() for each in re.findall(r'"(\w+\.csv)"', text)):
+        pytest.skip(f"needs the measured data: python scripts/get_{name}.py")
+    mesh = path.parent / tomllib.loads(text)["object"]["mesh"]
+    return Problem.read(path, [f"object.mesh={mesh}", *changes], folder=folder)
+
+
+@pytest.mark.slow
+def test_pressed_cylinders_are_predicted_within_their_repeatability():
+    problem = measured("phantom_compression", "PHANTOM_DATA")
+    found = run(problem, seek_causes=False)
+    assert found.solution.status.converged
+    assert 6.9e4 < found.derived["young_pa"] < 7.6e4
+    loads_n = [e.grasps[1].wrench.values[:, 2] for e in problem.experiments]
+    floor_n = np.sqrt(np.mean(np.var(loads_n, axis=0, ddof=1)))
+    missed_n = [found.rollouts[name].wrench_rms[0] for name in ("A2", "A4")]
+    assert np.sqrt(np.mean(np.square(missed_n))) < 1.2 * floor_n
+
+
+@pytest.mark.slow
+def test_a_neo_hookean_says_that_the_platens_stick():
+    constants = "{ mu_pa = { guess = 1.2e4 }, poisson = 0.4988, gamma_r_s = 0, gamma_m_1_s = 0 }"
+    changes = ("object.material=neo-hookean", f"parameters={constants}")
+    sticking, sliding = (
+        solve(measured("phantom_compression", "PHANTOM_DATA", file, changes))
+        for file in ("problem.toml", "sliding.toml")
+    )
+    assert pooled_wrench_rms(sliding)[0] > 1.5 * pooled_wrench_rms(sticking)[0]
+    assert sliding.parameters["mu_pa"] > 1.2 * sticking.parameters["mu_pa"]
+
+
+@pytest.mark.slow
+def test_the_soft_tentacle_is_missed_by_a_centimetre_at_most():
+    solution = solve(measured("soft_tentacle", "TENTACLE_DATA"))
+    assert solution.status.converged
+    assert solution.rms_m < 0.010
 
 
 # What motion capture does to markers ----------------------------------------------------------

@@ -98,8 +98,8 @@ def test_gross_residuals_of_single_samples_are_doubtful():
     singles = problem((1,) * 8, markers=4, offsets=False)
     for size, verdict in ((1.0, "good"), (50.0, "doubtful")):
         errors = [size * RNG(k).normal(size=(1, 4, 3)) for k in range(8)]
-        fit, wrong = singles.fit(errors, np.zeros(len(singles.names)))
-        found = uncertainty_of(fit, PARAMETERS, wrong[:4])
+        fit, _ = singles.fit(errors, np.zeros(len(singles.names)))
+        found = uncertainty_of(fit, PARAMETERS, np.zeros(4))
         assert np.isfinite(found.dependence.lag1)
         assert Trust.of(fit_concerns(found)).verdict == verdict
 

@@ -74,7 +74,7 @@ POISSON = Constant("poisson", "ν", "Poisson's ratio", (1e-3, 0.495), "linear", 
 GAMMA_R = Constant("gamma_r_s", "γ_r", "stiffness-proportional damping", (1e-7, 10.0), usual=3e-3)
 GAMMA_M = Constant("gamma_m_1_s", "γ_m", "mass-proportional damping", (1e-4, 1e4), usual=0.3)
 C10 = Constant("c10_pa", "C₁₀", "half the shear modulus, or a share of it", STIFFNESS)
-C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", (-1e9, 1e9), "linear")
+C01 = Constant("c01_pa", "C₀₁", "factor of the second invariant", STIFFNESS)
 C20 = Constant("c20_pa", "C₂₀", "factor of (Ī₁ − 3)²", (-1e9, 1e9), "linear")
 C30 = Constant("c30_pa", "C₃₀", "factor of (Ī₁ − 3)³", (-1e9, 1e9), "linear")
 GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), usual=50.0)

@@ -227,7 +227,8 @@ def followed(
         try:
             found = solve(x + step * rate, reached + step)
         except NewtonFailure:
-            increment, easy = step / 2, False
+            # What fails costs many times what succeeds: better short steps that grow.
+            increment, easy = step / 4, False
             if increment < 0.5**halvings:
                 raise
         else:

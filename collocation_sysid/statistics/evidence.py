@@ -53,7 +53,8 @@ def evidence_of(fit: LinearisedFit) -> Evidence:
     independent = float(fit.measurements)
     if fit.chi_squared > rounding:
         processes = error_processes(fit, factored)
-        independent = sum(map(_independent, fit.blocks, processes))
+        pairs = zip(fit.blocks, processes, strict=True)
+        independent = sum(_independent(b, p) for b, p in pairs if b.measurements)
     return Evidence(
         max(fit.chi_squared, rounding),
         float(np.sum(fit.prior_residual**2)),

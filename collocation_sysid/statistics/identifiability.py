@@ -84,6 +84,8 @@ def _combination(
     how = ""
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
+    if any(uncertainty.estimates[name].value <= 0 for name in names):  # no powers of these
+        return f"{_listed(names)} are confounded{how}: these data fix one combination of them"
     return (
         f"{_listed(names)} are confounded{how}: only their combination "
         f"{_product(names, weights / weights[largest])} is fixed, to {_spread(float(fixed))}, "

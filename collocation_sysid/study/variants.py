@@ -1,13 +1,14 @@
 """Variants of a problem's model as overrides of its file: other materials, other memory.
 
 What is estimated follows the model. Constants that a material does not have are left out, those
-that it needs besides are estimated, from where a scan of the stiffness starts them; all else stays
-as the file states it.
+that it needs besides are estimated, from as stiff a start as the file guesses, or where a scan of
+the stiffness starts them; all else stays as the file states it.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
-from ..fem.constants import bare
+from ..fem.constants import bare, usual_value
 from ..fem.materials import MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
 from ..problem import Problem
@@ -25,6 +26,8 @@ from ..problem.reading import read_problem_file
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
 MOST_BRANCHES = 20
+# Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
+USUAL_POISSON, LESS = 0.3, 0.1
 
 
 @dataclass(frozen=True)
@@ -231,10 +234,34 @@ def _of_part(
     kept = {n: v for n, v in parameters.items() if n not in mine or bare(n) in possible}
     alone = any(name in mine for name in parameters)
     elastic = {bare(name) for name in kept if name in (mine if alone else of_any)}
+    shear_pa = _shear_pa(parameters, front)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
-        kept[f"{front}mu_pa"] = {}
-    needed = [front + name for name in own if name not in ELASTIC]
-    return kept | {name: {} for name in needed if name not in kept}
+        kept[f"{front}mu_pa"] = _start("mu_pa", shear_pa)
+    needed = [name for name in own if name not in ELASTIC and front + name not in kept]
+    return kept | {front + name: _start(name, shear_pa) for name in needed}
+
+
+def _shear_pa(parameters: Mapping[str, Any], front: str) -> float | None:
+    """The small-strain shear modulus where the file guesses its own constants."""
+
+    def value(name: str) -> float:
+        given = parameters.get(front + name, parameters.get(name))
+        if isinstance(given, Mapping):
+            given = given.get("fixed", given.get("guess"))
+        return float("nan") if given is None else float(given)
+
+    linear = 0.0 if math.isnan(value("c01_pa")) else value("c01_pa")
+    poisson = USUAL_POISSON if math.isnan(value("poisson")) else value("poisson")
+    ways = value("mu_pa"), 2 * (value("c10_pa") + linear), value("young_pa") / (2 * (1 + poisson))
+    return next((each for each in ways if each > 0), None)
+
+
+def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
+    """A constant of another material: as stiff as the file's own, or found by a scan."""
+    usual = shear_pa and usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)
+    if usual is None:
+        return {}
+    return {"guess": usual} if usual else {"guess": usual, "typical": LESS * shear_pa}
 
 
 def _branches(
