@@ -22,6 +22,7 @@ from ..statistics.linearised import linearised_fit
 from .criterion import Criterion, Errors, both_sides, draws_about
 from .information import Recording, Told, shared_information
 from .limits import REACHED, Bounds, Limits
+from .linear import LinearRecording
 from .motion import Motion
 from .search import Found, Watch, search
 
@@ -30,6 +31,8 @@ Say = Callable[[str], None]
 # Beyond any logarithm of an error bar: of motions that break a rule, those come first that break
 # it least.
 FORBIDDEN = 1e3
+# Motions that are tried to first order, which takes milliseconds each.
+LINEAR_EVALUATIONS, LINEAR_NEWS = 3000, 500
 
 
 @dataclass(frozen=True)
@@ -179,10 +182,32 @@ class Judge:
         )
         return self.bounds.within(free)
 
-    def errors(self, told: Told | None, q: Array) -> Errors:
+    def errors(self, information: Array | float, q: Array) -> Errors:
         """Of the recordings there are, and of one more."""
-        information = self.known if told is None else self.known + told.information
-        return Errors.of(information, self.recording.problem.parameters, self.constants, q)
+        parameters = self.recording.problem.parameters
+        return Errors.of(self.known + information, parameters, self.constants, q)
+
+    def first_guess(self, options: DesignOptions, say: Say) -> Found:
+        """Where to begin: the best to first order; nowhere where not only markers are measured."""
+        if self.recording.template.grasps[0].wrench is not None:
+            return Found()
+        middle = self.draws[0]
+        try:
+            linear = LinearRecording.of(self.recording, middle)
+        except SimulationError:
+            return Found()
+
+        def told(number: int, size: float) -> None:
+            if number % LINEAR_NEWS == 0:
+                size = 100 * np.exp(size)
+                say(f"to first order: {number} of {LINEAR_EVALUATIONS} motions, {size:.3g} %")
+
+        def value(coefficients: Array, _: float) -> float:
+            information = linear.information(self.motion(coefficients))
+            return self.criterion.log_size(self.errors(information, middle))
+
+        size = Motion.size(options.waves)
+        return search(value, size, LINEAR_EVALUATIONS, options.seed, told)
 
     def value(self, coefficients: Array, bar: float) -> float:
         """The logarithm of the error bar, or `FORBIDDEN` and more where a rule is broken.
@@ -199,7 +224,7 @@ class Judge:
                 return FORBIDDEN * (3 - min(1.0, gone))
             if (beyond := self.limits.out_of_view(told.markers_m)) > 0:
                 return FORBIDDEN * (1 + beyond / (1 + beyond))
-            sizes.append(self.criterion.log_size(self.errors(told, q)))
+            sizes.append(self.criterion.log_size(self.errors(told.information, q)))
             if len(sizes) == 1 and sizes[0] > bar:
                 break
         return self.criterion.over_draws(sizes)
@@ -260,12 +285,13 @@ def design(
         draws = draws_about(problem.parameters, options.spread, options.pairs, options.seed)
         known = np.zeros((len(draws[0]),) * 2)
     judge = Judge(recording, limits, criterion, draws, known)
-    criterion.require_known(judge.errors(None, draws[0]))
+    criterion.require_known(judge.errors(0.0, draws[0]))
     recording.bounds(limits)
+    first = judge.first_guess(options, say)
     say("seeking a motion")
-    found = search(
-        judge.value, Motion.size(options.waves), options.evaluations, options.seed, watch
-    )
+    tried = 1 if first.interrupted else options.evaluations
+    found = search(judge.value, Motion.size(options.waves), tried, options.seed, watch, first.at)
+    found.interrupted |= first.interrupted
     if found.at is None or found.value >= FORBIDDEN:
         raise InputError(_no_motion(found), problem.path)
     say("simulating the best motion")
@@ -278,7 +304,7 @@ def _designed(judge: Judge, found: Found, add: bool) -> Design:
     recording, motion = judge.recording, judge.motion(found.at)
     experiment = recording.experiment(recording.poses(motion))
     told = [recording.told(experiment, q) for q in judge.draws]
-    after = Bars.of([judge.errors(*each) for each in zip(told, judge.draws, strict=True)])
+    after = _bars(judge, told)
     problem = recording.problem
     values = problem.parameters.values(judge.draws[0])
     predicted = simulate(experiment, values, problem.scheme, substeps=problem.substeps)
@@ -301,7 +327,7 @@ def _designed(judge: Judge, found: Found, add: bool) -> Design:
 def _before(judge: Judge, add: bool) -> Bars | None:
     """Error bars of the recordings there are, or of the motion that the problem has."""
     if add:
-        return Bars.of([judge.errors(None, q) for q in judge.draws])
+        return Bars.of([judge.errors(0.0, q) for q in judge.draws])
     recording = judge.recording
     template = recording.template
     if len(template.grasps[0].poses.t_s) < 2:
@@ -311,7 +337,12 @@ def _before(judge: Judge, add: bool) -> Bars | None:
         told = [shipped.told(template, q) for q in judge.draws]
     except SimulationError:
         return None
-    return Bars.of([judge.errors(*each) for each in zip(told, judge.draws, strict=True)])
+    return _bars(judge, told)
+
+
+def _bars(judge: Judge, told: list[Told]) -> Bars:
+    pairs = zip(told, judge.draws, strict=True)
+    return Bars.of([judge.errors(each.information, q) for each, q in pairs])
 
 
 def _from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:

@@ -45,7 +45,7 @@ class DesignProgress:
     def say(self, what: str) -> None:
         """Show what is being done now."""
         if self._live is not None:
-            self._live.update(Text(what, style="dim"))
+            self._live.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"))
         elif not self.quiet:
             self.console.print(what)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..errors import InputError
@@ -140,12 +141,23 @@ class Recording:
         """No wave is faster."""
         return limits.frequency_hz or 0.1 / self.template.timestep_s
 
-    def poses(self, motion: Motion) -> PoseSequence:
-        """The poses of a motion, several a sample."""
+    @cached_property
+    def pose_times_s(self) -> Array:
+        """(P,) times of the poses since the start, several a sample."""
         count = POSES_PER_SAMPLE * (self.samples - 1) + 1
-        t_s = np.linspace(0.0, self.since_start_s[-1], count)
-        found = motion.poses(np.minimum(t_s, motion.duration_s), self.start, self.hand_m)
-        return replace(found, t_s=t_s + self.template.t_s[0])
+        return np.linspace(0.0, self.since_start_s[-1], count)
+
+    def poses(self, motion: Motion) -> PoseSequence:
+        """The poses of a motion."""
+        return self.carried(motion.derivatives(self.pose_times_s)[0])
+
+    def carried(self, coordinates: Array) -> PoseSequence:
+        """The poses at `pose_times_s` from the hand's shift and rotation vector then, (P, 6)."""
+        rotation, translation = self.start
+        turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(rotation)
+        hand = rotation @ self.hand_m + translation + coordinates[:, :3]
+        placed = hand - turned.apply(self.hand_m)
+        return PoseSequence(self.pose_times_s + self.template.t_s[0], placed, turned.as_quat())
 
     def experiment(self, poses: PoseSequence) -> Experiment:
         """What would be recorded, without a measurement yet: all markers at the origin."""
@@ -168,6 +180,18 @@ class Recording:
         SimulationError
             Where it cannot be simulated to its end.
         """
+        fit, x = self.fit(experiment, q)
+        positions = x[:: self.problem.substeps].reshape(len(experiment.t_s), -1, 3)
+        return Told(shared_information(fit), experiment.markers.observe(positions))
+
+    def fit(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
+        """The experiment simulated at q, with the slopes of all residuals; and x (N, 3n) [m].
+
+        Raises
+        ------
+        SimulationError
+            Where it cannot be simulated to its end.
+        """
         problem = self.problem
         alone = Collocation([experiment], problem.parameters, problem.scheme, problem.substeps)
         (segment,) = alone.segments
@@ -182,9 +206,7 @@ class Recording:
         if failure is not None:
             raise failure
         self._starts[q.tobytes()] = x[:1]
-        fit = linearised_fit(alone, alone.pack(np.append(q, segment.guess_phi), [x]))
-        positions = x[:: problem.substeps].reshape(self.samples, -1, 3)
-        return Told(shared_information(fit), experiment.markers.observe(positions))
+        return linearised_fit(alone, alone.pack(np.append(q, segment.guess_phi), [x])), x
 
 
 def _anew(wrench: Wrench | None, t_s: Array) -> Wrench | None:

@@ -18,7 +18,7 @@ from .motion import Motion, angular_motion
 
 # Peaks are sought on a grid; between its points they may be this much larger.
 WITHIN = 1 - 3e-3
-BISECTIONS = 20
+TIGHTER = 1 - 1e-4
 # A peak beyond this share of its limit is at it.
 REACHED = 0.98
 
@@ -206,24 +206,18 @@ class Bounds:
     def within(self, motion: Motion) -> Motion:
         """The motion with its shifts, and its turns, made so small that every limit is kept.
 
-        What keeps to all of them is left as it is. Shifts are proportional to their scale; turns
-        are found by bisection, for angular accelerations are not.
+        What keeps to all of them is left as it is. Peaks of shifts are proportional to their
+        scale, those of turns nearly.
         """
         course = motion.derivatives(motion.grid_s)
         shift = WITHIN / max(WITHIN, *self._of_shift(*course).values())
         return motion.scaled(shift, self._turn_scale(course))
 
     def _turn_scale(self, course: tuple[Array, Array, Array]) -> float:
-        def kept(scale: float) -> bool:
-            return max(self._of_turn(*(scale * each for each in course)).values()) <= WITHIN
-
-        if kept(1.0):
-            return 1.0
-        low, high = 0.0, 1.0
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            low, high = (middle, high) if kept(middle) else (low, middle)
-        return low
+        scale = 1.0
+        while (largest := max(self._of_turn(*(scale * c for c in course)).values())) > WITHIN:
+            scale *= TIGHTER * WITHIN / largest
+        return scale
 
 
 def _largest(vectors: Array) -> float:

@@ -21,10 +21,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..experiment import PoseSequence
 
 # The window rises within this share of its length, and it lasts for this share of the motion.
 RISE = 0.15, 0.5
@@ -149,21 +147,6 @@ class Motion:
         first = 30 * u**2 * (1 - u) ** 2 * slope
         second = 60 * u * (1 - u) * (1 - 2 * u) * slope**2
         return value[:, None], first[:, None], second[:, None]
-
-    def poses(self, t_s: Array, start: tuple[Array, Array], hand_m: Array) -> PoseSequence:
-        """The poses at `t_s` (T,), from 0 on, of a body held at a place of its own.
-
-        Parameters
-        ----------
-        start : (3, 3), (3,) rotation and translation of the first pose
-        hand_m : (3,)
-            The place on the undeformed body that is shifted, and about which the body is turned.
-        """
-        rotation, translation = start
-        coordinates = self.derivatives(t_s)[0]
-        turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(rotation)
-        hand = rotation @ hand_m + translation + coordinates[:, :3]
-        return PoseSequence(t_s, hand - turned.apply(hand_m), turned.as_quat())
 
 
 def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Array]:
