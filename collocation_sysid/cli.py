@@ -453,7 +453,7 @@ def design(
         typer.Option("--for", metavar="A,B,…", help="Parameters and moduli that count; else all."),
     ] = None,
     over: Annotated[str, typer.Option(help="mean or worst over the draws of the prior.")] = "mean",
-    evaluations: Annotated[int, typer.Option(help="Motions that are tried.")] = 300,
+    evaluations: Annotated[int, typer.Option(help="Motions that are simulated.")] = 300,
     pairs: Annotated[
         int, typer.Option(help="Pairs of draws from the prior, about the guesses.")
     ] = 1,

@@ -49,11 +49,6 @@ angular_acceleration_deg_s2 = 3000.0
 """
 
 
-@pytest.fixture(autouse=True)
-def few_first_order_motions(monkeypatch):
-    monkeypatch.setattr(designing, "LINEAR_EVALUATIONS", 40)
-
-
 def drawn_motions(count: int = 12, waves: int = 1) -> list[Motion]:
     """Motions of coefficients up to far beyond the usual, within the limits."""
     bounds, rng = LIMITS.about(np.array([0.05, 0.05, 0.1])), np.random.default_rng(0)

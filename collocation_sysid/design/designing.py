@@ -31,8 +31,8 @@ Say = Callable[[str], None]
 # Beyond any logarithm of an error bar: of motions that break a rule, those come first that break
 # it least.
 FORBIDDEN = 1e3
-# Motions that are tried to first order, which takes milliseconds each.
-LINEAR_EVALUATIONS, LINEAR_NEWS = 3000, 500
+# Motions that are tried to first order, which takes milliseconds each, for each simulated one.
+TO_FIRST_ORDER, NEWS = 10, 500
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class DesignOptions(Options):
     Attributes
     ----------
     evaluations : int
-        Motions that are tried.
+        Motions that are simulated; ten times as many are tried to first order before.
     pairs : int
         Pairs of draws of θ, on either side of the guess, that a motion is judged by besides it.
     spread : float
@@ -191,23 +191,23 @@ class Judge:
         """Where to begin: the best to first order; nowhere where not only markers are measured."""
         if self.recording.template.grasps[0].wrench is not None:
             return Found()
-        middle = self.draws[0]
+        middle, count = self.draws[0], TO_FIRST_ORDER * options.evaluations
         try:
             linear = LinearRecording.of(self.recording, middle)
         except SimulationError:
             return Found()
 
         def told(number: int, size: float) -> None:
-            if number % LINEAR_NEWS == 0:
+            if number % NEWS == 0:
                 size = 100 * np.exp(size)
-                say(f"to first order: {number} of {LINEAR_EVALUATIONS} motions, {size:.3g} %")
+                say(f"to first order: {number} of {count} motions, {size:.3g} %")
 
         def value(coefficients: Array, _: float) -> float:
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
         size = Motion.size(options.waves)
-        return search(value, size, LINEAR_EVALUATIONS, options.seed, told)
+        return search(value, size, count, options.seed, told)
 
     def value(self, coefficients: Array, bar: float) -> float:
         """The logarithm of the error bar, or `FORBIDDEN` and more where a rule is broken.
