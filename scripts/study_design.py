@@ -85,13 +85,15 @@ def own_limits() -> Limits:
         return float(np.degrees(largest(vectors)))
 
     low, high = (tuple(side.tolist()) for side in (place.min(axis=0), place.max(axis=0)))
-    return Limits(
-        workspace_m=(low, high),
-        speed_m_s=largest(speed),
-        acceleration_m_s2=largest(np.gradient(speed, FINE_S, axis=0)),
-        rotation_deg=in_degrees((turns * turns[0].inv()).as_rotvec()),
-        angular_speed_deg_s=in_degrees(angular),
-        angular_acceleration_deg_s2=in_degrees(np.gradient(angular, FINE_S, axis=0)),
+    return Limits.model_validate(
+        {
+            "workspace_m": (low, high),
+            "speed_m_s": largest(speed),
+            "acceleration_m_s2": largest(np.gradient(speed, FINE_S, axis=0)),
+            "rotation_deg": in_degrees((turns * turns[0].inv()).as_rotvec()),
+            "angular_speed_deg_s": in_degrees(angular),
+            "angular_acceleration_deg_s2": in_degrees(np.gradient(angular, FINE_S, axis=0)),
+        }
     )
 
 

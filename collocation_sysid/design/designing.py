@@ -33,6 +33,7 @@ Say = Callable[[str], None]
 FORBIDDEN = 1e3
 # Motions that are tried to first order, which takes milliseconds each, for each simulated one.
 TO_FIRST_ORDER, NEWS = 10, 500
+MOST_GIGABYTES = 1.0
 
 
 @dataclass(frozen=True)
@@ -188,8 +189,12 @@ class Judge:
         return Errors.of(self.known + information, parameters, self.constants, q)
 
     def first_guess(self, options: DesignOptions, say: Say) -> Found:
-        """Where to begin: the best to first order; nowhere where not only markers are measured."""
-        if self.recording.template.grasps[0].wrench is not None:
+        """Where to begin: the best to first order.
+
+        Nowhere where a wrench is measured too, or that would take too much memory.
+        """
+        sensed = self.recording.template.grasps[0].wrench is not None
+        if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
             return Found()
         middle, count = self.draws[0], TO_FIRST_ORDER * options.evaluations
         try:
@@ -287,6 +292,7 @@ def design(
     judge = Judge(recording, limits, criterion, draws, known)
     criterion.require_known(judge.errors(0.0, draws[0]))
     recording.bounds(limits)
+    recording.highest_hz(limits)
     first = judge.first_guess(options, say)
     say("seeking a motion")
     tried = 1 if first.interrupted else options.evaluations

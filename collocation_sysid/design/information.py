@@ -138,8 +138,22 @@ class Recording:
         return limits.about(rotation @ self.hand_m + translation)
 
     def highest_hz(self, limits: Limits) -> float:
-        """No wave is faster."""
-        return limits.frequency_hz or 0.1 / self.template.timestep_s
+        """No wave is faster.
+
+        Raises
+        ------
+        InputError
+            If the samples could not tell it from a slower one.
+        """
+        rate_hz = 1 / self.template.timestep_s
+        if (limits.frequency_hz or 0.0) > rate_hz / 2:
+            raise InputError(
+                f"found {limits.frequency_hz:g}; expected at most {rate_hz / 2:g}, half the rate "
+                "of the samples",
+                None,
+                "frequency_hz",
+            )
+        return limits.frequency_hz or rate_hz / 10
 
     @cached_property
     def pose_times_s(self) -> Array:
@@ -169,7 +183,6 @@ class Recording:
             t_s=t_s,
             grasps=(replace(grasp, poses=poses, wrench=_anew(grasp.wrench, t_s)),),
             markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
-            validation=False,
         )
 
     def told(self, experiment: Experiment, q: Array) -> Told:
@@ -184,6 +197,12 @@ class Recording:
         positions = x[:: self.problem.substeps].reshape(len(experiment.t_s), -1, 3)
         return Told(shared_information(fit), experiment.markers.observe(positions))
 
+    def program(self, experiment: Experiment) -> Collocation:
+        """The equations of motion of one experiment."""
+        problem = self.problem
+        fitted = replace(experiment, validation=False) if experiment.validation else experiment
+        return Collocation([fitted], problem.parameters, problem.scheme, problem.substeps)
+
     def fit(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
         """The experiment simulated at q, with the slopes of all residuals; and x (N, 3n) [m].
 
@@ -192,8 +211,7 @@ class Recording:
         SimulationError
             Where it cannot be simulated to its end.
         """
-        problem = self.problem
-        alone = Collocation([experiment], problem.parameters, problem.scheme, problem.substeps)
+        alone = self.program(experiment)
         (segment,) = alone.segments
         known = self._starts.get(q.tobytes())  # every motion starts from the same rest
         x, failure = march_on(

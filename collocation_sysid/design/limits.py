@@ -17,7 +17,7 @@ from ..problem.section import Section, Vector
 from .motion import Motion, angular_motion
 
 # Peaks are sought on a grid; between its points they may be this much larger.
-WITHIN = 1 - 3e-3
+WITHIN = 1 - 6e-3
 TIGHTER = 1 - 1e-4
 # A peak beyond this share of its limit is at it.
 REACHED = 0.98

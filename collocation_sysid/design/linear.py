@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from scipy.fft import next_fast_len
 from scipy.interpolate import BSpline
 
 from ..arrays import Array
@@ -49,6 +49,13 @@ class LinearRecording:
     answers: Array
     length: int
 
+    @staticmethod
+    def gigabytes(recording: Recording) -> float:
+        """Memory that the answers take."""
+        (segment,) = recording.program(recording.template).segments
+        markers = 3 * len(recording.template.markers.names)
+        return 6 * 16e-9 * recording.samples * markers * len(segment.places)
+
     @classmethod
     def of(cls, recording: Recording, q: Array) -> LinearRecording:
         """Seven simulations.
@@ -66,7 +73,7 @@ class LinearRecording:
             pulsed = recording.experiment(_pulse(recording, height * np.eye(6)[k]))
             (block,) = recording.fit(pulsed, q)[0].blocks
             change = (block.channels[1] - at_rest.channels[1]) / height
-            answers.append(rfft(change, length, axis=0))
+            answers.append(np.fft.rfft(change, length, axis=0))
         return cls(recording, still, np.array(answers), length)
 
     def information(self, motion: Motion) -> Array:
@@ -74,10 +81,10 @@ class LinearRecording:
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]
         # What was simulated is highest at a sample before which a motion from rest is nothing yet.
-        of_course = rfft(course[CENTRE:], self.length, axis=0)
+        of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         whole = np.einsum("fk,kfcp->fcp", of_course, self.answers)
         (rest,) = self.rest.blocks
-        change = irfft(whole, self.length, axis=0)[: recording.samples]
+        change = np.fft.irfft(whole, self.length, axis=0)[: recording.samples]
         slope = rest.slope + change.reshape(rest.slope.shape)
         return shared_information(replace(self.rest, blocks=(replace(rest, slope=slope),)))
 
@@ -85,5 +92,6 @@ class LinearRecording:
 def _pulse(recording: Recording, heights: Array) -> PoseSequence:
     """Poses with a pulse of each coordinate, of these heights (6,)."""
     t_s = recording.pose_times_s
-    share = np.nan_to_num(PULSE(t_s / recording.template.timestep_s - CENTRE))
+    since = t_s / recording.template.timestep_s - CENTRE
+    share = np.nan_to_num(np.asarray(PULSE(since), dtype=np.float64))
     return recording.carried(np.outer(share, heights))

@@ -30,7 +30,7 @@ ACTIVE = 0.6, 1.0
 # Periods in the whole motion of the slowest wave.
 FEWEST_PERIODS = 0.4
 # Points of the grid in a period of the fastest wave on which peaks are sought.
-POINTS_PER_PERIOD = 100
+POINTS_PER_PERIOD = 60
 FEWEST_POINTS = 200
 OWN = 2
 PER_WAVE = 4
