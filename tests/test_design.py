@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from problem_files import AT_TRUTH, run_command, settings, write_problem
-from problems_small import GUESS, TRUTH, bar_in_two_hands, cube_with_nuisance, hung_cube
+from problems_small import GUESS, IDEAL, TRUTH, bar_in_two_hands, cube_with_nuisance, hung_cube
 from scipy.spatial.transform import Rotation
+from wrenches_small import wristed_cube
 
 from collocation_sysid.design import Criterion, DesignOptions, Limits, Motion, designing
 from collocation_sysid.design.criterion import Errors, both_sides, draws_about
 from collocation_sysid.design.designing import Judge, design
 from collocation_sysid.design.display import DesignProgress
-from collocation_sysid.design.folder import PROBLEM_FILE
+from collocation_sysid.design.folder import PROBLEM_FILE, write_design
 from collocation_sysid.design.information import Recording, shared_information
 from collocation_sysid.design.linear import LinearRecording
 from collocation_sysid.design.motion import angular_motion
@@ -335,6 +337,21 @@ def test_a_small_motion_tells_what_it_does_to_first_order():
     assert np.allclose(np.sqrt(np.diag(linear)), np.sqrt(np.diag(exact)), rtol=0.05)
 
 
+def test_a_sensor_measures_at_its_own_rate_over_the_new_time():
+    sensing = wristed_cube(8)
+    recording = Recording(Problem([sensing], AT), sensing, 0.2)
+    (before,), (grasp,) = sensing.grasps, recording.experiment(still_poses(recording)).grasps
+    assert before.wrench is not None
+    assert grasp.wrench is not None
+    assert np.ptp(grasp.wrench.t_s) == pytest.approx(0.2, abs=0.02)
+    assert np.diff(grasp.wrench.t_s) == pytest.approx(np.diff(before.wrench.t_s).mean())
+    assert grasp.wrench.names == before.wrench.names
+
+
+def still_poses(recording: Recording) -> PoseSequence:
+    return recording.carried(np.zeros((len(recording.pose_times_s), 6)))
+
+
 # Designs ------------------------------------------------------------------------------------------
 
 FEW = DesignOptions(evaluations=10, pairs=0)
@@ -352,6 +369,20 @@ def test_a_designed_motion_tells_more_than_a_poor_one():
     assert max(found.before.relative[n] for n in TRUTH) > 3 * found.size
     assert found.size == pytest.approx(max(found.after.relative[n] for n in TRUTH))
     assert max(found.shares.values()) <= 1
+
+
+def test_a_wrench_counts_and_the_search_then_begins_at_random():
+    sensing = replace(wristed_cube(8), nuisance=IDEAL)
+    (grasp,) = sensing.grasps
+    blind = replace(sensing, grasps=(replace(grasp, wrench=None),))
+    q, told = AT.guess_q, []
+    for experiment in (sensing, blind):
+        recording = Recording(Problem([experiment], AT), experiment, 0.08)
+        told.append(recording.told(recording.experiment(still_poses(recording)), q).information)
+    assert np.linalg.eigvalsh(told[0] - told[1]).min() > -1e-6 * np.trace(told[0])
+    assert np.trace(told[0]) > 1.01 * np.trace(told[1])
+    found = design(Problem([sensing], AT), LIMITS, 0.08, options=DesignOptions(1, pairs=0))
+    assert np.isfinite(found.size)
 
 
 def test_a_motion_is_judged_over_all_draws():
@@ -459,6 +490,24 @@ def test_the_folder_holds_a_problem_that_simulates_the_motion(tiny, tmp_path):
     assert max(item["share_used"] for item in content["limits"].values()) <= 1
     simulated = run_command("simulate", str(folder / PROBLEM_FILE), "--out", str(tmp_path / "data"))
     assert simulated.code == 0, simulated.err
+
+
+def test_poses_are_written_as_the_robot_has_them(tiny, tmp_path):
+    shutil.copytree(tiny.parent, tmp_path / "held")
+    file = tmp_path / "held" / "problem.toml"
+    held = (
+        "gripper_to_body = { position_m = [0.01, 0.0, 0.02], quaternion_xyzw = [0, 0.6, 0, 0.8] }"
+    )
+    file.write_text(file.read_text().replace('poses = "swing', f'{held}, poses = "swing'))
+    loaded = Problem.read(file)
+    wide = Limits.model_validate(LIMITS.model_dump() | {"workspace_m": ((-1.0,) * 3, (1.0,) * 3)})
+    found = design(loaded, wide, 0.05, options=DesignOptions(1, pairs=0))
+    write_design(found, tmp_path / "out", with_film=False)
+    read = Problem.read(tmp_path / "out" / PROBLEM_FILE).experiments[0].grasps[0].poses
+    for mine, theirs in zip(read.at(read.t_s), found.poses.at(read.t_s), strict=True):
+        assert np.allclose(mine, theirs, atol=1e-9)
+    written = (tmp_path / "out" / "poses.csv").read_text().splitlines()[1].split(",")
+    assert not np.allclose(np.array(written[1:4], float), found.poses.positions_m[0], atol=1e-3)
 
 
 def test_an_interrupted_design_is_written_and_told(tiny, tmp_path, monkeypatch):

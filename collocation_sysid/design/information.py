@@ -232,7 +232,7 @@ def _anew(wrench: Wrench | None, t_s: Array) -> Wrench | None:
     if wrench is None:
         return None
     rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
-    count = max(2, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
+    count = max(3, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
     times = t_s[0] + np.arange(count) / rate_hz
     values = np.tile(np.where(wrench.measured, 0.0, np.nan), (count, 1))
     return replace(wrench, t_s=times, values=values)
