@@ -24,7 +24,7 @@ LAYERS = (
     {"check", "earlier", "rollout", "verdict", "run", "refine"},
     {"output", "synthesis"},
     {"terminal", "method_tables"},
-    {"study"},
+    {"design", "study"},
     {"cli"},
 )
 

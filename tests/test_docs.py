@@ -52,6 +52,7 @@ SHORT = {
     "compare": ["--dry-run"],
     "sweep": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
+    "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
 }
 
 

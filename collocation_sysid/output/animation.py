@@ -37,6 +37,7 @@ HEAD_MM, FOOT_MM = 12.0, 12.0
 MOST_FRAMES = 3000
 # Of a static experiment, however long it took.
 STATES_A_SECOND = 8
+NAMES = ("fitted", "rolled out")
 
 Progress = Callable[[float], None]
 
@@ -83,7 +84,19 @@ def animate(
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
-    film = Film(replay)
+    return film(replay, file, fps, slow, progress)
+
+
+def film(
+    replay: Replay,
+    file: Path,
+    fps: float = 25.0,
+    slow: float = 1.0,
+    progress: Progress | None = None,
+    names: tuple[str, str] = NAMES,
+) -> Path:
+    """Film one experiment, the body by its two `names`; see `animate`."""
+    picture = Film(replay, names)
     t_s = replay.t_s
     if replay.static:  # which may take a second or a day
         t_s = np.arange(len(t_s)) / STATES_A_SECOND
@@ -93,9 +106,9 @@ def animate(
     dpi = PIXELS_WIDE[file.suffix.lower()] / (WIDTH_MM / 25.4)
     with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
         writer = _writer(fps, ffmpeg)
-        with writer.saving(film.figure, str(file), dpi):
+        with writer.saving(picture.figure, str(file), dpi):
             for number, t in enumerate(shown):
-                film.show(int(t))
+                picture.show(int(t))
                 writer.grab_frame()
                 if progress is not None:
                     progress((number + 1) / len(shown))
@@ -157,11 +170,11 @@ class Film:
 
     figure: Figure
 
-    def __init__(self, replay: Replay) -> None:
+    def __init__(self, replay: Replay, names: tuple[str, str] = NAMES) -> None:
         self.replay = replay
         trajectories = (
-            ("fitted", replay.positions_m, replay.markers_m),
-            ("rolled out", replay.rolled_out_positions_m, replay.rolled_out_m),
+            (names[0], replay.positions_m, replay.markers_m),
+            (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
         )
         there = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
         # A roll-out may leave the picture where it goes astray; the fit and the markers may not.
@@ -199,7 +212,7 @@ class Film:
             distances = np.linalg.norm(markers[t] - measured, axis=1)
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
-            title.set_text(f"{name}: {off}")
+            title.set_text(name if markers is replay.measured_m else f"{name}: {off}")
         self.clock.set_text(f"{replay.t_s[t] - replay.t_s[0]:.2f} s")
 
 

@@ -1,4 +1,4 @@
-"""Pydantic's complaints about a problem file in this project's words."""
+"""Pydantic's complaints about a file in this project's words."""
 
 from __future__ import annotations
 
@@ -18,46 +18,52 @@ Part = str | int
 Fault = Mapping[str, Any]
 
 
-def explain(error: ValidationError, content: dict[str, Any], path: Path) -> InputError:
+def explain(
+    error: ValidationError,
+    content: dict[str, Any],
+    path: Path,
+    root: type[BaseModel] = ProblemFile,
+) -> InputError:
     """Turn the first complaint into an `InputError`, and count the others.
 
     Parameters
     ----------
     error : ValidationError
-        Of `ProblemFile`.
     content : dict
         The file's content that was validated.
     path : Path
+    root : type
+        What it was validated as.
     """
     faults = error.errors(include_url=False)
     # An unknown key explains the others around it.
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    message = _message(fault, content)
-    where = _place(fault, content)
-    others = {_place(other, content) for other in faults} - {where}
+    message = _message(fault, content, root)
+    where = _place(fault, content, root)
+    others = {_place(other, content, root) for other in faults} - {where}
     if others:
         message += f" (and {len(others)} more to mend)"
     return InputError(message, path, where or None)
 
 
-def _key(fault: Fault) -> list[Part]:
+def _key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     """The key at fault: without the union's tags, and without places in an array of numbers."""
     parts = [p for p in fault["loc"] if not (isinstance(p, str) and p.startswith("<"))]
-    field, depth = _field(parts)
+    field, depth = _field(parts, root)
     if field is not None and _model_in(field.annotation) is None:
         while len(parts) > depth and isinstance(parts[-1], int):
             parts.pop()
     return parts
 
 
-def _message(fault: Fault, content: dict[str, Any]) -> str:
-    key = _key(fault)
-    field, _ = _field(key)
+def _message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
+    key = _key(fault, root)
+    field, _ = _field(key, root)
     description = (field.description if field else None) or ""
     expected = description[:1].lower() + description[1:].rstrip(".").split(";")[0]
     kind, model = fault["type"], _model_in(field.annotation) if field else None
     if kind == "extra_forbidden":
-        return _unknown_key(key)
+        return _unknown_key(key, root)
     if kind == "value_error":
         error = fault["ctx"]["error"]
         return error.message if isinstance(error, InputError) else str(error)
@@ -76,17 +82,17 @@ def _message(fault: Fault, content: dict[str, Any]) -> str:
     return f"{found}; expected {wanted(fault)}"
 
 
-def _unknown_key(key: Sequence[Part]) -> str:
-    known = list(_model_at(key[:-1]).model_fields)
+def _unknown_key(key: Sequence[Part], root: type[BaseModel]) -> str:
+    known = list(_model_at(key[:-1], root).model_fields)
     hint = hint_at(str(key[-1]), known)
     return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
 
 
-def _place(fault: Fault, content: dict[str, Any]) -> str:
+def _place(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
     """Where a fault is; an `InputError` knows the place inside what is one value here."""
     error = (fault.get("ctx") or {}).get("error")
     known = error.where if isinstance(error, InputError) else None
-    return known or _where(_key(fault), content)
+    return known or _where(_key(fault, root), content)
 
 
 def _where(key: Sequence[Part], content: dict[str, Any]) -> str:
@@ -120,9 +126,9 @@ def _inside(place: Any, part: Part) -> Any:
 # The schema -----------------------------------------------------------------------------------
 
 
-def _field(key: Sequence[Part]) -> tuple[FieldInfo | None, int]:
+def _field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None, int]:
     """The deepest field of the schema on the way to a key, and how many parts lead to it."""
-    model: type[BaseModel] | None = ProblemFile
+    model: type[BaseModel] | None = root
     field, depth, named = None, 0, False
     for count, part in enumerate(key, start=1):
         if isinstance(part, int):
@@ -137,10 +143,10 @@ def _field(key: Sequence[Part]) -> tuple[FieldInfo | None, int]:
     return field, depth
 
 
-def _model_at(key: Sequence[Part]) -> type[BaseModel]:
-    field, _ = _field(key)
+def _model_at(key: Sequence[Part], root: type[BaseModel]) -> type[BaseModel]:
+    field, _ = _field(key, root)
     model = _model_in(field.annotation) if field is not None else None
-    return model or ProblemFile
+    return model or root
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

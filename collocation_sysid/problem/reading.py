@@ -45,7 +45,7 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
         Naming the file, the key or line, what was found and what was expected.
     """
     path = Path(path)
-    text = _read_text(path)
+    text = read_text(path)
     content = parse_toml(text, path)
     for override in overrides:
         _apply(content, override)
@@ -92,16 +92,23 @@ def _beyond_limits(error: Exception) -> str:
     return "holds a whole number of too many digits; expected a number that can be"
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
+    """The text of a file that is `what`.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
     require_regular(path)
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError("there is no such file; expected a problem file (TOML)", path) from None
+        raise InputError(f"there is no such file; expected {what}", path) from None
     except IsADirectoryError:
-        raise InputError("this is a folder; expected a problem file (TOML)", path) from None
+        raise InputError(f"this is a folder; expected {what}", path) from None
     except UnicodeDecodeError:
-        raise InputError("this is not a text file; expected a problem file (TOML)", path) from None
+        raise InputError(f"this is not a text file; expected {what}", path) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path) from error
 

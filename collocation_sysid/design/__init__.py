@@ -1,0 +1,8 @@
+"""Motions of the grasp that make the error bars of the next recording small."""
+
+from .criterion import Criterion
+from .designing import Design, DesignOptions, design
+from .limits import Limits
+from .motion import Motion
+
+__all__ = ["Criterion", "Design", "DesignOptions", "Limits", "Motion", "design"]
