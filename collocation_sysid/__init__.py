@@ -9,6 +9,7 @@
 from importlib.metadata import version
 
 from . import starting as _starting  # noqa: F401  (before all that takes time to import)
+from . import live
 from .errors import InputError, SimulationError
 from .experiment import (
     Experiment,
@@ -93,6 +94,7 @@ __all__ = [
     "UncertaintyOptions",
     "Unknown",
     "Wrench",
+    "live",
     "place_markers",
     "refine",
     "run",

@@ -24,6 +24,7 @@ LAYERS = (
     {"check", "earlier", "rollout", "verdict", "run", "refine"},
     {"output", "synthesis"},
     {"terminal", "method_tables"},
+    {"live"},
     {"study"},
     {"cli"},
 )

@@ -43,14 +43,18 @@ WEAK = 2.3
 MOVED = 0.1
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
-# A pass is accepted where the sum of squares grows by no more than this.
-SLACK = 0.01
+# A pass is accepted where the sum of squares is no more than this above what it was, or what was
+# to be expected of it: less than noise makes.
+SLACK = 1.0
 # Share of the time between samples that a frame may take, and blocks that a window has.
-SHARE, BLOCKS = 0.7, 12
+SHARE, BLOCKS = 0.8, 12
 # So many samples tell which stiffness to start from; where so many passes were rejected in a row,
 # it is sought. Trials whose squares are so many times the least are lost.
 SEEN, REJECTED, WORSE = 20, 3, 9.0
 TRIED_PA = STIFFEST_PA * 10.0 ** (-0.5 * np.arange(11))
+# What is left after a frame of the longest time that a row took: rows are not begun that might not
+# end within the budget, and one that took long by chance is forgotten.
+FADING = 0.9
 # Residuals this many times the usual are no noise.
 JUMP = 6.0
 # Frames between two looks at all residuals.
@@ -285,9 +289,7 @@ class Estimator:
 
     def _warmed_up(self) -> tuple[Poses, Array] | None:
         """Have the kernels compiled before frames come; the body at rest, and where it is held."""
-        grasps = self.model.experiment.grasps
-        first = ([part[0] for part in g.poses.at(g.poses.t_s[:1])] for g in grasps)
-        poses = tuple((turn, shift) for turn, shift in first)
+        poses = self.model.first_poses
         moved = tuple(poses[k] for k in self.model.moved_grasps)
         nowhere = np.full((len(self.names), 3), np.nan)
         nowhere[0] = 0.0
@@ -337,7 +339,7 @@ class Estimator:
         if self.track is None or self.track.failed:
             return np.inf
         nq = self.model.collocation.nq
-        errors = np.sqrt(np.diag(self.track.information.covariance())[:nq])
+        errors = np.sqrt(np.diag(self.track.information.covariance)[:nq])
         return float(np.max(np.abs((self.p - self.track.p)[:nq]) / errors, initial=0.0))
 
     def _estimate(self) -> None:
@@ -372,7 +374,7 @@ class Estimator:
     def _estimates_at(self, track: Track, p: Array) -> dict[str, Estimate]:
         collocation, nq = self.model.collocation, self.model.collocation.nq
         factor, quantile = widened(track.information, p, self.model.size, self.scatter)
-        of_q = factor * track.information.covariance()[:nq, :nq]
+        of_q = factor * track.information.covariance[:nq, :nq]
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
         return user_estimates(collocation.parameters, p[:nq], of_q, bounded, quantiles)
@@ -381,7 +383,7 @@ class Estimator:
 
     def _pass_again(self, began: float, notes: list[str]) -> int:
         """Go on with a pass in what is left of the budget; how many rows that were."""
-        done = 0
+        done, self._row_s = 0, FADING * self._row_s
         while self.track is not None:
             if self.again is None and not self._wanted(notes):
                 break
@@ -395,9 +397,7 @@ class Estimator:
                 again.failed = True
             done += 1
             took_s = self.clock() - before
-            self._row_s = max(took_s, 0.9 * self._row_s + 0.1 * took_s) if done == 1 else (
-                0.9 * self._row_s + 0.1 * took_s
-            )
+            self._row_s = max(took_s, self._row_s)
             if self.search is not None and not self.search.done:
                 if again.failed or again.rows >= min(self.search.rows, len(self.log)):
                     self.search.compare(again)
@@ -437,7 +437,8 @@ class Estimator:
         """Take a pass that has caught up in place of the first, or not."""
         track, self.again = self.track, None
         sought, self.search = self.search is not None, None
-        if not again.failed and (track.failed or again.loss <= track.loss + SLACK):
+        expected = max(track.loss, track.information.loss(again.p))
+        if not again.failed and (track.failed or again.loss <= expected + SLACK):
             again.base, self.track = None, again
             self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
             self._rejected = 0

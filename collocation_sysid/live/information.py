@@ -9,6 +9,7 @@ equations are never formed, and what T says stays positive semidefinite to round
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -72,6 +73,7 @@ class Information:
         step = lsq_linear(square, -right - square @ near, (low, high), method="bvls").x
         return np.clip(near + step, lower, upper)
 
+    @cached_property
     def covariance(self) -> Array:
         """(P, P) of p, for rows whose errors are independent and of size one."""
         size = len(self.triangle) - 1

@@ -15,6 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
+from ..experiment.clock import TIME_TOLERANCE_S
+from .model import Poses
 from .sweep import LATEST, LoggedRow, Reading, lagrange
 
 # Frames this near in time, in samples, are of one time.
@@ -139,7 +141,11 @@ class Intake:
             found.append(LoggedRow(poses, self._ready()))
         return found
 
-    def _poses_at(self, t_s: float):
+    def _poses_at(self, t_s: float) -> Poses:
+        for at_s, positions_m, quaternions in self._poses:
+            if abs(at_s - t_s) <= TIME_TOLERANCE_S:
+                turns = Rotation.from_quat(quaternions).as_matrix()
+                return tuple(zip(turns, positions_m, strict=True))
         times = np.array([each[0] for each in self._poses])
         gaps = np.diff(times)
         used = len(times)

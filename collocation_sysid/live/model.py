@@ -116,6 +116,12 @@ class Model:
         """Samples before and after one that its reading needs."""
         return NEIGHBOURS // 2 if len(self.segment.nuisance.places("time")) else 0
 
+    @property
+    def reads_plainly(self) -> bool:
+        """Whether a marker is read as it is, at its place on the body."""
+        nuisance = self.segment.nuisance
+        return not len(nuisance.places("time", "turn", "shift", "offset"))
+
     @cached_property
     def observation(self) -> Observation:
         """Reads one sample, in the middle, of markers measured at the origin."""
@@ -133,9 +139,14 @@ class Model:
         grasps = self.experiment.grasps
         return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
 
+    @cached_property
+    def first_poses(self) -> Poses:
+        """Those of all grasps that the problem's recording begins with."""
+        return _first_poses(self.experiment)
+
     def poses_of(self, moved: Poses) -> Poses:
         """Those of all grasps from those that move."""
-        still = [tuple(part[0] for part in grasp.poses.at(0.0)) for grasp in self.experiment.grasps]
+        still = list(self.first_poses)
         for number, pose in zip(self.moved_grasps, moved, strict=True):
             still[number] = pose
         return tuple(still)
@@ -204,18 +215,20 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
     # The rows of the start, and room for a reading.
     count = max(2 * reach + 3, NEIGHBOURS, 3)
     t_s = experiment.timestep_s * np.arange(count)
-    at_start = tuple(
-        (turn[0], shift[0]) for turn, shift in (g.poses.at(g.poses.t_s[:1]) for g in experiment.grasps)
-    )
     markers = experiment.markers
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
     return replace(
         experiment,
         t_s=t_s,
-        grasps=[replace(g, wrench=None) for g in _held_at(experiment, at_start)],
+        grasps=[replace(g, wrench=None) for g in _held_at(experiment, _first_poses(experiment))],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
     )
+
+
+def _first_poses(experiment: Experiment) -> Poses:
+    found = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
+    return tuple((turns[0], shifts[0]) for turns, shifts in found)
 
 
 def _held_at(experiment: Experiment, poses: Poses) -> list:

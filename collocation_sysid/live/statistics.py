@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, t
+from scipy.special import chdtrc, stdtrit
 
 from ..arrays import Array
 from .information import Information
@@ -65,6 +65,6 @@ def widened(known: Information, p: Array, fitted: float, scatter: Scatter) -> tu
     freedom = max(1.0, known.rows - fitted)
     loss = known.loss(p)
     factor, quantile = 1.0, 1.96
-    if chi2.sf(loss, freedom) < RARE:
-        factor, quantile = loss / freedom, float(t.ppf(0.975, freedom))
+    if chdtrc(freedom, loss) < RARE:
+        factor, quantile = loss / freedom, float(stdtrit(freedom, 0.975))
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile

@@ -116,6 +116,7 @@ class Sweep:
         self.dynamics = self.setting.dynamics.first_rows(model.rows)
         self.carried = model.carried(self.phi)
         self.operator = segment.observation.operator(self.phi)
+        self.reading = segment.observation.reading(self.phi)
         self.newton = Solver(segment.experiment, CAREFUL)
         self.held = np.setdiff1d(np.arange(segment.dofs), self.solver.free)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
@@ -225,7 +226,7 @@ class Sweep:
             return None, self._start(poses), np.zeros_like(self.x[t])
         equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
         if guess is None:
-            guess = extrapolated(self.x[:t], np.zeros(self.segment.dofs)) if t else self._start(poses)
+            guess = self._guess(t) if t else self._start(poses)
         near = guess.copy()
         near[dofs] = goal
         try:
@@ -241,6 +242,12 @@ class Sweep:
             time_s = self.row * self.model.interval_s / self.model.substeps
             what = f"the step at row {self.row}"
             raise simulation_error(self.newton, failure, time_s, what) from failure
+
+    def _guess(self, t: int) -> Array:
+        """x_t on a cubic through the last four rows, as far as there are that many."""
+        if t < 4:
+            return extrapolated(self.x[:t], np.zeros(self.segment.dofs))
+        return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _quick(self, t: int, equations: RowEquations, x: Array) -> tuple[Step, Array, Array]:
         """Newton's method without safeguards, as long as its steps get shorter."""
@@ -277,14 +284,25 @@ class Sweep:
     def linearised(self, reading: Reading) -> tuple[Array, Array]:
         """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P)."""
         model, around = self.model, self.model.samples_around
-        backs = [reading.back - k * model.substeps for k in range(-around, around + 1)]
-        x, columns = zip(*map(self._at, backs), strict=True)
-        found = model.observation.linearised(
-            np.array(x), self.phi, np.array(columns), self.moving, self.segment.nq
-        )
-        residual, slope = found[0][around], found[1][around]
         sigma = self.segment.experiment.markers.sigma_m[:, None]
-        return residual - reading.tracks_m / sigma, slope
+        if not model.reads_plainly:
+            backs = [reading.back - k * model.substeps for k in range(-around, around + 1)]
+            x, columns = zip(*map(self._at, backs), strict=True)
+            found = model.observation.linearised(
+                np.array(x), self.phi, np.array(columns), self.moving, self.segment.nq
+            )
+            return found[0][around] - reading.tracks_m / sigma, found[1][around]
+        x, columns = self._at(reading.back)
+        nodes, weights = self.reading
+        around_m = x.reshape(-1, 3)[nodes]
+        read = np.einsum("ma,mai->mi", weights.weights, around_m)
+        slope = np.zeros((*read.shape, model.size))
+        slope[..., self.moving] = columns.reshape(*read.shape, -1) / sigma[..., None]
+        observation = self.segment.observation
+        for m in observation.chart.estimated:
+            places = self.segment.nq + observation.place_places[m]
+            slope[m][:, places] = around_m[m].T @ weights.slopes[m] / sigma[m]
+        return (read - reading.tracks_m) / sigma, slope
 
     def _at(self, back: float) -> tuple[Array, Array]:
         """x and the markers' columns so many rows before the last; the start before the start."""
@@ -317,9 +335,8 @@ class Sweep:
 
 def lagrange(at: Array, wanted: float) -> Array:
     """Weights of values at points (k,) in the polynomial through them, at another."""
-    return np.array(
-        [
-            np.prod((wanted - np.delete(at, k)) / (at[k] - np.delete(at, k)))
-            for k in range(len(at))
-        ]
-    )
+    weights = np.ones(len(at))
+    for k, point in enumerate(at):
+        for other in (*at[:k], *at[k + 1 :]):
+            weights[k] *= (wanted - other) / (point - other)
+    return weights
