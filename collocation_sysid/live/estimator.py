@@ -348,7 +348,7 @@ class Estimator:
         reach = self._trust * self.model.collocation.reach_p
         low, high = np.maximum(self.lower, self.track.p - reach), self.track.p + reach
         high = np.minimum(self.upper, high)
-        self.p = self.track.information.best(low, high, self.track.p)
+        self.p = self.track.information.best(low, high)
 
     def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
         grave: list[Concern] = []

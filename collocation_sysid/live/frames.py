@@ -116,7 +116,8 @@ def _numbers(given: Any, shape: tuple[int, ...]) -> Array:
     except (TypeError, ValueError):
         raise InputError(f"found {given!r}; expected {size} numbers") from None
     if found.shape != shape:
-        raise InputError(f"found {np.shape(given)} numbers; expected {size}")
+        sizes = " × ".join(map(str, found.shape)) or "single"
+        raise InputError(f"found {sizes} numbers; expected {size} numbers")
     return found
 
 

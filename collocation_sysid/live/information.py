@@ -13,9 +13,11 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear
 
 from ..arrays import Array
+
+# Changes of what is held at bounds, for each parameter, before the search for the best ends.
+TURNS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,22 +58,30 @@ class Information:
         left = self.triangle @ np.append(p, 1.0)
         return float(left @ left)
 
-    def best(self, lower: Array, upper: Array, near: Array) -> Array:
-        """The p between bounds with the least squares; `near` is within them.
+    def best(self, lower: Array, upper: Array) -> Array:
+        """The p between bounds with the least squares.
 
-        What the rows say must be definite.
+        What the rows say must be definite. By active sets: what leaves its bounds is held there,
+        and what would rather come back is let go.
         """
         size = len(lower)
         square, right = self.triangle[:size, :size], self.triangle[:size, size]
-        try:
-            free = solve_triangular(square, -right)
-        except np.linalg.LinAlgError:
-            free = np.full(size, np.nan)
-        if ((free >= lower) & (free <= upper)).all():
-            return free
-        low, high = np.minimum(lower - near, -1e-15), np.maximum(upper - near, 1e-15)
-        step = lsq_linear(square, -right - square @ near, (low, high), method="bvls").x
-        return np.clip(near + step, lower, upper)
+        p, held = solve_triangular(square, -right), np.zeros(size, dtype=bool)
+        for _ in range(TURNS * size):
+            outside = ~held & ((p < lower) | (p > upper))
+            p = np.clip(p, lower, upper)
+            if outside.any():
+                held |= outside
+            else:
+                pull = square.T @ (square @ p + right)
+                back = np.where(p <= lower, -pull, np.where(p >= upper, pull, 0.0)) * held
+                if back.max(initial=0.0) <= 1e-9 * np.abs(pull).max(initial=1.0):
+                    break
+                held[back.argmax()] = False
+            free = np.flatnonzero(~held)
+            q, r = np.linalg.qr(square[:, free])
+            p[free] = solve_triangular(r, -q.T @ (right + square[:, held] @ p[held]))
+        return np.clip(p, lower, upper)
 
     @cached_property
     def covariance(self) -> Array:

@@ -118,9 +118,8 @@ class Model:
 
     @property
     def reads_plainly(self) -> bool:
-        """Whether a marker is read as it is, at its place on the body."""
-        nuisance = self.segment.nuisance
-        return not len(nuisance.places("time", "turn", "shift", "offset"))
+        """Whether a marker is read as it is, at its place on the body, if by another clock."""
+        return not len(self.segment.nuisance.places("turn", "shift", "offset"))
 
     @cached_property
     def observation(self) -> Observation:

@@ -117,6 +117,7 @@ class Sweep:
         self.carried = model.carried(self.phi)
         self.operator = segment.observation.operator(self.phi)
         self.reading = segment.observation.reading(self.phi)
+        self.clock = self._weights_in_time()
         self.newton = Solver(segment.experiment, CAREFUL)
         self.held = np.setdiff1d(np.arange(segment.dofs), self.solver.free)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
@@ -285,24 +286,40 @@ class Sweep:
         """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P)."""
         model, around = self.model, self.model.samples_around
         sigma = self.segment.experiment.markers.sigma_m[:, None]
+        backs = [reading.back - k * model.substeps for k in range(-around, around + 1)]
+        x, columns = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
         if not model.reads_plainly:
-            backs = [reading.back - k * model.substeps for k in range(-around, around + 1)]
-            x, columns = zip(*map(self._at, backs), strict=True)
-            found = model.observation.linearised(
-                np.array(x), self.phi, np.array(columns), self.moving, self.segment.nq
-            )
+            found = model.observation.linearised(x, self.phi, columns, self.moving, self.segment.nq)
             return found[0][around] - reading.tracks_m / sigma, found[1][around]
-        x, columns = self._at(reading.back)
-        nodes, weights = self.reading
-        around_m = x.reshape(-1, 3)[nodes]
-        read = np.einsum("ma,mai->mi", weights.weights, around_m)
+        (nodes, places), (weights, rates) = self.reading, self.clock
+        at_m = np.tensordot(weights, x, 1).reshape(-1, 3)[nodes]
+        read = np.einsum("ma,mai->mi", places.weights, at_m)
         slope = np.zeros((*read.shape, model.size))
-        slope[..., self.moving] = columns.reshape(*read.shape, -1) / sigma[..., None]
-        observation = self.segment.observation
+        slope[..., self.moving] = np.tensordot(weights, columns, 1).reshape(*read.shape, -1)
+        if around:
+            moves_m = np.tensordot(rates, x, 1).reshape(-1, 3)[nodes]
+            (time,) = self.segment.nq + self.segment.nuisance.places("time")
+            slope[..., time] = np.einsum("ma,mai->mi", places.weights, moves_m)
+        observation = model.observation
         for m in observation.chart.estimated:
-            places = self.segment.nq + observation.place_places[m]
-            slope[m][:, places] = around_m[m].T @ weights.slopes[m] / sigma[m]
-        return (read - reading.tracks_m) / sigma, slope
+            own = self.segment.nq + observation.place_places[m]
+            slope[m][:, own] = at_m[m].T @ places.slopes[m]
+        return (read - reading.tracks_m) / sigma, slope / sigma[..., None]
+
+    def _weights_in_time(self) -> tuple[Array, Array]:
+        """Weights of the samples around one as the clock is off, and their slopes by its φ."""
+        around, places = self.model.samples_around, self.segment.nuisance.places("time")
+        if not around:
+            return np.ones(1), np.zeros(1)
+        at = np.arange(-around, around + 1.0)
+        unit = float(self.segment.nuisance.scales[places[0]]) / self.model.interval_s
+        late = unit * float(self.phi[places[0]])
+        # Of a polynomial of fourth order central differences with a step of one, and half of
+        # one, are exact to rounding when combined.
+        wide, near = (
+            (lagrange(at, late + h) - lagrange(at, late - h)) / (2 * h) for h in (1.0, 0.5)
+        )
+        return lagrange(at, late), unit * (4 * near - wide) / 3
 
     def _at(self, back: float) -> tuple[Array, Array]:
         """x and the markers' columns so many rows before the last; the start before the start."""
