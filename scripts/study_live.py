@@ -1,11 +1,11 @@
 """How often the intervals of live estimates hold the truth while a recording is being made.
 
 Twins of a small block are moved at random, seen with noise of 0.5 mm, and streamed frame by frame
-from the guess; each frame may take the budget, in the processor's time of this process, so that
-what else the machine does changes nothing.
+from the guess; with each frame a number of rows is passed again, so that what the machine does
+besides changes nothing but the times.
 
     python scripts/study_live.py                       # 200 twins
-    python scripts/study_live.py --twins 20 --budget-ms 8
+    python scripts/study_live.py --twins 20 --rows 6 --batch 5
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
     parser.add_argument("--body", default="block")
-    parser.add_argument("--budget-ms", type=float, default=8.0)
+    parser.add_argument("--rows", type=int, default=6, help="passed again with each frame")
     parser.add_argument("--batch", type=int, default=0, help="so many are solved as a whole too")
     arguments = parser.parse_args()
     held: Counter[tuple[float, str]] = Counter()
@@ -46,9 +46,7 @@ def main() -> None:
     latency: list[float] = []
     for seed in range(arguments.first, arguments.first + arguments.twins):
         problem = twin(arguments.body, SOFT, seed, SAMPLES)
-        live = Estimator(
-            problem, LiveOptions(budget_s=1e-3 * arguments.budget_ms), time.thread_time
-        )
+        live = Estimator(problem, LiveOptions(rows=arguments.rows), time.thread_time)
         for frame in recorded(problem.experiments[0], live.model):
             update = live.take(frame)
             latency.append(update.latency_s)
@@ -69,7 +67,7 @@ def main() -> None:
                 abs(update.estimates[n].value - batch[n].value) / (batch[n].std_error or np.inf)
                 for n in SOFT
             ]
-    print(f"{arguments.twins} twins of the {arguments.body}, {arguments.budget_ms:g} ms a frame")
+    print(f"{arguments.twins} twins of the {arguments.body}, {arguments.rows} rows a frame")
     for at_s in LOOKED_AT_S:
         shares = (f"{n} {held[at_s, n] / max(1, told[at_s, n]):.3f}" for n in SOFT)
         count, whole = (sum(each[at_s, n] for n in SOFT) for each in (held, told))

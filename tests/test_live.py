@@ -250,6 +250,30 @@ def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
     assert update.trust.verdict != "good"
 
 
+def test_frames_whose_clock_was_set_back_begin_anew():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for frame in frames[:20]:
+        live.take(replace(frame, t_s=frame.t_s + 100.0))
+    notes = [note for frame in frames[:20] for note in live.take(frame).notes]
+    assert sum("too late" in note for note in notes) == 10
+    assert live.counts["begun anew"] == 1 and live.track.rows == 10
+
+
+def test_markers_without_poses_are_not_kept():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for k in range(40):
+        update = live.take(replace(frames[0], t_s=-1.0 + 0.01 * k, pose=None))
+        assert update.trust.verdict == "doubtful" and not live.intake._waiting
+    live.take(frames[0])
+    for k in range(1, 40):
+        live.take(replace(frames[0], t_s=0.01 * k, pose=None))
+    assert len(live.intake._waiting) <= 10
+
+
 def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
     problem = swing()
     live = Estimator(problem)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
-from ..checked import Positive
+from ..checked import AtLeastOne, Positive
 from ..errors import SimulationError
 from ..methods.options import Options
 from ..methods.scan import STIFFEST_PA, usual_parameters, without_guesses
@@ -72,12 +72,16 @@ class LiveOptions(Options):
         whatever it costs.
     window_s : float
         Frames that are passed again when the estimate moves.
+    rows : int, optional
+        Rows of the grid that are passed again a frame, whatever time that takes: estimates are the
+        same on any machine then.
     """
 
     name: ClassVar[str] = "live"
 
     budget_s: Positive | None = None
     window_s: Positive = 3.0
+    rows: AtLeastOne | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,7 +392,7 @@ class Estimator:
             if self.again is None and not self._wanted(notes):
                 break
             before = self.clock()
-            if before - began + self._row_s > self.budget_s:
+            if self._is_spent(done, before - began):
                 break
             again = self.again
             try:
@@ -405,6 +409,11 @@ class Estimator:
             elif again.failed or again.rows == len(self.log):
                 self._judge(again, notes)
         return done
+
+    def _is_spent(self, done: int, elapsed_s: float) -> bool:
+        if self.options.rows is not None:
+            return done >= self.options.rows
+        return elapsed_s + self._row_s > self.budget_s
 
     def _wanted(self, notes: list[str]) -> bool:
         """Begin a pass where one is wanted."""

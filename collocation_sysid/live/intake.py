@@ -57,6 +57,7 @@ class Intake:
         self._times: deque[float] = deque(maxlen=8 * LATEST)
         self._poses: deque[tuple[float, Array, Array]] = deque(maxlen=4)
         self._waiting: list[tuple[float, Array]] = []
+        self._too_late = 0
 
     @property
     def last_pose_s(self) -> float | None:
@@ -64,7 +65,12 @@ class Intake:
         return self._poses[-1][0] if self._poses else None
 
     def is_lost(self, t_s: float) -> bool:
-        """Whether a time is so long after the last pose that nothing is known of the motion."""
+        """Whether a time is so long after the last pose that nothing is known of the motion.
+
+        So it is where many frames in turn are too late: their clock was set back.
+        """
+        if self._too_late >= LONGEST:
+            return True
         gone_s = t_s - (t_s if self.last_pose_s is None else self.last_pose_s)
         return gone_s > (LONGEST + TOLERANCE) * self.interval_s
 
@@ -87,11 +93,14 @@ class Intake:
         if late:
             if self.last_s - t_s > LATEST * sample_s:
                 self.counts["late"] += 1
+                self._too_late += 1
                 return [], [], [f"the frame of {t_s:.6g} s is too late: left out"]
             self.counts["unordered"] += 1
             said.append(f"the frame of {t_s:.6g} s is late: its markers count, its pose does not")
+        self._too_late = 0
         self._times.append(t_s)
-        if np.isfinite(tracks_m).any():
+        begun = self.start_s is not None or pose is not None
+        if begun and not self.is_lost(t_s) and np.isfinite(tracks_m).any():
             self._waiting.append((t_s, tracks_m))
         if not late:
             said += self._gap(t_s)
@@ -113,8 +122,9 @@ class Intake:
             self.counts["dropped"] += missing
             said.append(f"{missing} frames before {t_s:.6g} s are missing: bridged")
         if abs(off - round(off)) > TOLERANCE:
+            if not self.counts["off the grid"]:
+                said.append(f"the frame of {t_s:.6g} s lies between samples: such are read there")
             self.counts["off the grid"] += 1
-            said.append(f"the frame of {t_s:.6g} s lies between samples: read there")
         return said
 
     def _add_pose(self, t_s: float, positions_m: Array, quaternions: Array) -> None:
