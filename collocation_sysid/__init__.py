@@ -9,7 +9,6 @@
 from importlib.metadata import version
 
 from . import starting as _starting  # noqa: F401  (before all that takes time to import)
-from . import live
 from .errors import InputError, SimulationError
 from .experiment import (
     Experiment,
@@ -45,6 +44,8 @@ from .nlp.simulation import Trajectory, simulate, with_markers
 from .problem import Problem, RolloutOptions, UncertaintyOptions
 from .refine import refine
 from .run import Run, run, solve
+
+from . import live  # isort: skip  (after `starting`, which is before all)
 
 __version__ = version("collocation-sysid")
 

@@ -81,15 +81,18 @@ def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame])
     median, late = 1e3 * np.percentile(took, [50, 99])
     print(f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again")
     print(f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms")
-    print(f"    a row of the batch's sweep {1e3 * row_s:.2f} ms: {1e-3 * median / row_s:.1f} of these")
+    print(
+        f"    a row of the batch's sweep {1e3 * row_s:.2f} ms: {1e-3 * median / row_s:.1f} of these"
+    )
     solution = solve(problem, ReducedSpace())
     batch = covariance(solution.collocation, solution.z).estimates
     for key, true in TRUTH[name].items():
         found, known = update.estimates[key], batch[key]
         apart = abs(found.value - known.value) / (known.std_error or np.nan)
         off = 100 * (early.estimates[key].value / true - 1)
+        error = known.std_error or np.nan
         print(
-            f"    {key}: {found.value:.5g}, batch {known.value:.5g} ± {known.std_error or np.nan:.2g}: "
+            f"    {key}: {found.value:.5g}, batch {known.value:.5g} ± {error:.2g}: "
             f"{apart:.3f} standard errors apart; {off:+.1f} % from the truth at {EARLY_S:g} s"
         )
     print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")

@@ -13,15 +13,23 @@ from functools import cache
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from problem_files import run_command
+from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Nuisance, PoseSequence
-from collocation_sysid.live import Estimator, Frame, FrameReader, LiveOptions, Update, estimator, sweep
+from collocation_sysid.live import (
+    Estimator,
+    Frame,
+    FrameReader,
+    LiveOptions,
+    Update,
+    estimator,
+    sweep,
+)
 from collocation_sysid.live.information import Information
 from collocation_sysid.live.intake import Intake
 from collocation_sysid.live.sources import as_json, datagrams, paced, recorded
@@ -73,7 +81,9 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     horizon, p = Horizon(collocation, [count], prior=estimator.WEAK), collocation.guess_p
     x, failure = horizon.extend(p)
     assert failure is None
-    point = horizon.evaluate(p, [a + b.step for a, b in zip(x, horizon.evaluate(p, x).tangents)])
+    point = horizon.evaluate(
+        p, [a + b.step for a, b in zip(x, horizon.evaluate(p, x).tangents, strict=False)]
+    )
     rows = np.column_stack([point.slope, point.residual - point.slope @ p])
     batch = rows.T @ rows
     ours = normal_equations(live.track.information.triangle)
@@ -213,14 +223,14 @@ def test_a_frame_that_is_too_late_is_left_out():
     rows = live.track.information.rows
     update = live.take(frames[10])
     assert "too late" in update.notes[0]
-    assert live.counts["late"] == 1 and live.track.information.rows == rows
+    assert live.counts["late"] == 1
+    assert live.track.information.rows == rows
 
 
 def test_missing_markers_say_nothing():
     problem = swing()
     live = Estimator(problem, NO_TIME)
-    seen = 0
-    for frame in frames_of(problem, live):
+    for seen, frame in enumerate(frames_of(problem, live)):
         tracks = frame.tracks_m.copy()
         if seen % 3:
             tracks[: 1 + seen % 2] = np.nan
@@ -228,7 +238,6 @@ def test_missing_markers_say_nothing():
         live.take(replace(frame, tracks_m=tracks))
         found = live.track.information.rows - before
         assert found == np.isfinite(tracks).sum()
-        seen += 1
 
 
 def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
@@ -242,10 +251,12 @@ def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
     assert live.track.information.rows == live.prior.rows + 14 * frames[0].tracks_m.size
     for frame in blind[14:30]:
         update = live.take(frame)
-    assert update.trust.verdict == "doubtful" and "grasp is lost" in update.trust.reasons[0]
+    assert update.trust.verdict == "doubtful"
+    assert "grasp is lost" in update.trust.reasons[0]
     known = live.track.information
     update = live.take(frames[30])
-    assert "begun anew" in update.notes[0] and live.track.rows == 1
+    assert "begun anew" in update.notes[0]
+    assert live.track.rows == 1
     assert live.track.prior is known
     assert update.trust.verdict != "good"
 
@@ -258,7 +269,8 @@ def test_frames_whose_clock_was_set_back_begin_anew():
         live.take(replace(frame, t_s=frame.t_s + 100.0))
     notes = [note for frame in frames[:20] for note in live.take(frame).notes]
     assert sum("too late" in note for note in notes) == 10
-    assert live.counts["begun anew"] == 1 and live.track.rows == 10
+    assert live.counts["begun anew"] == 1
+    assert live.track.rows == 10
 
 
 def test_markers_without_poses_are_not_kept():
@@ -267,7 +279,8 @@ def test_markers_without_poses_are_not_kept():
     frames = frames_of(problem, live)
     for k in range(40):
         update = live.take(replace(frames[0], t_s=-1.0 + 0.01 * k, pose=None))
-        assert update.trust.verdict == "doubtful" and not live.intake._waiting
+        assert update.trust.verdict == "doubtful"
+        assert not live.intake._waiting
     live.take(frames[0])
     for k in range(1, 40):
         live.take(replace(frames[0], t_s=0.01 * k, pose=None))
@@ -283,7 +296,8 @@ def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
         tracks = first.tracks_m + noise.normal(scale=NOISE_M, size=first.tracks_m.shape)
         update = live.take(replace(first, t_s=0.01 * k, tracks_m=tracks))
     damping = update.estimates["gamma_r_s"]
-    assert damping.std_error is None and damping.ci95[1] > 100 * damping.ci95[0]
+    assert damping.std_error is None
+    assert damping.ci95[1] > 100 * damping.ci95[0]
     assert update.trust.verdict != "good"
     assert any("gamma_r_s is not known yet" in reason for reason in update.trust.reasons)
 
@@ -341,14 +355,13 @@ def test_memory_is_bounded():
     sizes = []
     for k in range(90):
         live.take(replace(period[k % len(period)], t_s=0.01 * k))
-        sizes.append(
-            (len(live.log), sum(len(b.kept) + len(b.said) for b in live.track.blocks))
-        )
+        sizes.append((len(live.log), sum(len(b.kept) + len(b.said) for b in live.track.blocks)))
     most = 3 * live._blocks * live._block_rows
     assert max(logged for logged, _ in sizes) <= most
     assert max(kept for _, kept in sizes) <= 2 * most
     assert live.track.information.triangle.shape == (len(live.p) + 1,) * 2
-    assert len(live.intake._waiting) <= 4 and len(live.track.sweep.read) <= 30
+    assert len(live.intake._waiting) <= 4
+    assert len(live.track.sweep.read) <= 30
 
 
 # What cannot be live --------------------------------------------------------------------------
@@ -380,7 +393,8 @@ def test_what_is_no_frame_is_refused_and_changes_nothing(given, said):
     live = Estimator(swing(), NO_TIME)
     with pytest.raises(InputError, match=said):
         live.update(**given)
-    assert live.track is None and not live.counts
+    assert live.track is None
+    assert not live.counts
 
 
 # Text -----------------------------------------------------------------------------------------
@@ -470,13 +484,16 @@ def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
     assert ended.code == 0
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines[:2], "{", lines[2]])))
     ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
-    assert ended.code == 2 and "standard input, line 3: no JSON" in ended.err
+    assert ended.code == 2
+    assert "standard input, line 3: no JSON" in ended.err
     assert len(ended.out.splitlines()) == 3
 
 
 def test_a_recording_is_replayed_and_filmed(tiny):
     ended = run_command("replay", "problem.toml", "--rate", 0, "--film", "swing.gif")
-    assert ended.code == 0 and "mu_pa" in ended.out and "frames, latency" in ended.out
+    assert ended.code == 0
+    assert "mu_pa" in ended.out
+    assert "frames, latency" in ended.out
     assert imread("swing.gif").size > 0
     assert run_command("replay", "problem.toml", "--film", "swing.mp4").code == 2
     ended = run_command("replay", "problem.toml", "--rate", 1000, "--json")

@@ -21,7 +21,6 @@ from ..arrays import Array
 from ..checked import AtLeastOne, Positive
 from ..errors import SimulationError
 from ..methods.options import Options
-from ..methods.scan import STIFFEST_PA, usual_parameters, without_guesses
 from ..nlp.lapack import one_blas_thread
 from ..problem import Problem
 from ..statistics.estimates import Estimate, user_estimates
@@ -31,6 +30,7 @@ from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .information import Information
 from .intake import LONGEST, Intake
 from .model import Model, Poses
+from .search import Search
 from .statistics import Scatter, widened
 from .sweep import LoggedRow, Reading
 from .track import Track
@@ -48,10 +48,8 @@ TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 SLACK = 1.0
 # Share of the time between samples that a frame may take, and blocks that a window has.
 SHARE, BLOCKS = 0.8, 12
-# So many samples tell which stiffness to start from; where so many passes were rejected in a row,
-# it is sought. Trials whose squares are so many times the least are lost.
-SEEN, REJECTED, WORSE = 20, 3, 9.0
-TRIED_PA = STIFFEST_PA * 10.0 ** (-0.5 * np.arange(11))
+# After so many passes that were rejected in a row another start is sought.
+REJECTED = 3
 # What is left after a frame of the longest time that a row took: rows are not begun that might not
 # end within the budget, and one that took long by chance is forgotten.
 FADING = 0.9
@@ -156,7 +154,7 @@ class Estimator:
         self.track: Track | None = None
         self.again: Track | None = None
         self.log: list[LoggedRow] = []
-        self.search = Search(self) if problem.parameters.unguessed else None
+        self.search = self._search() if problem.parameters.unguessed else None
         self.scatter = Scatter()
         self._trust, self._rejected, self._row_s = TRUST, 0, 0.0
         self._away = np.zeros(len(self.names), dtype=np.int64)
@@ -245,14 +243,15 @@ class Estimator:
 
     def _read(self, readings: Sequence[Reading], squares: list[Array]) -> list[str]:
         """Take what is read after the last row, without samples that jump."""
-        if self.track is None:
+        track = self.track
+        if track is None:
             return []
         notes, sigma_m = [], self.model.segment.experiment.markers.sigma_m[:, None]
         for reading in readings:
             self.samples += int(np.isfinite(reading.tracks_m[:, 0]).sum())
-            if not self.track.failed:
-                residual, slope = self.track.sweep.linearised(reading)
-                here = residual + slope @ (self.p - self.track.p)
+            if not track.failed:
+                residual, slope = track.sweep.linearised(reading)
+                here = residual + slope @ (self.p - track.p)
                 wild = self._wild(here)
                 if wild.any():
                     names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
@@ -261,7 +260,7 @@ class Estimator:
                         tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
                     )
                     residual[wild] = here[wild] = np.nan
-                self.track.read(residual, slope)
+                track.read(residual, slope)
                 near = np.sum((here * sigma_m) ** 2, axis=1)
                 squares.append(near[np.isfinite(near)])
             self.log[-1].readings.append(reading)
@@ -282,6 +281,9 @@ class Estimator:
 
     def _bounds(self) -> None:
         self.lower, self.upper = self.model.collocation.bounds_p
+
+    def _search(self) -> Search:
+        return Search(self.model, self.p[self.model.collocation.nq :])
 
     def _of_priors(self) -> Information:
         """What is known before the first frame."""
@@ -389,12 +391,10 @@ class Estimator:
         """Go on with a pass in what is left of the budget; how many rows that were."""
         done, self._row_s = 0, FADING * self._row_s
         while self.track is not None:
-            if self.again is None and not self._wanted(notes):
-                break
+            again = self.again or self._wanted(self.track, notes)
             before = self.clock()
-            if self._is_spent(done, before - began):
+            if again is None or self._is_spent(done, before - began):
                 break
-            again = self.again
             try:
                 again.again(self.log[again.rows])
             except SimulationError:
@@ -407,7 +407,7 @@ class Estimator:
                     self.search.compare(again)
                     self.again = None
             elif again.failed or again.rows == len(self.log):
-                self._judge(again, notes)
+                self._judge(self.track, again, notes)
         return done
 
     def _is_spent(self, done: int, elapsed_s: float) -> bool:
@@ -415,36 +415,30 @@ class Estimator:
             return done >= self.options.rows
         return elapsed_s + self._row_s > self.budget_s
 
-    def _wanted(self, notes: list[str]) -> bool:
+    def _wanted(self, track: Track, notes: list[str]) -> Track | None:
         """Begin a pass where one is wanted."""
-        track, search = self.track, self.search
+        search = self.search
         at_start = track.start[0] is None
         if search is None and track.failed and at_start:
-            search = self.search = Search(self)
+            search = self.search = self._search()
             notes.append("a start is sought among stiffnesses")
-        if search is not None and not search.done:
-            if len(self.log) < search.rows or not at_start:
-                return False
-            p = search.next()
-            if p is not None:
-                self.again = Track(self.model, p, track.prior, self._block_rows)
-                return True
+        p, base = self.p, track
         if search is not None:
-            p, search_ended = search.best, True
+            if not search.done and (len(self.log) < search.rows or not at_start):
+                return None
+            p, base = search.best if search.done else search.next(), None
             if p is None:
                 self.search = None
                 notes.append("no start was found among stiffnesses")
-                return False
-            self.again = Track(self.model, p, track.prior, self._block_rows)
-            return True
-        if track.failed or self.moved <= MOVED:
-            return False
-        self.again = Track(self.model, self.p, track.prior, self._block_rows, track)
-        return True
+                return None
+        elif track.failed or self.moved <= MOVED:
+            return None
+        self.again = Track(self.model, p, track.prior, self._block_rows, base)
+        return self.again
 
-    def _judge(self, again: Track, notes: list[str]) -> None:
+    def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
         """Take a pass that has caught up in place of the first, or not."""
-        track, self.again = self.track, None
+        self.again = None
         sought, self.search = self.search is not None, None
         expected = max(track.loss, track.information.loss(again.p))
         if not again.failed and (track.failed or again.loss <= expected + SLACK):
@@ -462,7 +456,7 @@ class Estimator:
             lost = self._rejected >= REJECTED and self.scatter.rms > GROSS_MISFIT
             if lost and not sought and not self.counts["searched"] and track.start[0] is None:
                 self.counts["searched"] += 1
-                self.search = Search(self)
+                self.search = self._search()
                 notes.append("the search is stuck: another start is sought among stiffnesses")
         self._estimate()
 
@@ -479,39 +473,3 @@ class Estimator:
             if len(self.log) <= most:
                 break
             del self.log[: self.track.drop_oldest()]
-
-
-class Search:
-    """A start among stiffnesses, from stiff to soft, on the first frames."""
-
-    def __init__(self, estimator: Estimator) -> None:
-        model = estimator.model
-        self.rows = (SEEN - 1) * model.substeps + 1
-        forgotten = without_guesses(model.collocation).parameters
-        self._waiting = [usual_parameters(forgotten, young).guess_q for young in TRIED_PA]
-        self._phi = estimator.p[model.collocation.nq :]
-        self._tried: list[tuple[float, Array]] = []
-
-    @property
-    def done(self) -> bool:
-        """Whether there is nothing left to try."""
-        return not self._waiting
-
-    def next(self) -> Array | None:
-        """The next p to try."""
-        return np.concatenate([self._waiting[0], self._phi]) if self._waiting else None
-
-    def compare(self, track: Track) -> None:
-        """Note what a trial gave; two in a row that are lost end it."""
-        self._waiting.pop(0)
-        self._tried.append((np.inf if track.failed else track.loss, track.p))
-        least = min(loss for loss, _ in self._tried)
-        worse = [not loss <= WORSE * least for loss, _ in self._tried]
-        if np.isfinite(least) and all(worse[-2:]) and len(worse) > 2:
-            self._waiting.clear()
-
-    @property
-    def best(self) -> Array | None:
-        """Where the sum of squares was least."""
-        loss, p = min(self._tried, key=lambda each: each[0])
-        return p if np.isfinite(loss) else None

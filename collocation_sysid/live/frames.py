@@ -106,7 +106,7 @@ def as_tracks(given: ArrayLike | Mapping[str, Any] | None, names: Sequence[str])
                 tracks[list(names).index(name)] = _numbers(place, (3,))
     if np.isinf(tracks).any():
         raise InputError("a marker's position is infinite; expected numbers, or null if missing")
-    return np.where(np.isfinite(tracks).all(axis=1)[:, None], tracks, np.nan)
+    return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
 
 
 def _numbers(given: Any, shape: tuple[int, ...]) -> Array:

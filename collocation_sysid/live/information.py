@@ -51,7 +51,7 @@ class Information:
         if not count:
             return self
         triangle = np.linalg.qr(np.vstack([self.triangle, rows]), mode="r")
-        return Information(triangle, self.rows + count)
+        return Information(np.asarray(triangle), self.rows + count)
 
     def loss(self, p: Array) -> float:
         """Sum of the squares at p."""

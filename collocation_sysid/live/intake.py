@@ -137,11 +137,12 @@ class Intake:
         self._poses.append((t_s, positions_m, quaternions))
 
     def _time_s(self, row: int) -> float:
+        assert self.start_s is not None
         return self.start_s + row * self.interval_s / self.substeps
 
     def _due(self) -> list[LoggedRow]:
         """The rows that there are poses for."""
-        found = []
+        found: list[LoggedRow] = []
         if self.start_s is None:
             return found
         until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
@@ -163,14 +164,14 @@ class Intake:
             used = 2
         weights = lagrange(times[-used:], t_s)
         known = list(self._poses)[-used:]
-        positions = sum(w * p for w, (_, p, _) in zip(weights, known, strict=True))
-        quaternions = sum(w * q for w, (_, _, q) in zip(weights, known, strict=True))
+        positions = np.tensordot(weights, [p for _, p, _ in known], 1)
+        quaternions = np.tensordot(weights, [q for _, _, q in known], 1)
         turns = Rotation.from_quat(quaternions).as_matrix()
         return tuple(zip(turns, positions, strict=True))
 
     def _ready(self) -> list[Reading]:
         """What can be read after the rows there are."""
-        if not self.rows:
+        if self.start_s is None or not self.rows:
             return []
         now_s = self._time_s(self.rows - 1)
         step_s = self.interval_s / self.substeps

@@ -127,9 +127,7 @@ class Model:
         around, markers = self.samples_around, self.segment.experiment.markers
         count = 2 * around + 1
         t_s = markers.t_s[:count]
-        origin = replace(
-            markers, t_s=t_s, positions_m=np.zeros((count, len(markers.names), 3))
-        )
+        origin = replace(markers, t_s=t_s, positions_m=np.zeros((count, len(markers.names), 3)))
         return Observation(origin, np.arange(count), self.segment.nuisance, self.segment.chart)
 
     @cached_property

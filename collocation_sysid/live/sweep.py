@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import SimulationError
 from ..methods.robust import huberised
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, NewtonOptions, Solver, simulation_error
-from ..nlp.row import Row
 from ..nlp.rest import start_state
+from ..nlp.row import Row
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
 from .information import Information
 from .model import Model, Poses
@@ -34,6 +34,10 @@ CAREFUL = NewtonOptions(tolerance=1e-6)
 NEAR = 1e-3
 # Readings may come this many samples late.
 LATEST = 5
+
+
+# x (3n,), its columns Z, and those of the markers.
+Read = tuple[Array, NDArray[np.float32], Array]
 
 
 class Reading(NamedTuple):
@@ -55,7 +59,7 @@ class Kept:
     """What a later pass starts a row from: x (3n,) and Z (3n, m)."""
 
     x: Array
-    columns: Array
+    columns: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +81,7 @@ class State:
     force: Array
     given: Array
     memory: Memory
-    read: tuple[tuple[Array, Array, Array], ...]
+    read: tuple[Read, ...]
 
 
 class Sweep:
@@ -123,7 +127,7 @@ class Sweep:
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
         self.moving = segment.moving
         self.information, self.known = known, known
-        state = self._begin() if start is None else self._moved(start, p - at)
+        state = self._begin() if start is None or at is None else self._moved(start, p - at)
         self._resume(state)
 
     # State ------------------------------------------------------------------------------------
@@ -156,7 +160,7 @@ class Sweep:
         shape = (len(self.solver.free), len(self.moving))
         self.forward = Forward(self.solver, self.setting, shape, state.memory)
         most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4
-        self.read: deque[tuple[Array, Array, Array]] = deque(state.read, maxlen=most)
+        self.read: deque[Read] = deque(state.read, maxlen=most)
 
     @property
     def state(self) -> State:
@@ -185,18 +189,19 @@ class Sweep:
         goal, slopes = self.model.goals(self.carried, poses)
         self.given[t, :, self.segment.nq :] = slopes
         dofs = self.segment.grasping.dofs
-        step, self.x[t], self.force[t] = self._solved(t, poses, goal, guess)
         given = None
         if self.segment.nuisance.moves_grasps:
             given = GivenMotion.along(self.solver, dofs, self.given)
-        right = np.zeros((len(self.solver.free), len(self.moving)))
         by_p = np.zeros((self.segment.dofs, len(self.moving)))
-        if t >= self.dynamics.first_row:
+        if t < self.dynamics.first_row:
+            self.x[t] = self._start(poses)
+        else:
+            step, self.x[t], self.force[t] = self._solved(t, poses, goal, guess)
+            right = np.zeros((len(self.solver.free), len(self.moving)))
             if self.setting.mass_moves:
-                acceleration = self._acceleration(t, step.row)
-                right -= self.forward.inertia_slopes(step, acceleration)
-            slopes_f = self.forward.force_slopes(step)
-            by_p[self.solver.free] = self.forward.advance(step, right, slopes_f, given)
+                right -= self.forward.inertia_slopes(step, self._acceleration(t, step.row))
+            slopes_n = self.forward.force_slopes(step)
+            by_p[self.solver.free] = self.forward.advance(step, right, slopes_n, given)
         by_p[self.held] = self.given[t, np.searchsorted(dofs, self.held)]
         kept = Kept(self.x[t].copy(), by_p.astype(np.float32))
         self.read.append((kept.x, kept.columns, self.operator @ by_p))
@@ -216,15 +221,13 @@ class Sweep:
 
     def _acceleration(self, t: int, row: Row) -> Array:
         reach = min(t, self.dynamics.reach)
-        return sum(row.s[i] * self.x[t - i] for i in range(reach + 1))
+        return np.tensordot(row.s[: reach + 1], self.x[t - reach : t + 1][::-1], 1)
 
     def _solved(
         self, t: int, poses: Poses, goal: Array, guess: Array | None
-    ) -> tuple[Step | None, Array, Array]:
+    ) -> tuple[Step, Array, Array]:
         """Row t: its last linearisation, x_t, and F_t."""
         dofs = self.segment.grasping.dofs
-        if t < self.dynamics.first_row:
-            return None, self._start(poses), np.zeros_like(self.x[t])
         equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
         if guess is None:
             guess = self._guess(t) if t else self._start(poses)
@@ -322,7 +325,7 @@ class Sweep:
         return lagrange(at, late), unit * (4 * near - wide) / 3
 
     def _at(self, back: float) -> tuple[Array, Array]:
-        """x and the markers' columns so many rows before the last; the start before the start."""
+        """X and the markers' columns so many rows before the last; the start before the start."""
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= NEAR or not last:
@@ -331,11 +334,8 @@ class Sweep:
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
         weights = lagrange(np.array(rows, dtype=float), back)
-        picked = [self.read[last - row] for row in rows]
-        return (
-            sum(w * x for w, (x, _, _) in zip(weights, picked, strict=True)),
-            sum(w * z for w, (_, _, z) in zip(weights, picked, strict=True)),
-        )
+        x, _, columns = zip(*(self.read[last - row] for row in rows), strict=True)
+        return np.tensordot(weights, x, 1), np.tensordot(weights, columns, 1)
 
     def take(self, residual: Array, slope: Array) -> None:
         """Add what markers say, of those that are there."""

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from ..arrays import Array
 from .information import Information
 from .model import Model, Poses
@@ -103,9 +101,7 @@ class Track:
     def residuals(self, p: Array) -> list[Array]:
         """(M, 3) of what was read within the window, linearised to p, NaN where missing."""
         step = p - self.p
-        return [
-            residual + slope @ step for block in self.blocks for residual, slope in block.said
-        ]
+        return [residual + slope @ step for block in self.blocks for residual, slope in block.said]
 
     def again(self, row: LoggedRow) -> None:
         """Go on by a row and all that was read after it."""

@@ -21,7 +21,7 @@ from .estimator import Update
 BARS = "▁▂▃▄▅▆▇█"
 COLUMNS = 40
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
-WIDTH_MM, ROW_MM, DPI, FRAMES_A_SECOND = 160.0, 32.0, 100, 25.0
+WIDTH_MM, ROW_MM, DPI, FRAMES_A_SECOND = 160.0, 32.0, 100, 25
 
 
 def bars(values: Sequence[float], columns: int = COLUMNS) -> str:
@@ -32,7 +32,7 @@ def bars(values: Sequence[float], columns: int = COLUMNS) -> str:
     shown = np.log(last) if (last > 0).all() else last
     low, high = float(shown.min()), float(shown.max())
     share = (shown - low) / (high - low) if high > low else np.full(len(shown), 0.5)
-    return "".join(BARS[int(round(s * (len(BARS) - 1)))] for s in share)
+    return "".join(BARS[round(s * (len(BARS) - 1))] for s in share)
 
 
 def picture(updates: Sequence[Update]) -> RenderableType:

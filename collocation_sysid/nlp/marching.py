@@ -173,6 +173,7 @@ class RowEquations:
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
     def balanced(self, force: Array, x: Array) -> Array:
+        """c_t from F_t."""
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
@@ -188,7 +189,9 @@ class RowEquations:
         return self.balanced(at.force[0], x), matrix, skew
 
 
-def solve_row(solver: Solver, row: RowEquations, guess: Array, previous: Array, held: Array) -> Array:
+def solve_row(
+    solver: Solver, row: RowEquations, guess: Array, previous: Array, held: Array
+) -> Array:
     """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way.
 
     So does a static load change then. Static rows keep to the branch that is stable.

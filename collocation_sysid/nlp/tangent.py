@@ -587,9 +587,7 @@ class Forward:
         self.past.appendleft(solution)
         return solution
 
-    def _sense(
-        self, held: HeldForces, step: Step, force: Array, state: Array, rate: Array
-    ) -> None:
+    def _sense(self, held: HeldForces, step: Step, force: Array, state: Array, rate: Array) -> None:
         """Note F_t and dF_t of the dofs whose grasp has a sensor."""
         t, rows, dofs = step.t, self.solver.sensed_rows, self.solver.sensed
         held.force[t] = step.force[dofs]
