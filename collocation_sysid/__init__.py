@@ -45,6 +45,8 @@ from .problem import Problem, RolloutOptions, UncertaintyOptions
 from .refine import refine
 from .run import Run, run, solve
 
+from . import live  # isort: skip  (after `starting`, which is before all)
+
 __version__ = version("collocation-sysid")
 
 __all__ = [
@@ -93,6 +95,7 @@ __all__ = [
     "UncertaintyOptions",
     "Unknown",
     "Wrench",
+    "live",
     "place_markers",
     "refine",
     "run",

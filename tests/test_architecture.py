@@ -21,9 +21,10 @@ LAYERS = (
     {"methods"},
     {"statistics"},
     {"problem"},
-    {"check", "earlier", "rollout", "verdict", "run", "refine"},
+    {"check", "earlier", "rollout", "second_start", "verdict", "run", "refine"},
     {"output", "synthesis"},
     {"terminal", "method_tables"},
+    {"live"},
     {"design", "study"},
     {"cli"},
 )

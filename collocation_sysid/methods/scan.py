@@ -129,7 +129,7 @@ def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan |
     if not _scannable(collocation):
         return None
     try:
-        return scan(_without_guesses(collocation), reason, whole)
+        return scan(without_guesses(collocation), reason, whole)
     except InputError:
         return None
 
@@ -225,7 +225,7 @@ def _scannable(collocation: Collocation) -> bool:
     return any(is_modulus(item.name) and item.scale == "log" for item in free)
 
 
-def _without_guesses(collocation: Collocation) -> Collocation:
+def without_guesses(collocation: Collocation) -> Collocation:
     """The problem without the guesses that the scan can do without."""
 
     def forgotten(item: Parameter) -> Parameter:

@@ -96,15 +96,15 @@ def march_on(
     memory, intervals = history.last if history else None, dynamics.until_next_s
     for t in range(done, dynamics.rows):
         carried = memory.ahead(intervals[t - 1]) if memory else None
-        row = _Step(dynamics, theta, x, forces, t, carried)
+        row = RowEquations(dynamics, theta, x, forces, t, carried)
         solver = solvers.holding(held[t])
         goal = held_positions[t].ravel()[solver.held]
         if dynamics.static:
             guess = _carried_on(x[:t], solver.held, goal)
         else:
-            guess = _predicted(x[:t], dynamics.step_s * v0)
+            guess = extrapolated(x[:t], dynamics.step_s * v0)
         try:
-            x[t] = _solve_row(solver, row, guess, x[t - 1], goal)
+            x[t] = solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
             return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
@@ -117,7 +117,7 @@ def march_on(
     return x, None
 
 
-def _predicted(x: Array, first_step: Array) -> Array:
+def extrapolated(x: Array, first_step: Array) -> Array:
     """The next row, extrapolated."""
     if len(x) > 2:
         return 3 * (x[-1] - x[-2]) + x[-3]
@@ -133,7 +133,7 @@ def _carried_on(x: Array, held: Index, goal: Array) -> Array:
     return x[-1] + share * (x[-1] - x[-2])
 
 
-class _Step:
+class RowEquations:
     """Row t of the discrete equations as a function of x_t alone."""
 
     def __init__(
@@ -157,7 +157,7 @@ class _Step:
         self.known -= row.mass_kg * weighted(row.s, past, shape)
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
-    def under(self, share: float) -> _Step:
+    def under(self, share: float) -> RowEquations:
         """The same when a share of the change of a static load has come."""
         found = copy(self)
         if self.forces_before is not None:
@@ -172,23 +172,26 @@ class _Step:
         """ξ_t and ν_t, (1, 3n) each."""
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
-    def _balanced(self, force: Array, x: Array) -> Array:
+    def balanced(self, force: Array, x: Array) -> Array:
+        """c_t from F_t."""
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual(self, x: Array) -> Array:
         """c_t."""
-        return self._balanced(self.force(x), x)
+        return self.balanced(self.force(x), x)
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
         at = self.forces.linearise(*self.states(x), self.theta, carried=self.carried)
         matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
         skew = self.row.skew_block(at.by_position_skew[0])
-        return self._balanced(at.force[0], x), matrix, skew
+        return self.balanced(at.force[0], x), matrix, skew
 
 
-def _solve_row(solver: Solver, row: _Step, guess: Array, previous: Array, held: Array) -> Array:
+def solve_row(
+    solver: Solver, row: RowEquations, guess: Array, previous: Array, held: Array
+) -> Array:
     """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way.
 
     So does a static load change then. Static rows keep to the branch that is stable.

@@ -89,7 +89,7 @@ class Memory:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class Step:
     """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, G's skew part, ν."""
 
     t: int
@@ -183,7 +183,7 @@ class BlockSolver:
         held = HeldForces.nothing(len(x), len(self.sensed), count)
         if known is not None:
             held.begin(known.held)
-        march = _Forward(self, setting, (len(self.free), count), memory, held)
+        march = Forward(self, setting, (len(self.free), count), memory, held)
         march.remember(history, theta_q, done)
         for step in self._steps(x, setting, first=done, history=history):
             indefinite += not step.factor.positive_definite
@@ -212,7 +212,7 @@ class BlockSolver:
             Where a timestep's equations are singular or not finite.
         """
         shape = (x.shape[1], len(self.segment.moving))
-        march = _Forward(self, setting, (len(self.free), shape[1]), held=held)
+        march = Forward(self, setting, (len(self.free), shape[1]), held=held)
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
         march.remember(history, setting.columns(shape[1], first=0))
         acceleration = self.dynamics.acceleration(x)
@@ -240,7 +240,7 @@ class BlockSolver:
         """
         count = moved.shape[2]
         given = GivenMotion.along(self, setting.held.dofs, moved)
-        march = _Forward(self, setting, (len(self.free), count), held=held)
+        march = Forward(self, setting, (len(self.free), count), held=held)
         history = self.dynamics.history(x, setting.theta)
         march.remember(history, np.zeros((len(setting.theta), count)))
         yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
@@ -344,7 +344,7 @@ class BlockSolver:
         backward: bool = False,
         first: int = 0,
         history: History | None = None,
-    ) -> Iterator[_Step]:
+    ) -> Iterator[Step]:
         """Blocks and factors of every row from `first` on, computed in chunks side by side."""
         dynamics, theta = self.dynamics_at(setting), setting.theta
         xi, nu = dynamics.evaluation_states(x)
@@ -362,7 +362,7 @@ class BlockSolver:
                 factors = self._factorise(dynamics, at, slice(start, stop), rows, rooms)
             order = range(stop - start)
             for k in reversed(order) if backward else order:
-                yield _Step(
+                yield Step(
                     start + k,
                     rows[k],
                     at.force[k],
@@ -474,7 +474,7 @@ class GivenMotion:
             columns=columns,
         )
 
-    def force(self, solver: BlockSolver, step: _Step) -> Array:
+    def force(self, solver: BlockSolver, step: Step) -> Array:
         """What their motion adds to F' (free, columns)."""
         position, velocity = (each[step.t] for each in self.of_evaluations)
         # What is only parameters of other kinds does not move them.
@@ -491,7 +491,7 @@ class GivenMotion:
         solution[self.places[here]] = self.columns[t, here]
 
 
-class _Forward:
+class Forward:
     """Substitution row by row; remembers the last few rows."""
 
     def __init__(
@@ -535,7 +535,7 @@ class _Forward:
             # The start is given.
             self.slopes.advance(np.zeros((self.solver.pattern.size, theta_q.shape[1])))
 
-    def residual(self, step: _Step, acceleration: Array) -> Array:
+    def residual(self, step: Step, acceleration: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
         solver, row = self.solver, step.row
         force = step.force[solver.free]
@@ -546,17 +546,17 @@ class _Forward:
             self.past_forces.appendleft(force)
         return solver.without_taken(step.t, total)
 
-    def force_slopes(self, step: _Step) -> Array:
+    def force_slopes(self, step: Step) -> Array:
         """∂F/∂p (3n, m)."""
         return self.setting.force_slopes(step.t, step.by_theta, step.velocity)
 
-    def inertia_slopes(self, step: _Step, acceleration: Array) -> Array | float:
+    def inertia_slopes(self, step: Step, acceleration: Array) -> Array | float:
         """∂(M a)/∂p on the free dofs."""
         free = self.solver.free
         return self.setting.inertia_slopes(step.t, acceleration[free], free)
 
     def advance(
-        self, step: _Step, right: Array, force: Array, given: GivenMotion | None = None
+        self, step: Step, right: Array, force: Array, given: GivenMotion | None = None
     ) -> Array:
         """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
@@ -587,9 +587,7 @@ class _Forward:
         self.past.appendleft(solution)
         return solution
 
-    def _sense(
-        self, held: HeldForces, step: _Step, force: Array, state: Array, rate: Array
-    ) -> None:
+    def _sense(self, held: HeldForces, step: Step, force: Array, state: Array, rate: Array) -> None:
         """Note F_t and dF_t of the dofs whose grasp has a sensor."""
         t, rows, dofs = step.t, self.solver.sensed_rows, self.solver.sensed
         held.force[t] = step.force[dofs]
@@ -607,7 +605,7 @@ class _Forward:
             found[given.held_dofs] = given.of_evaluations[order][t, given.places < 0]
         return found
 
-    def _of_past(self, step: _Step, row: Row) -> Array:
+    def _of_past(self, step: Step, row: Row) -> Array:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
         p, q = row.p[1:], row.q[1:]
         lags = np.flatnonzero((p != 0) | (q != 0))

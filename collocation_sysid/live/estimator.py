@@ -1,0 +1,475 @@
+"""Parameters while the recording is being made: one frame in, one estimate out.
+
+All frames are linearised at one p; the estimate is the Gauss–Newton step from there, within bounds
+and a trust region. When it has moved, what the window holds is passed again at the estimate, in
+what is left of each frame's time, until that pass has caught up: it takes the place of the first
+where the sum of squares is less, and else the trust region shrinks. So each pass is an iteration
+of the reduced-space method on all that has come, and what it converges to is the batch's answer.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import Array
+from ..checked import AtLeastOne, Positive
+from ..errors import SimulationError
+from ..methods.options import Options
+from ..nlp.lapack import one_blas_thread
+from ..problem import Problem
+from ..statistics.estimates import Estimate, user_estimates
+from ..statistics.linearised import AT_BOUND
+from ..statistics.trust import GROSS_MISFIT, Concern, Trust
+from .frames import Frame, Pose, as_pose, as_time, as_tracks
+from .information import Information
+from .intake import LONGEST, Intake
+from .model import Model, Poses
+from .search import Search
+from .statistics import Scatter, widened
+from .sweep import LoggedRow, Reading
+from .track import Track
+from .trust import UNSETTLED, data_concerns, estimate_concerns
+
+# A prior of this standard deviation of the logarithm holds each parameter near its guess: what the
+# first frames do not tell stays finite, and of what a recording tells it changes nothing.
+WEAK = 2.3
+# Estimates this far from where all is linearised, in standard errors, begin another pass.
+MOVED = 0.1
+# First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
+TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
+# A pass is accepted where the sum of squares is no more than this above what it was, or what was
+# to be expected of it: less than noise makes.
+SLACK = 1.0
+# Share of the time between samples that a frame may take, and blocks that a window has.
+SHARE, BLOCKS = 0.8, 12
+# After so many passes that were rejected in a row another start is sought.
+REJECTED = 3
+# What is left after a frame of the longest time that a row took: rows are not begun that might not
+# end within the budget, and one that took long by chance is forgotten.
+FADING = 0.9
+# Residuals this many times the usual are no noise.
+JUMP = 6.0
+# Frames between two looks at all residuals.
+LOOK_EVERY = 5
+
+
+@dataclass(frozen=True)
+class LiveOptions(Options):
+    """What live estimation may take.
+
+    Attributes
+    ----------
+    budget_s : float, optional
+        Time of a frame; 70 % of the time between samples by default. The frame itself is taken
+        whatever it costs.
+    window_s : float
+        Frames that are passed again when the estimate moves.
+    rows : int, optional
+        Rows of the grid that are passed again a frame, whatever time that takes: estimates are the
+        same on any machine then.
+    """
+
+    name: ClassVar[str] = "live"
+
+    budget_s: Positive | None = None
+    window_s: Positive = 3.0
+    rows: AtLeastOne | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What is known after a frame.
+
+    Attributes
+    ----------
+    t_s : float
+        Of the frame.
+    estimates : by name, value, standard error and 95 % interval
+    trust : Trust
+    marker_rms_m : float
+        Distance of the markers of this frame from where the estimate has them; NaN without any.
+    notes : tuple of str
+        What was odd about the frame, or happened now.
+    latency_s : float
+        Time the frame took.
+    relinearised : int
+        Rows that were passed again.
+    """
+
+    t_s: float
+    estimates: Mapping[str, Estimate]
+    trust: Trust
+    marker_rms_m: float
+    notes: tuple[str, ...]
+    latency_s: float
+    relinearised: int
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
+        return f"Update(t = {self.t_s:.4g} s: {found}; {self.trust.verdict})"
+
+
+class Estimator:
+    """Estimates a problem's parameters from frames, one after another.
+
+    Parameters
+    ----------
+    problem : Problem
+        One experiment; its recording only says which grasps and markers there are, and how many
+        samples a second.
+    options : LiveOptions
+    clock : callable
+        Seconds that the budget is taken from; `time.thread_time` does not count what others take.
+
+    Raises
+    ------
+    InputError
+        Where the problem has what cannot be live.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        options: LiveOptions = LiveOptions(),
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.problem, self.options, self.clock = problem, options, clock
+        self.model = Model.of(problem)
+        model, self.names = self.model, self.model.experiment.markers.names
+        self.intake = Intake(model.interval_s, model.substeps, model.samples_around)
+        self.counts, self.samples = self.intake.counts, 0
+        self.budget_s = options.budget_s or SHARE * model.interval_s
+        samples = max(LONGEST, round(options.window_s / model.interval_s / BLOCKS))
+        self._block_rows = samples * model.substeps
+        self._blocks = max(2, round(options.window_s / model.interval_s / samples))
+        self._bounds()
+        self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
+        self.prior = self._of_priors()
+        self.track: Track | None = None
+        self.again: Track | None = None
+        self.log: list[LoggedRow] = []
+        self.search = self._search() if problem.parameters.unguessed else None
+        self.scatter = Scatter()
+        self._trust, self._rejected, self._row_s = TRUST, 0, 0.0
+        self._away = np.zeros(len(self.names), dtype=np.int64)
+        self._rest = self._warmed_up()
+
+    # Frames -----------------------------------------------------------------------------------
+
+    def update(
+        self,
+        t_s: float,
+        pose: Pose | Mapping[str, Pose] | None,
+        markers: ArrayLike | Mapping[str, ArrayLike],
+        wrench: object = None,
+    ) -> Update:
+        """Take a frame.
+
+        Parameters
+        ----------
+        t_s : float
+        pose : 4×4 matrix, (position, quaternion x y z w), or None
+            Of the grasp that moves, None where it is not seen; of several by number from "1" on,
+            or by the order of the problem.
+        markers : (M, 3) array, or mapping of name to (3,)
+            NaN, or left out, where missing.
+        wrench : optional
+            Not read: frames tell the motion only.
+
+        Raises
+        ------
+        InputError
+            For values that are no frame; the estimator is as it was before.
+        """
+        poses = as_pose(pose, self.model.moved_grasps + 1)
+        tracks = as_tracks(markers, self.names)
+        return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None))
+
+    @one_blas_thread()
+    def take(self, frame: Frame) -> Update:
+        """Take a frame that was read."""
+        began = self.clock()
+        notes = self._of_frame(frame)
+        if self.intake.is_lost(frame.t_s):
+            if frame.pose is None:
+                notes.append("the grasp is lost: nothing is read until its pose is back")
+            else:
+                self._begin_anew()
+                notes.append("nothing was seen for long: begun anew, as if at rest here")
+        rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m)
+        notes += said
+        squares: list[Array] = []
+        for row in rows:
+            notes += self._go_on(row, squares)
+        notes += self._read(readings, squares)
+        self._estimate()
+        done = self._pass_again(began, notes)
+        self._shorten()
+        near = np.concatenate([*squares, np.zeros(0)])
+        rms_m = float(np.sqrt(near.mean())) if len(near) else float("nan")
+        estimates, trust = self._known(frame)
+        latency_s = self.clock() - began
+        return Update(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
+
+    def _of_frame(self, frame: Frame) -> list[str]:
+        if not frame.has_wrench:
+            return []
+        self.counts["with a wrench"] += 1
+        once = self.counts["with a wrench"] == 1
+        return ["wrenches are not read: live takes poses and markers"] if once else []
+
+    def _go_on(self, row: LoggedRow, squares: list[Array]) -> list[str]:
+        """Log a row, and take it."""
+        self.log.append(LoggedRow(row.poses, []))
+        try:
+            if self.track is None:
+                self._begin(row)
+            elif not self.track.failed:
+                self.track.advance(row.poses)
+        except SimulationError as error:
+            if self.track is None:
+                self.log.clear()
+                self.intake.begin_anew()
+                return [f"there is no start: {error}"]
+            self.track.failed = True
+            return [f"the body cannot be simulated with these parameters: {error}"]
+        return self._read(row.readings, squares)
+
+    def _read(self, readings: Sequence[Reading], squares: list[Array]) -> list[str]:
+        """Take what is read after the last row, without samples that jump."""
+        track = self.track
+        if track is None:
+            return []
+        notes, sigma_m = [], self.model.segment.experiment.markers.sigma_m[:, None]
+        for reading in readings:
+            self.samples += int(np.isfinite(reading.tracks_m[:, 0]).sum())
+            if not track.failed:
+                residual, slope = track.sweep.linearised(reading)
+                here = residual + slope @ (self.p - track.p)
+                wild = self._wild(here)
+                if wild.any():
+                    names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
+                    notes.append(f"left out, far from where they can be: {names}")
+                    reading = reading._replace(
+                        tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
+                    )
+                    residual[wild] = here[wild] = np.nan
+                track.read(residual, slope)
+                near = np.sum((here * sigma_m) ** 2, axis=1)
+                squares.append(near[np.isfinite(near)])
+            self.log[-1].readings.append(reading)
+        return notes
+
+    def _wild(self, residual: Array) -> NDArray[np.bool_]:
+        """(M,) samples that the estimate cannot explain while it explains the others."""
+        if self.moved > UNSETTLED or not 0 < self.scatter.rms < GROSS_MISFIT:
+            return np.zeros(len(residual), dtype=bool)
+        length = np.sqrt(np.sum(residual**2, axis=1) / 3)
+        wild = length > JUMP * max(1.0, self.scatter.rms)
+        if wild.sum() > np.isfinite(length).sum() / 2:
+            return np.zeros_like(wild)
+        self.counts["wild"] += int(wild.sum())
+        return wild
+
+    # Beginnings -------------------------------------------------------------------------------
+
+    def _bounds(self) -> None:
+        self.lower, self.upper = self.model.collocation.bounds_p
+
+    def _search(self) -> Search:
+        return Search(self.model, self.p[self.model.collocation.nq :])
+
+    def _of_priors(self) -> Information:
+        """What is known before the first frame."""
+        collocation, size, nq = self.model.collocation, self.model.size, self.model.collocation.nq
+        residual, slopes = collocation.prior(self.p)
+        found = Information.none(size).with_rows(residual, np.diag(slopes), self.p)
+        away = (self.p[:nq] - collocation.parameters.guess_q) / WEAK
+        return found.with_rows(away, np.eye(nq, size) / WEAK, self.p)
+
+    def _warmed_up(self) -> tuple[Poses, Array] | None:
+        """Have the kernels compiled before frames come; the body at rest, and where it is held."""
+        poses = self.model.first_poses
+        moved = tuple(poses[k] for k in self.model.moved_grasps)
+        nowhere = np.full((len(self.names), 3), np.nan)
+        nowhere[0] = 0.0
+        try:
+            trial = Track(self.model, self.p, self.prior, self._block_rows)
+            for _ in range(self.model.rows + 2):
+                trial.again(LoggedRow(moved, [Reading(0.0, nowhere)]))
+        except SimulationError:
+            return None
+        self._estimates_at(trial, self.p)
+        return poses, trial.blocks[0].kept[0].x
+
+    def _begin(self, row: LoggedRow) -> None:
+        model, guess = self.model, None
+        poses = model.poses_of(row.poses)
+        if self._rest is not None and len(poses) == 1:
+            (was_turned, was_at), x = self._rest[0][0], self._rest[1]
+            (turned, at) = poses[0]
+            guess = ((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()
+        track = Track(model, self.p, self.prior, self._block_rows)
+        track.advance(row.poses, guess)
+        first = row.readings[0].tracks_m if row.readings else np.full((len(self.names), 3), np.nan)
+        self.model = model.placed(first, track.blocks[0].kept[0].x)
+        if self.model is not model:
+            self._bounds()
+            places = self.model.collocation.guess_p[model.collocation.nq :]
+            self.p = np.concatenate([self.p[: model.collocation.nq], places])
+            self.prior = self._of_priors()
+            track = Track(self.model, self.p, self.prior, self._block_rows)
+            track.advance(row.poses, guess)
+        self.track = track
+
+    def _begin_anew(self) -> None:
+        """Keep what is known, and wait for a start."""
+        if self.track is not None:
+            self.prior = self.track.information
+        self.track = self.again = None
+        self.log.clear()
+        self.intake.begin_anew()
+        self.counts["begun anew"] += 1
+
+    # Estimates --------------------------------------------------------------------------------
+
+    @property
+    def moved(self) -> float:
+        """How far the estimate is from where all is linearised, in standard errors."""
+        if self.track is None or self.track.failed:
+            return np.inf
+        nq = self.model.collocation.nq
+        errors = np.sqrt(np.diag(self.track.information.covariance)[:nq])
+        return float(np.max(np.abs((self.p - self.track.p)[:nq]) / errors, initial=0.0))
+
+    def _estimate(self) -> None:
+        if self.track is None or self.track.failed:
+            return
+        reach = self._trust * self.model.collocation.reach_p
+        low, high = np.maximum(self.lower, self.track.p - reach), self.track.p + reach
+        high = np.minimum(self.upper, high)
+        self.p = self.track.information.best(low, high)
+
+    def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
+        grave: list[Concern] = []
+        if self.track is None:
+            grave.append(("there is no start yet: the first frame needs a pose", "doubtful"))
+        elif self.track.failed:
+            grave.append(("the body cannot be simulated with these parameters", "doubtful"))
+        elif self.intake.is_lost(frame.t_s):
+            grave.append(("the grasp is lost", "doubtful"))
+        elif self.search is not None:
+            grave.append(("a start is still sought", "doubtful"))
+        if self.track is None or self.track.failed:
+            values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
+            return {name: Estimate(value) for name, value in values.items()}, Trust.of(grave)
+        if self.counts["looked"] % LOOK_EVERY == 0:
+            self.scatter = Scatter.of(self.track.residuals(self.p))
+        self.counts["looked"] += 1
+        estimates = self._estimates_at(self.track, self.p)
+        grave += data_concerns(self.scatter, self.counts, self.samples)
+        grave += estimate_concerns(estimates, self.moved)
+        return estimates, Trust.of(grave)
+
+    def _estimates_at(self, track: Track, p: Array) -> dict[str, Estimate]:
+        collocation, nq = self.model.collocation, self.model.collocation.nq
+        factor, quantile = widened(track.information, p, self.model.size, self.scatter)
+        of_q = factor * track.information.covariance[:nq, :nq]
+        bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
+        quantiles = np.full(nq, quantile)
+        return user_estimates(collocation.parameters, p[:nq], of_q, bounded, quantiles)
+
+    # Passing again ----------------------------------------------------------------------------
+
+    def _pass_again(self, began: float, notes: list[str]) -> int:
+        """Go on with a pass in what is left of the budget; how many rows that were."""
+        done, self._row_s = 0, FADING * self._row_s
+        while self.track is not None:
+            again = self.again or self._wanted(self.track, notes)
+            before = self.clock()
+            if again is None or self._is_spent(done, before - began):
+                break
+            try:
+                again.again(self.log[again.rows])
+            except SimulationError:
+                again.failed = True
+            done += 1
+            took_s = self.clock() - before
+            self._row_s = max(took_s, self._row_s)
+            if self.search is not None and not self.search.done:
+                if again.failed or again.rows >= min(self.search.rows, len(self.log)):
+                    self.search.compare(again)
+                    self.again = None
+            elif again.failed or again.rows == len(self.log):
+                self._judge(self.track, again, notes)
+        return done
+
+    def _is_spent(self, done: int, elapsed_s: float) -> bool:
+        if self.options.rows is not None:
+            return done >= self.options.rows
+        return elapsed_s + self._row_s > self.budget_s
+
+    def _wanted(self, track: Track, notes: list[str]) -> Track | None:
+        """Begin a pass where one is wanted."""
+        search = self.search
+        at_start = track.start[0] is None
+        if search is None and track.failed and at_start:
+            search = self.search = self._search()
+            notes.append("a start is sought among stiffnesses")
+        p, base = self.p, track
+        if search is not None:
+            if not search.done and (len(self.log) < search.rows or not at_start):
+                return None
+            p, base = search.best if search.done else search.next(), None
+            if p is None:
+                self.search = None
+                notes.append("no start was found among stiffnesses")
+                return None
+        elif track.failed or self.moved <= MOVED:
+            return None
+        self.again = Track(self.model, p, track.prior, self._block_rows, base)
+        return self.again
+
+    def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
+        """Take a pass that has caught up in place of the first, or not."""
+        self.again = None
+        sought, self.search = self.search is not None, None
+        expected = max(track.loss, track.information.loss(again.p))
+        if not again.failed and (track.failed or again.loss <= expected + SLACK):
+            again.base, self.track = None, again
+            self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
+            self._rejected = 0
+            if sought:
+                notes.append("begun from another stiffness")
+            self.scatter = Scatter.of(again.residuals(again.p))
+        else:
+            reach = self.model.collocation.reach_p
+            length = float(np.abs((again.p - track.p) / reach).max())
+            self._trust = max(SHRINK * length, 1e-6)
+            self._rejected += 1
+            lost = self._rejected >= REJECTED and self.scatter.rms > GROSS_MISFIT
+            if lost and not sought and not self.counts["searched"] and track.start[0] is None:
+                self.counts["searched"] += 1
+                self.search = self._search()
+                notes.append("the search is stuck: another start is sought among stiffnesses")
+        self._estimate()
+
+    def _shorten(self) -> None:
+        """Let the oldest rows leave when the window is full."""
+        if self.track is None:
+            return
+        most = self._blocks * self._block_rows
+        if self.again is not None and len(self.log) > 2 * most:
+            self.again = None
+        if self.track.failed and len(self.log) > 2 * most:
+            self._begin_anew()
+        while self.again is None and self.track is not None and not self.track.failed:
+            if len(self.log) <= most:
+                break
+            del self.log[: self.track.drop_oldest()]

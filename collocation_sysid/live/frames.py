@@ -1,0 +1,229 @@
+"""Frames as they are given, and as text: JSON lines, or the rows of a table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ..arrays import Array
+from ..errors import InputError
+from ..experiment.poses import first_matrix_fault, first_pose_fault
+
+Pose = Any
+
+POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_KEYS = ("t_s", "pose", "markers", "wrench")
+_POSE_KEYS = ("position_m", "quaternion_xyzw")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What cameras and robot saw at a time.
+
+    Attributes
+    ----------
+    t_s : float
+    pose : positions (G, 3) and quaternions (G, 4) of the grasps that move, or None
+    tracks_m : (M, 3) NaN where missing
+    has_wrench : bool
+    """
+
+    t_s: float
+    pose: tuple[Array, Array] | None
+    tracks_m: Array
+    has_wrench: bool = False
+
+
+def as_pose(given: Pose | None, numbers: Sequence[int]) -> tuple[Array, Array] | None:
+    """The poses of the grasps of these numbers; None where one of them is missing.
+
+    Raises
+    ------
+    InputError
+        For what is no pose.
+    """
+    if given is None:
+        return None
+    if isinstance(given, Mapping) and not set(given) & set(_POSE_KEYS):
+        known = [str(number) for number in numbers]
+        if unknown := [name for name in given if name not in known]:
+            raise InputError(f"a pose of grasp {unknown[0]!r}; expected {', '.join(known)}")
+        each = [given.get(name) for name in known]
+    elif len(numbers) == 1:
+        each = [given]
+    else:
+        each = list(given) if isinstance(given, Sequence) else [given]
+        if len(each) != len(numbers):
+            raise InputError(f"{len(each)} poses; expected {len(numbers)}, one of each grasp")
+    if any(one is None for one in each):
+        return None
+    parts = [_one_pose(one) for one in each]
+    return np.array([part[0] for part in parts]), np.array([part[1] for part in parts])
+
+
+def _one_pose(given: Pose) -> tuple[Array, Array]:
+    if isinstance(given, Mapping):
+        if missing := [key for key in _POSE_KEYS if key not in given]:
+            raise InputError(f"the pose has no {missing[0]}; expected {' and '.join(_POSE_KEYS)}")
+        given = tuple(given[key] for key in _POSE_KEYS)
+    if isinstance(given, tuple) and len(given) == 2:
+        position, quaternion = _numbers(given[0], (3,)), _numbers(given[1], (4,))
+        fault = first_pose_fault(np.zeros(1), position[None], quaternion[None])
+        if fault is not None:
+            raise InputError(fault[1].replace(" at t_s = 0", ""))
+        return position, quaternion / np.linalg.norm(quaternion)
+    matrix = _numbers(given, (4, 4))
+    fault = first_matrix_fault(np.zeros(1), matrix[None])
+    if fault is not None:
+        raise InputError(fault[1].replace(" at t_s = 0", ""))
+    return matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_quat()
+
+
+def as_tracks(given: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]) -> Array:
+    """(M, 3) markers, NaN where missing.
+
+    Raises
+    ------
+    InputError
+        For markers that are not there, or what are no three numbers.
+    """
+    tracks = np.full((len(names), 3), np.nan)
+    if given is None:
+        return tracks
+    if not isinstance(given, Mapping):
+        tracks = _numbers(given, tracks.shape)
+    else:
+        for name, place in given.items():
+            if name not in names:
+                raise InputError(f"a marker {name!r}; expected {', '.join(names)}")
+            if place is not None:
+                tracks[list(names).index(name)] = _numbers(place, (3,))
+    if np.isinf(tracks).any():
+        raise InputError("a marker's position is infinite; expected numbers, or null if missing")
+    return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
+
+
+def _numbers(given: Any, shape: tuple[int, ...]) -> Array:
+    size = " × ".join(map(str, shape))
+    try:
+        found = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"found {given!r}; expected {size} numbers") from None
+    if found.shape != shape:
+        sizes = " × ".join(map(str, found.shape)) or "single"
+        raise InputError(f"found {sizes} numbers; expected {size} numbers")
+    return found
+
+
+class FrameReader:
+    """Reads frames from lines of text: JSON objects, or a table whose header is the first line.
+
+    Parameters
+    ----------
+    grasps : sequence of int
+        Numbers of the grasps that move.
+    names : sequence of str
+        Markers.
+    source : str
+        For messages.
+    """
+
+    def __init__(self, grasps: Sequence[int], names: Sequence[str], source: str = "input") -> None:
+        self.grasps, self.names, self.source = list(grasps), list(names), source
+        self.line = 0
+        self._columns: list[str] | None = None
+
+    def read(self, text: str) -> Frame | None:
+        """The frame in a line; None where it has none.
+
+        Raises
+        ------
+        InputError
+            Naming the line.
+        """
+        self.line += 1
+        text = text.strip()
+        if not text or text.startswith("#"):
+            return None
+        try:
+            if text.startswith("{"):
+                return self._of_object(_parsed(text))
+            return self._of_row([cell.strip() for cell in text.split(",")])
+        except InputError as error:
+            where = f"{self.source}, line {self.line}"
+            raise InputError(f"{where}: {error.message}") from error
+
+    def _of_object(self, found: Mapping[str, Any]) -> Frame:
+        if unknown := [key for key in found if key not in _KEYS]:
+            raise InputError(f"found the key {unknown[0]!r}; expected {', '.join(_KEYS)}")
+        if "t_s" not in found:
+            raise InputError("there is no t_s; expected the time in seconds")
+        pose = as_pose(found.get("pose"), self.grasps)
+        tracks = as_tracks(found.get("markers"), self.names)
+        return Frame(as_time(found["t_s"]), pose, tracks, found.get("wrench") is not None)
+
+    def _of_row(self, cells: list[str]) -> Frame | None:
+        if self._columns is None:
+            self._columns = self._checked(cells)
+            return None
+        if len(cells) != len(self._columns):
+            raise InputError(f"{len(cells)} cells; expected {len(self._columns)}")
+        by_name = dict(zip(self._columns, map(_cell, cells), strict=True))
+        poses = [self._pose_of(by_name, number) for number in self.grasps]
+        pose = None if any(one is None for one in poses) else as_pose(_alone(poses), self.grasps)
+        tracks = [[by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")] for m in self.names]
+        return Frame(as_time(by_name["t_s"]), pose, as_tracks(tracks, self.names))
+
+    def _pose_of(self, by_name: Mapping[str, float], number: int) -> Pose | None:
+        values = [by_name[name] for name in self._pose_columns(number)]
+        return None if np.isnan(values).any() else (values[:3], values[3:])
+
+    def _pose_columns(self, number: int) -> list[str]:
+        before = "" if len(self.grasps) == 1 else f"{number}."
+        return [before + name for name in POSE_COLUMNS]
+
+    def _checked(self, columns: list[str]) -> list[str]:
+        needed = ["t_s", *(name for k in self.grasps for name in self._pose_columns(k))]
+        if missing := [name for name in needed if name not in columns]:
+            raise InputError(
+                f"neither a JSON object nor a header with the column {missing[0]!r}; "
+                f"expected {', '.join(needed)} and the markers' columns"
+            )
+        known = {*needed, *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z"))}
+        if unknown := [name for name in columns if name not in known]:
+            raise InputError(f"a column {unknown[0]!r}; expected {', '.join(sorted(known))}")
+        return columns
+
+
+def _alone(poses: list[Pose]) -> Pose:
+    return poses[0] if len(poses) == 1 else poses
+
+
+def _parsed(text: str) -> Mapping[str, Any]:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"no JSON: {error.msg} at column {error.colno}") from error
+
+
+def as_time(given: Any) -> float:
+    """A time [s]; an `InputError` for what is none."""
+    number = isinstance(given, (int, float, np.number)) and not isinstance(given, bool)
+    if not number or not np.isfinite(given):
+        raise InputError(f"t_s is {given!r}; expected a finite number of seconds")
+    return float(given)
+
+
+def _cell(text: str) -> float:
+    if text == "" or text.lower() == "nan":
+        return float("nan")
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"found {text!r}; expected a number") from None

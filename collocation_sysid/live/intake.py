@@ -1,0 +1,183 @@
+"""From frames, as they come, to rows of the time grid.
+
+The grid is the problem's, from the first frame on. Rows that no frame is at (substeps, frames that
+are missing or between) take the poses from a polynomial through the last four frames, or straight
+between two where more than a few are missing. Nothing waits: a row is there as soon as a pose at
+its time or later is. Markers are read where their own times are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import Array
+from ..experiment.clock import TIME_TOLERANCE_S
+from .model import Poses
+from .sweep import LATEST, LoggedRow, Reading, lagrange
+
+# Frames this near in time, in samples, are of one time.
+TOLERANCE = 0.1
+# Poses between frames are cubic over so few samples, straight over more, and beyond the second
+# nothing is known of the motion.
+FEW, LONGEST = 3, 10
+
+
+@dataclass(eq=False)
+class Intake:
+    """Frames that have come.
+
+    Attributes
+    ----------
+    interval_s : float
+        Of samples.
+    substeps : int
+    around : int
+        Samples before and after one that its reading needs.
+    counts : Counter
+        Of what was wrong with frames.
+    """
+
+    interval_s: float
+    substeps: int
+    around: int
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget all frames."""
+        self.start_s: float | None = None
+        self.rows = 0
+        self.last_s = -np.inf
+        self._times: deque[float] = deque(maxlen=8 * LATEST)
+        self._poses: deque[tuple[float, Array, Array]] = deque(maxlen=4)
+        self._waiting: list[tuple[float, Array]] = []
+        self._too_late = 0
+
+    @property
+    def last_pose_s(self) -> float | None:
+        """When the last pose was."""
+        return self._poses[-1][0] if self._poses else None
+
+    def is_lost(self, t_s: float) -> bool:
+        """Whether a time is so long after the last pose that nothing is known of the motion.
+
+        So it is where many frames in turn are too late: their clock was set back.
+        """
+        if self._too_late >= LONGEST:
+            return True
+        gone_s = t_s - (t_s if self.last_pose_s is None else self.last_pose_s)
+        return gone_s > (LONGEST + TOLERANCE) * self.interval_s
+
+    def take(
+        self, t_s: float, pose: tuple[Array, Array] | None, tracks_m: Array
+    ) -> tuple[list[LoggedRow], list[Reading], list[str]]:
+        """The rows a frame completes, what can be read after the last row, and what was odd.
+
+        Parameters
+        ----------
+        t_s : float
+        pose : positions (G, 3) and quaternions (G, 4) of the grasps that move; None where missing
+        tracks_m : (M, 3), NaN where missing
+        """
+        sample_s, said = self.interval_s, []
+        if any(abs(t_s - other) <= TOLERANCE * sample_s for other in self._times):
+            self.counts["doubled"] += 1
+            return [], [], [f"a frame at {t_s:.6g} s has come already: left out"]
+        late = t_s < self.last_s
+        if late:
+            if self.last_s - t_s > LATEST * sample_s:
+                self.counts["late"] += 1
+                self._too_late += 1
+                return [], [], [f"the frame of {t_s:.6g} s is too late: left out"]
+            self.counts["unordered"] += 1
+            said.append(f"the frame of {t_s:.6g} s is late: its markers count, its pose does not")
+        self._too_late = 0
+        self._times.append(t_s)
+        begun = self.start_s is not None or pose is not None
+        if begun and not self.is_lost(t_s) and np.isfinite(tracks_m).any():
+            self._waiting.append((t_s, tracks_m))
+        if not late:
+            said += self._gap(t_s)
+            self.last_s = t_s
+            if pose is not None:
+                self._add_pose(t_s, *pose)
+            else:
+                self.counts["without a pose"] += 1
+        rows = self._due()
+        return rows, self._ready() if not rows else [], said
+
+    def _gap(self, t_s: float) -> list[str]:
+        if not np.isfinite(self.last_s):
+            return []
+        missing = round((t_s - self.last_s) / self.interval_s) - 1
+        off = (t_s - self.start_s) / self.interval_s if self.start_s is not None else 0.0
+        said = []
+        if missing > 0:
+            self.counts["dropped"] += missing
+            said.append(f"{missing} frames before {t_s:.6g} s are missing: bridged")
+        if abs(off - round(off)) > TOLERANCE:
+            if not self.counts["off the grid"]:
+                said.append(f"the frame of {t_s:.6g} s lies between samples: such are read there")
+            self.counts["off the grid"] += 1
+        return said
+
+    def _add_pose(self, t_s: float, positions_m: Array, quaternions: Array) -> None:
+        if self._poses:
+            before = self._poses[-1][2]
+            signs = np.where(np.sum(quaternions * before, axis=1) < 0, -1.0, 1.0)
+            quaternions = quaternions * signs[:, None]
+        elif self.start_s is None:
+            self.start_s = t_s
+        self._poses.append((t_s, positions_m, quaternions))
+
+    def _time_s(self, row: int) -> float:
+        assert self.start_s is not None
+        return self.start_s + row * self.interval_s / self.substeps
+
+    def _due(self) -> list[LoggedRow]:
+        """The rows that there are poses for."""
+        found: list[LoggedRow] = []
+        if self.start_s is None:
+            return found
+        until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
+        while self._time_s(self.rows) <= until_s:
+            poses = self._poses_at(self._time_s(self.rows))
+            self.rows += 1
+            found.append(LoggedRow(poses, self._ready()))
+        return found
+
+    def _poses_at(self, t_s: float) -> Poses:
+        for at_s, positions_m, quaternions in self._poses:
+            if abs(at_s - t_s) <= TIME_TOLERANCE_S:
+                turns = Rotation.from_quat(quaternions).as_matrix()
+                return tuple(zip(turns, positions_m, strict=True))
+        times = np.array([each[0] for each in self._poses])
+        gaps = np.diff(times)
+        used = len(times)
+        if len(gaps) and gaps.max() > (FEW + TOLERANCE) * self.interval_s:
+            used = 2
+        weights = lagrange(times[-used:], t_s)
+        known = list(self._poses)[-used:]
+        positions = np.tensordot(weights, [p for _, p, _ in known], 1)
+        quaternions = np.tensordot(weights, [q for _, _, q in known], 1)
+        turns = Rotation.from_quat(quaternions).as_matrix()
+        return tuple(zip(turns, positions, strict=True))
+
+    def _ready(self) -> list[Reading]:
+        """What can be read after the rows there are."""
+        if self.start_s is None or not self.rows:
+            return []
+        now_s = self._time_s(self.rows - 1)
+        step_s = self.interval_s / self.substeps
+        latest_s = now_s - self.around * self.interval_s + TOLERANCE * self.interval_s
+        ready = [each for each in self._waiting if each[0] <= latest_s]
+        self._waiting = [each for each in self._waiting if each[0] > latest_s]
+        # Before the first row nothing is known.
+        ready = [each for each in ready if each[0] >= self.start_s - TOLERANCE * self.interval_s]
+        return [Reading((now_s - t_s) / step_s, tracks) for t_s, tracks in ready]

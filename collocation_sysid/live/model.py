@@ -1,0 +1,237 @@
+"""What a problem says of a recording that is still being made.
+
+A short still recording of the same body, grasps and markers stands for every recording: its first
+rows have the stencils of the start, and its last row those of all later ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import Array, Index
+from ..errors import InputError
+from ..experiment.experiment import Experiment
+from ..experiment.poses import PoseSequence
+from ..methods.scan import usual_parameters
+from ..nlp.collocation import Collocation
+from ..nlp.observation import NEIGHBOURS, Observation
+from ..nlp.segment import Segment
+from ..nlp.tangent import BlockSolver
+from ..problem import Problem
+
+# Young's modulus that a search without a guess begins at.
+MIDDLE_PA = 1e4
+
+# Of each grasp, its rotation (3, 3) and its translation (3,).
+Poses = tuple[tuple[Array, Array], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A problem whose recording comes frame by frame.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        The one that is fitted, as the problem has it.
+    collocation : Collocation
+        Of the still recording.
+    """
+
+    experiment: Experiment
+    collocation: Collocation
+
+    @classmethod
+    def of(cls, problem: Problem) -> Model:
+        """The model of a problem.
+
+        Raises
+        ------
+        InputError
+            Where what the problem has cannot be live, in words.
+        """
+        experiment = _only_experiment(problem)
+        collocation = problem.collocation()
+        if collocation.parameters.unguessed:
+            usual = usual_parameters(collocation.parameters, MIDDLE_PA)
+            collocation = replace(collocation, parameters=usual)
+        still = replace(collocation, experiments=[_still(experiment, collocation)])
+        return cls(experiment, still)
+
+    def at_start(self, poses: Poses, phi: Array) -> Experiment:
+        """The experiment that begins with its grasps at these poses, as φ has it."""
+        still = self.segment.experiment
+        corrected = self.segment.corrected(phi)
+        held = _held_at(still, poses)
+        if self.segment.nuisance.moves_grasps:
+            motion = self.segment.nuisance.in_grasp(phi)
+            held = [replace(grasp, poses=grasp.poses.after(motion)) for grasp in held]
+        return replace(corrected, grasps=held)
+
+    def placed(self, tracks_m: Array, x: Array) -> Model:
+        """The same with unknown places where markers (M, 3) lie on the start x (3n,)."""
+        unknown = ~self.segment.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
+        if not unknown.any():
+            return self
+        places_m = self.segment.places_m(self.segment.guess_phi)
+        nodes_m = x.reshape(-1, 3)
+        places_m[unknown] = self.segment.chart.at_markers(nodes_m, tracks_m[unknown])
+        return replace(self, collocation=self.collocation.placed_at([places_m]))
+
+    @cached_property
+    def segment(self) -> Segment:
+        """The still recording."""
+        return self.collocation.segments[0]
+
+    @cached_property
+    def solver(self) -> BlockSolver:
+        """Of its rows."""
+        return BlockSolver(self.segment, self.rows)
+
+    @cached_property
+    def rows(self) -> int:
+        """Rows of the start, and one more."""
+        return 2 * self.segment.dynamics.reach + 3
+
+    @property
+    def size(self) -> int:
+        """Number of parameters p."""
+        return self.collocation.nq + self.collocation.nphi
+
+    @property
+    def substeps(self) -> int:
+        """Rows between samples."""
+        return self.collocation.substeps
+
+    @property
+    def interval_s(self) -> float:
+        """Time between samples."""
+        return self.experiment.timestep_s
+
+    @cached_property
+    def samples_around(self) -> int:
+        """Samples before and after one that its reading needs."""
+        return NEIGHBOURS // 2 if len(self.segment.nuisance.places("time")) else 0
+
+    @property
+    def reads_plainly(self) -> bool:
+        """Whether a marker is read as it is, at its place on the body, if by another clock."""
+        return not len(self.segment.nuisance.places("turn", "shift", "offset"))
+
+    @cached_property
+    def observation(self) -> Observation:
+        """Reads one sample, in the middle, of markers measured at the origin."""
+        around, markers = self.samples_around, self.segment.experiment.markers
+        count = 2 * around + 1
+        t_s = markers.t_s[:count]
+        origin = replace(markers, t_s=t_s, positions_m=np.zeros((count, len(markers.names), 3)))
+        return Observation(origin, np.arange(count), self.segment.nuisance, self.segment.chart)
+
+    @cached_property
+    def moved_grasps(self) -> Index:
+        """Numbers of the grasps whose poses come with the frames; others never move."""
+        grasps = self.experiment.grasps
+        return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
+
+    @cached_property
+    def first_poses(self) -> Poses:
+        """Those of all grasps that the problem's recording begins with."""
+        return _first_poses(self.experiment)
+
+    def poses_of(self, moved: Poses) -> Poses:
+        """Those of all grasps from those that move."""
+        still = list(self.first_poses)
+        for number, pose in zip(self.moved_grasps, moved, strict=True):
+            still[number] = pose
+        return tuple(still)
+
+    def carried(self, phi: Array) -> tuple[Array, Array]:
+        """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
+        segment, nuisance = self.segment, self.segment.nuisance
+        nodes, place = np.unique(segment.grasping.dofs // 3, return_inverse=True)
+        moved, by_own = nuisance.carried(segment.body.nodes_m[nodes], phi)
+        slopes = np.zeros((*moved.shape, len(nuisance.moving)))
+        slopes[..., np.flatnonzero(np.isin(nuisance.moving, nuisance.of_grasps))] = by_own
+        return moved[place], slopes[place]
+
+    def goals(self, carried: tuple[Array, Array], poses: Poses) -> tuple[Array, Array]:
+        """Where grasped dofs are at some poses, (g,), and the slopes by the φ that move them."""
+        dofs = self.segment.grasping.dofs
+        turns, shifts = np.zeros((len(dofs), 3)), np.zeros(len(dofs))
+        for grasp, (turn, shift) in zip(self.experiment.grasps, poses, strict=True):
+            place, axis = np.searchsorted(dofs, grasp.dofs), grasp.dofs % 3
+            turns[place], shifts[place] = turn[axis], shift[axis]
+        goal = np.einsum("gj,gj->g", turns, carried[0]) + shifts
+        return goal, np.einsum("gj,gjm->gm", turns, carried[1])
+
+
+def _only_experiment(problem: Problem) -> Experiment:
+    fitted = [each for each in problem.experiments if not each.validation]
+
+    def refused(found: str, expected: str) -> InputError:
+        where = f"experiment '{fitted[0].name}'"
+        return InputError(f"{found} cannot be live; expected {expected}", problem.path, where)
+
+    if len(fitted) != 1:
+        raise InputError(
+            f"{len(fitted)} experiments are fitted; live there is one, expected the others to be "
+            "left out or for validation",
+            problem.path,
+            "experiment",
+        )
+    (experiment,) = fitted
+    if experiment.static:
+        raise refused("a static experiment", "a motion")
+    if experiment.start == "given":
+        raise refused("a start that is given", "one in equilibrium, or undeformed")
+    if experiment.body.remembers:
+        raise refused("a material with memory", "one without Prony branches")
+    if experiment.actuators:
+        raise refused("tensions and pressures, which frames do not bring,", "none")
+    if not experiment.markers.names:
+        raise refused("an experiment without markers", "markers")
+    if any(np.isfinite([g.from_s, g.until_s]).any() for g in experiment.grasps):
+        raise refused("a grasp that holds for a while only", "grasps throughout")
+    if any(grasp.zero for grasp in experiment.grasps):
+        raise refused("a grasp whose zero is estimated", "one whose zero is known")
+    if not any(len(grasp.poses.t_s) > 1 for grasp in experiment.grasps):
+        raise refused("an experiment whose grasps never move", "a pose that moves")
+    for loads in (experiment.tied_mass_kg, experiment.node_forces_n):
+        found = loads(experiment.t_s)
+        if not np.allclose(found, found[:1]):
+            raise refused("a load that joins, leaves or changes", "loads that are always there")
+    return experiment
+
+
+def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
+    """A few samples in which nothing moves."""
+    reach = collocation.segments[0].dynamics.reach
+    # The rows of the start, and room for a reading.
+    count = max(2 * reach + 3, NEIGHBOURS, 3)
+    t_s = experiment.timestep_s * np.arange(count)
+    markers = experiment.markers
+    first, _ = markers.first_samples
+    tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
+    return replace(
+        experiment,
+        t_s=t_s,
+        grasps=[replace(g, wrench=None) for g in _held_at(experiment, _first_poses(experiment))],
+        markers=replace(markers, t_s=t_s, positions_m=tracks),
+    )
+
+
+def _first_poses(experiment: Experiment) -> Poses:
+    found = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
+    return tuple((turns[0], shifts[0]) for turns, shifts in found)
+
+
+def _held_at(experiment: Experiment, poses: Poses) -> list:
+    found = []
+    for grasp, (turn, shift) in zip(experiment.grasps, poses, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn, shift
+        found.append(replace(grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])))
+    return found

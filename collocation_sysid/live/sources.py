@@ -1,0 +1,111 @@
+"""Where frames come from: lines of a stream, datagrams on this machine, or a recording."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from ..experiment.experiment import Experiment
+from ..files import read_json
+from ..output.replay import reading_run
+from ..problem import Problem
+from .estimator import Update
+from .frames import Frame
+from .model import Model
+
+# Largest datagram, and this machine's own address: nobody else is listened to.
+DATAGRAM_BYTES, HERE = 65536, "127.0.0.1"
+
+
+def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
+    """Lines that come as UDP datagrams to a port of this machine, until an empty one comes.
+
+    Parameters
+    ----------
+    port : int
+        Any free one where it is 0.
+    opened : callable, optional
+        Called with the port once it is open.
+
+    Raises
+    ------
+    OSError
+        Where the port is taken.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind((HERE, port))
+        if opened is not None:
+            opened(receiver.getsockname()[1])
+        while datagram := receiver.recv(DATAGRAM_BYTES):
+            yield from datagram.decode("utf-8", errors="replace").splitlines()
+
+
+def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
+    """The problem of a file, or the one that a run's folder is of.
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    if not recording.is_dir():
+        return Problem.read(recording, overrides, allow_code)
+    result = read_json(recording / "result.json", "a run folder")
+    with reading_run(recording):
+        origin = result["provenance"]["problem_file"]
+    if origin is None:
+        raise InputError("the run is of no problem file, which a replay needs", recording)
+    file, home = recording / "problem.toml", Path(origin).parent
+    return Problem.read(file, overrides, allow_code, folder=home)
+
+
+def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:
+    """The frames of an experiment's recording."""
+    moved = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moved_grasps]
+    turns = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in moved]
+    for k, t_s in enumerate(experiment.t_s):
+        positions_m = np.array([translations[k] for _, translations in moved])
+        quaternions = np.array([each[k] for each in turns])
+        yield Frame(float(t_s), (positions_m, quaternions), experiment.markers.positions_m[k])
+
+
+def paced(
+    frames: Iterator[Frame],
+    rate_hz: float,
+    clock: Callable[[], float] = time.monotonic,
+    wait: Callable[[float], None] = time.sleep,
+) -> Iterator[Frame]:
+    """Frames at a rate; where they are taken too slowly, the next ones come at once."""
+    began = clock()
+    for number, frame in enumerate(frames):
+        left_s = began + number / rate_hz - clock()
+        if left_s > 0:
+            wait(left_s)
+        yield frame
+
+
+def as_json(update: Update) -> str:
+    """A line that tells an update; what is not known is null."""
+    parameters = {
+        name: {"value": each.value, "std_error": each.std_error, "ci95": each.ci95}
+        for name, each in update.estimates.items()
+    }
+    rms_m = update.marker_rms_m
+    return json.dumps(
+        {
+            "t_s": update.t_s,
+            "parameters": parameters,
+            "trust": {"verdict": update.trust.verdict, "reasons": update.trust.reasons},
+            "marker_rms_m": rms_m if np.isfinite(rms_m) else None,
+            "latency_s": round(update.latency_s, 6),
+            "notes": update.notes,
+        },
+        ensure_ascii=False,
+    )

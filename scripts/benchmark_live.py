@@ -1,0 +1,131 @@
+"""Latency of live estimates, and how far they end from the batch's answer.
+
+Streams table1's size (171 nodes, with noise of sigma_m) and foam_cylinder at 100 Hz. Times are the
+processor's, of this process, which other work on the machine does not lengthen much; the yardstick
+beside them is the time that one row takes in a sweep of the whole recording at once.
+
+    python scripts/benchmark_live.py
+    python scripts/benchmark_live.py --frames 360000 --problem foam_cylinder   # an hour
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from collocation_sysid.live import Estimator, Frame, LiveOptions
+from collocation_sysid.live.sources import recorded
+from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.problem import Problem
+from collocation_sysid.run import solve
+from collocation_sysid.statistics.uncertainty import covariance
+
+PROBLEMS = Path(__file__).parent.parent / "problems"
+# Standard deviation of the noise that is added, and of the truth.
+NOISE_M = {"table1": 1e-3, "foam_cylinder": 0.0}
+TRUTH = {
+    "table1": {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0},
+    "foam_cylinder": {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5},
+}
+EARLY_S = 0.3
+SWEEPS = 5
+
+
+def main() -> None:
+    """Stream the problems and print what was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--problem", choices=[*TRUTH], action="append")
+    parser.add_argument("--rows", type=int, help="passed again a frame, in place of a budget")
+    parser.add_argument("--budget-ms", type=float)
+    parser.add_argument("--frames", type=int, help="stream to and fro for so many")
+    arguments = parser.parse_args()
+    budget_s = None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
+    options = LiveOptions(budget_s=budget_s, rows=arguments.rows)
+    for name in arguments.problem or TRUTH:
+        problem = _noisy(name)
+        live = Estimator(problem, options, time.thread_time)
+        frames = list(recorded(problem.experiments[0], live.model))
+        if arguments.frames:
+            _endless(name, live, frames, arguments.frames)
+        else:
+            _compared(name, problem, live, frames)
+
+
+def _noisy(name: str) -> Problem:
+    problem = Problem.read(PROBLEMS / name / "problem.toml")
+    (experiment,) = problem.experiments
+    tracks = experiment.markers.positions_m
+    noise = np.random.default_rng(0).normal(scale=NOISE_M[name] or 1.0, size=tracks.shape)
+    tracks = tracks + noise * bool(NOISE_M[name])
+    seen = replace(experiment, markers=replace(experiment.markers, positions_m=tracks))
+    return Problem([seen], problem.parameters, scheme=problem.scheme, substeps=problem.substeps)
+
+
+def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame]) -> None:
+    took, again = [], []
+    for frame in frames:
+        update = live.take(frame)
+        took.append(update.latency_s)
+        again.append(update.relinearised)
+        if abs(frame.t_s - EARLY_S) < 1e-6:
+            early = update
+    row_s = _row_s(problem)
+    median, late = 1e3 * np.percentile(took, [50, 99])
+    print(f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again")
+    print(f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms")
+    print(
+        f"    a row of the batch's sweep {1e3 * row_s:.2f} ms: {1e-3 * median / row_s:.1f} of these"
+    )
+    solution = solve(problem, ReducedSpace())
+    batch = covariance(solution.collocation, solution.z).estimates
+    for key, true in TRUTH[name].items():
+        found, known = update.estimates[key], batch[key]
+        apart = abs(found.value - known.value) / (known.std_error or np.nan)
+        off = 100 * (early.estimates[key].value / true - 1)
+        error = known.std_error or np.nan
+        print(
+            f"    {key}: {found.value:.5g}, batch {known.value:.5g} ± {error:.2g}: "
+            f"{apart:.3f} standard errors apart; {off:+.1f} % from the truth at {EARLY_S:g} s"
+        )
+    print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
+
+
+def _row_s(problem: Problem) -> float:
+    """Processor time of a row in a sweep of the whole recording, the least of some."""
+    collocation = problem.collocation()
+    rows = collocation.segments[0].grid_rows
+    horizon, found = Horizon(collocation, [rows]), []
+    x, _ = horizon.extend(collocation.guess_p)
+    for _ in range(SWEEPS):
+        began = time.thread_time()
+        horizon.evaluate(collocation.guess_p, x)
+        found.append((time.thread_time() - began) / rows)
+    return min(found)
+
+
+def _to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
+    there_and_back = [*frames, *frames[-2:0:-1]]
+    interval_s = frames[1].t_s - frames[0].t_s
+    for k in count():
+        yield replace(there_and_back[k % len(there_and_back)], t_s=k * interval_s)
+
+
+def _endless(name: str, live: Estimator, frames: list[Frame], wanted: int) -> None:
+    """The poses there and back again, with markers that stay behind: memory is what counts."""
+    for k, frame in zip(range(wanted), _to_and_fro(frames), strict=False):
+        live.take(frame)
+        if k in (999, wanted - 1) or (k + 1) % max(1, wanted // 10) == 0:
+            used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            print(f"{name}: {k + 1} frames, {len(live.log)} rows kept, {used_mb:.0f} MB at most")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,500 @@
+"""Estimates frame by frame: the batch's information, its answer, and what frames may lack."""
+
+from __future__ import annotations
+
+import io
+import json
+import socket
+import sys
+import threading
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from problem_files import run_command
+from problems_small import GUESS, IDEAL, TRUTH, hung_cube
+from scipy.optimize import lsq_linear
+from scipy.spatial.transform import Rotation
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Nuisance, PoseSequence
+from collocation_sysid.live import (
+    Estimator,
+    Frame,
+    FrameReader,
+    LiveOptions,
+    Update,
+    estimator,
+    sweep,
+)
+from collocation_sysid.live.information import Information
+from collocation_sysid.live.intake import Intake
+from collocation_sysid.live.sources import as_json, datagrams, paced, recorded
+from collocation_sysid.live.track import Track
+from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.statistics.uncertainty import covariance
+
+NOISE_M = 3e-4
+# No time to pass anything again.
+NO_TIME = LiveOptions(budget_s=1e-9)
+
+
+@cache
+def swing(steps: int = 36, nuisance: Nuisance = IDEAL, seed: int = 1) -> cs.Problem:
+    """A cube swung by its top, seen with noise, described rightly."""
+    hung = hung_cube(steps, nuisance=nuisance)
+    tracks = cs.simulate(hung, TRUTH, integrator="midpoint").markers_m
+    noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
+    seen = cs.with_markers(hung, tracks + noise)
+    seen = replace(seen, markers=replace(seen.markers, sigma_m=NOISE_M))
+    return cs.Problem([seen], GUESS)
+
+
+def frames_of(problem: cs.Problem, live: Estimator) -> list[Frame]:
+    return list(recorded(problem.experiments[0], live.model))
+
+
+def with_time_every(count: int, live: Estimator, frames: list[Frame]) -> Update:
+    """Take frames, and at every so manieth all the passes that are wanted."""
+    for number, frame in enumerate(frames, start=1):
+        live.budget_s = 1e-9 if number % count else np.inf
+        update = live.take(frame)
+    return update
+
+
+def normal_equations(triangle: np.ndarray) -> np.ndarray:
+    return triangle.T @ triangle
+
+
+@pytest.mark.parametrize("nuisance", [IDEAL, Nuisance()], ids=["ideal", "as in a laboratory"])
+def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
+    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    problem, count = swing(nuisance=nuisance), 30
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live)[:count]:
+        live.take(frame)
+    collocation = problem.collocation()
+    horizon, p = Horizon(collocation, [count], prior=estimator.WEAK), collocation.guess_p
+    x, failure = horizon.extend(p)
+    assert failure is None
+    point = horizon.evaluate(
+        p, [a + b.step for a, b in zip(x, horizon.evaluate(p, x).tangents, strict=False)]
+    )
+    rows = np.column_stack([point.slope, point.residual - point.slope @ p])
+    batch = rows.T @ rows
+    ours = normal_equations(live.track.information.triangle)
+    scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
+    np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
+    assert live.track.information.rows == len(rows)
+
+
+def test_passes_end_where_the_batch_does():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    *most, last = frames_of(problem, live)
+    for frame in most:
+        live.take(frame)
+    live.budget_s = np.inf
+    update = live.take(last)
+    solution = cs.solve(problem, ReducedSpace())
+    batch = covariance(solution.collocation, solution.z).estimates
+    for name, estimate in update.estimates.items():
+        known = batch[name]
+        assert abs(estimate.value - known.value) < 0.1 * known.std_error
+        assert estimate.std_error == pytest.approx(known.std_error, rel=0.1)
+    assert update.trust.verdict == "good", update.trust.reasons
+    assert update.relinearised > 0
+
+
+def test_an_update_of_the_triangle_is_the_sum_of_the_normal_equations(rng):
+    p, parts = rng.normal(size=3), [(rng.normal(size=5), rng.normal(size=(5, 3))) for _ in "ab"]
+    separate = [Information.none(3).with_rows(r, s, p) for r, s in parts]
+    joined = separate[0].joined(separate[1])
+    expected = sum(normal_equations(each.triangle) for each in separate)
+    np.testing.assert_allclose(normal_equations(joined.triangle), expected, atol=1e-12)
+    residual = np.concatenate([r for r, _ in parts])
+    assert joined.loss(p) == pytest.approx(residual @ residual)
+    slope = np.vstack([s for _, s in parts])
+    best = p - np.linalg.lstsq(slope, residual, rcond=None)[0]
+    wide = np.full(3, 1e3)
+    np.testing.assert_allclose(joined.best(-wide, wide), best, atol=1e-10)
+    np.testing.assert_allclose(joined.covariance, np.linalg.inv(slope.T @ slope), atol=1e-10)
+
+
+def test_the_best_between_bounds_is_that_of_bounded_least_squares(rng):
+    for _ in range(20):
+        slope, residual = rng.normal(size=(9, 6)), rng.normal(size=9)
+        known = Information.none(6).with_rows(residual, slope, np.zeros(6))
+        lower, upper = -rng.uniform(0.01, 0.3, 6), rng.uniform(0.01, 0.3, 6)
+        expected = lsq_linear(slope, -residual, (lower, upper), method="bvls", tol=1e-14).x
+        np.testing.assert_allclose(known.best(lower, upper), expected, atol=1e-7)
+
+
+def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
+    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    problem = swing(nuisance=Nuisance())
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live):
+        live.take(frame)
+    track, log, whole = live.track, list(live.log), live.track.information
+    left = track.drop_oldest()
+    assert 0 < left < len(log)
+    assert track.information is whole
+    again = Track(live.model, track.p, track.prior, live._block_rows, track)
+    for row in log[left:]:
+        again.again(row)
+    before, after = (normal_equations(each.triangle) for each in (whole, again.information))
+    scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
+    np.testing.assert_allclose(after / scale, before / scale, atol=1e-8)
+
+
+def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(monkeypatch):
+    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    problem = swing(nuisance=Nuisance())
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live):
+        live.take(frame)
+    way = np.full(len(live.p), 1.0)
+    errors = []
+    for size in (1e-3, 5e-4):
+        p = live.track.p + size * way
+        whole = Track(live.model, p, live.prior, live._block_rows)
+        state = live.track.blocks[1]
+        part = sweep.Sweep(live.model, p, live.prior, state.start, state.at)
+        for number, row in enumerate(live.log):
+            whole.advance(row.poses)
+            if number >= live._block_rows:
+                kept = part.advance(row.poses)
+        errors.append(np.abs(kept.x - whole.blocks[-1].kept[-1].x).max())
+    assert errors[1] < 0.3 * errors[0] < 1e-5  # of second order
+
+
+def test_a_stiffness_that_is_wrong_by_ten_is_found():
+    problem = swing()
+    far = GUESS.with_guess({"lambda_pa": 4000.0, "mu_pa": 3000.0})
+    live = Estimator(cs.Problem(problem.experiments, far), NO_TIME)
+    update = with_time_every(6, live, frames_of(problem, live))
+    assert update.estimates["mu_pa"].value == pytest.approx(TRUTH["mu_pa"], rel=0.1)
+
+
+def test_parameters_without_a_guess_are_sought():
+    problem = swing()
+    free = {name: cs.Unknown() for name in ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")}
+    live = Estimator(cs.Problem(problem.experiments, free), NO_TIME)
+    assert live.search is not None
+    update = with_time_every(6, live, frames_of(problem, live))
+    assert live.search is None
+    assert update.estimates["young_pa"].value == pytest.approx(780.0, rel=0.2)
+
+
+# What frames may lack -------------------------------------------------------------------------
+
+
+def test_doubled_late_unordered_and_dropped_frames_are_told_and_change_little():
+    problem = swing()
+    whole, live = Estimator(problem, NO_TIME), Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for frame in frames:
+        expected = whole.take(frame)
+    order = [*range(12), 11, 13, 12, *range(14, 20), *range(22, 37), 5]
+    notes = [note for k in order for note in live.take(frames[k]).notes]
+    assert live.counts["doubled"] == 1 + 1  # one twice, and one long ago that was there
+    assert live.counts["unordered"] == 1
+    assert live.counts["dropped"] == 1 + 2  # one of them came late
+    assert any("bridged" in note for note in notes)
+    assert any("late" in note for note in notes)
+    assert live.track.rows == whole.track.rows
+    for name, estimate in live._estimates_at(live.track, live.p).items():
+        error = expected.estimates[name].std_error
+        if error is not None:
+            assert abs(estimate.value - expected.estimates[name].value) < 2 * error
+
+
+def test_a_frame_that_is_too_late_is_left_out():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for frame in frames[:10] + frames[11:30]:
+        live.take(frame)
+    rows = live.track.information.rows
+    update = live.take(frames[10])
+    assert "too late" in update.notes[0]
+    assert live.counts["late"] == 1
+    assert live.track.information.rows == rows
+
+
+def test_missing_markers_say_nothing():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    for seen, frame in enumerate(frames_of(problem, live)):
+        tracks = frame.tracks_m.copy()
+        if seen % 3:
+            tracks[: 1 + seen % 2] = np.nan
+        before = live.track.information.rows if live.track else live.prior.rows
+        live.take(replace(frame, tracks_m=tracks))
+        found = live.track.information.rows - before
+        assert found == np.isfinite(tracks).sum()
+
+
+def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    blind = [replace(frame, pose=None) for frame in frames]
+    for frame in [*frames[:10], *blind[10:13], frames[13]]:
+        update = live.take(frame)
+    assert live.track.rows == 14
+    assert live.track.information.rows == live.prior.rows + 14 * frames[0].tracks_m.size
+    for frame in blind[14:30]:
+        update = live.take(frame)
+    assert update.trust.verdict == "doubtful"
+    assert "grasp is lost" in update.trust.reasons[0]
+    known = live.track.information
+    update = live.take(frames[30])
+    assert "begun anew" in update.notes[0]
+    assert live.track.rows == 1
+    assert live.track.prior is known
+    assert update.trust.verdict != "good"
+
+
+def test_frames_whose_clock_was_set_back_begin_anew():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for frame in frames[:20]:
+        live.take(replace(frame, t_s=frame.t_s + 100.0))
+    notes = [note for frame in frames[:20] for note in live.take(frame).notes]
+    assert sum("too late" in note for note in notes) == 10
+    assert live.counts["begun anew"] == 1
+    assert live.track.rows == 10
+
+
+def test_markers_without_poses_are_not_kept():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for k in range(40):
+        update = live.take(replace(frames[0], t_s=-1.0 + 0.01 * k, pose=None))
+        assert update.trust.verdict == "doubtful"
+        assert not live.intake._waiting
+    live.take(frames[0])
+    for k in range(1, 40):
+        live.take(replace(frames[0], t_s=0.01 * k, pose=None))
+    assert len(live.intake._waiting) <= 10
+
+
+def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
+    problem = swing()
+    live = Estimator(problem)
+    first = frames_of(problem, live)[0]
+    noise = np.random.default_rng(3)
+    for k in range(12):
+        tracks = first.tracks_m + noise.normal(scale=NOISE_M, size=first.tracks_m.shape)
+        update = live.take(replace(first, t_s=0.01 * k, tracks_m=tracks))
+    damping = update.estimates["gamma_r_s"]
+    assert damping.std_error is None
+    assert damping.ci95[1] > 100 * damping.ci95[0]
+    assert update.trust.verdict != "good"
+    assert any("gamma_r_s is not known yet" in reason for reason in update.trust.reasons)
+
+
+def test_a_track_that_jumps_is_left_out():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    frames = frames_of(problem, live)
+    for frame in frames[:29]:
+        live.take(frame)
+    live.budget_s = np.inf
+    live.take(frames[29])
+    jumped = frames[30].tracks_m.copy()
+    jumped[2] += 0.02
+    update = live.take(replace(frames[30], tracks_m=jumped))
+    name = live.names[2]
+    assert any(f"left out, far from where they can be: {name}" in note for note in update.notes)
+    assert live.counts["wild"] == 1
+
+
+def test_frames_between_samples_are_read_there():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    x = problem.experiments[0].grasps[0].poses
+    for t_s in np.arange(0.0, 0.2, 0.004):
+        turns, shifts = x.at([t_s])
+        pose = (shifts[0], Rotation.from_matrix(turns[0]).as_quat())
+        update = live.update(t_s, pose, {live.names[0]: [0.0, 0.0, 0.0]})
+    assert live.counts["off the grid"] > 0
+    assert live.track.rows == 20
+    assert update.t_s == pytest.approx(0.196)
+
+
+def test_rows_between_frames_take_poses_from_a_cubic():
+    intake, t_s = Intake(0.01, 2, 0), 0.01 * np.arange(8)
+
+    def place(t):
+        return np.array([[1 + t - 30 * t**2 + 200 * t**3, 0.0, 0.0]])
+
+    rows = []
+    for k, t in enumerate(t_s):
+        if k != 5:
+            rows += intake.take(t, (place(t), np.array([[0, 0, 0, 1.0]])), np.zeros((1, 3)))[0]
+    found = np.array([row.poses[0][1][0] for row in rows])
+    assert len(found) == 15
+    expected = [place(0.005 * k)[0, 0] for k in range(15)]
+    np.testing.assert_allclose(found[4:], expected[4:], atol=1e-12)
+
+
+def test_memory_is_bounded():
+    problem = swing()
+    live = Estimator(problem, LiveOptions(budget_s=4e-3, window_s=0.2))
+    frames = frames_of(problem, live)
+    period = [*frames, *frames[-2:0:-1]]
+    sizes = []
+    for k in range(90):
+        live.take(replace(period[k % len(period)], t_s=0.01 * k))
+        sizes.append((len(live.log), sum(len(b.kept) + len(b.said) for b in live.track.blocks)))
+    most = 3 * live._blocks * live._block_rows
+    assert max(logged for logged, _ in sizes) <= most
+    assert max(kept for _, kept in sizes) <= 2 * most
+    assert live.track.information.triangle.shape == (len(live.p) + 1,) * 2
+    assert len(live.intake._waiting) <= 4
+    assert len(live.track.sweep.read) <= 30
+
+
+# What cannot be live --------------------------------------------------------------------------
+
+
+def test_problems_that_cannot_be_live_are_refused_in_words():
+    problem = swing()
+    hung = problem.experiments[0]
+    still = replace(hung, grasps=[replace(hung.grasps[0], poses=PoseSequence.fixed())])
+    for changed, said in (
+        ([still], "never move"),
+        ([hung, replace(hung, name="again")], "2 experiments"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Estimator(cs.Problem(changed, GUESS))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (dict(t_s=float("nan"), pose=None, markers=None), "finite"),
+        (dict(t_s=0.0, pose=np.eye(3), markers=None), "4 × 4"),
+        (dict(t_s=0.0, pose=([0, 0, 0], [0, 0, 0, 2]), markers=None), "norm"),
+        (dict(t_s=0.0, pose=None, markers={"nobody": [0, 0, 0]}), "nobody"),
+        (dict(t_s=0.0, pose=None, markers=np.zeros((1, 3))), "expected 9 × 3 numbers"),
+    ],
+)
+def test_what_is_no_frame_is_refused_and_changes_nothing(given, said):
+    live = Estimator(swing(), NO_TIME)
+    with pytest.raises(InputError, match=said):
+        live.update(**given)
+    assert live.track is None
+    assert not live.counts
+
+
+# Text -----------------------------------------------------------------------------------------
+
+
+def test_frames_are_read_from_json_and_from_tables():
+    of_json = FrameReader([1], ["a", "b"])
+    line = {"t_s": 1, "pose": {"position_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1]}}
+    frame = of_json.read(json.dumps(line | {"markers": {"b": [4, 5, 6], "a": None}}))
+    of_rows = FrameReader([1], ["a", "b"])
+    header = "t_s,x_m,y_m,z_m,qx,qy,qz,qw,a_x,a_y,a_z,b_x,b_y,b_z"
+    assert of_rows.read(header) is None
+    same = of_rows.read("1,1,2,3,0,0,0,1,,,,4,5,6")
+    for each in (frame, same):
+        assert each.t_s == 1.0
+        np.testing.assert_array_equal(each.pose[0], [[1, 2, 3]])
+        np.testing.assert_array_equal(each.tracks_m, [[np.nan] * 3, [4, 5, 6]])
+    assert of_rows.read("1.1,,,,,,,,,,,4,5,6").pose is None
+    assert of_json.read('{"t_s": 1.1}').pose is None
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("{nonsense", "line 2: no JSON"),
+        ('{"markers": {}}', "line 2: there is no t_s"),
+        ('{"t_s": 1, "marker": {}}', "line 2: found the key 'marker'"),
+        ('{"t_s": true}', "line 2: t_s is True"),
+        ('{"t_s": 1, "pose": {"position_m": [0, 0, 0]}}', "no quaternion_xyzw"),
+        ('{"t_s": 1, "markers": {"a": [1, 2]}}', "expected 3 numbers"),
+        ("[1, 2]", "neither a JSON object nor a header"),
+    ],
+)
+def test_bad_lines_are_named(line, said):
+    reader = FrameReader([1], ["a"], "input")
+    reader.read("")
+    with pytest.raises(InputError, match=said):
+        reader.read(line)
+
+
+def test_datagrams_are_read_until_an_empty_one():
+    port: list[int] = []
+    ready = threading.Event()
+
+    def opened(number: int) -> None:
+        port.append(number)
+        ready.set()
+
+    found: list[str] = []
+    listener = threading.Thread(target=lambda: found.extend(datagrams(0, opened)))
+    listener.start()
+    assert ready.wait(5)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for text in ("one\ntwo", "three", ""):
+            sender.sendto(text.encode(), ("127.0.0.1", port[0]))
+    listener.join(5)
+    assert found == ["one", "two", "three"]
+
+
+def test_frames_are_paced_and_catch_up_when_late():
+    now, waited = [0.0], []
+
+    def wait(seconds: float) -> None:
+        waited.append(seconds)
+        now[0] += seconds
+
+    for k, _ in enumerate(paced(iter(range(5)), 10.0, lambda: now[0], wait)):
+        now[0] += 0.25 if k == 1 else 0.01
+    np.testing.assert_allclose(waited, [0.09, 0.03], atol=1e-12)
+
+
+def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
+    lines = []
+    problem = cs.Problem.read("problem.toml")
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live):
+        (position,), (quaternion,) = frame.pose
+        pose = {"position_m": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
+        markers = dict(zip(live.names, frame.tracks_m.tolist(), strict=True))
+        lines.append(json.dumps({"t_s": frame.t_s, "pose": pose, "markers": markers}))
+    expected = [json.loads(as_json(live.take(f))) for f in frames_of(problem, live)]
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
+    ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
+    found = [json.loads(line) for line in ended.out.splitlines()]
+    assert [each["t_s"] for each in found] == [each["t_s"] for each in expected]
+    assert found[-1]["parameters"] == expected[-1]["parameters"]
+    assert ended.code == 0
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines[:2], "{", lines[2]])))
+    ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
+    assert ended.code == 2
+    assert "standard input, line 3: no JSON" in ended.err
+    assert len(ended.out.splitlines()) == 3
+
+
+def test_a_recording_is_replayed_and_filmed(tiny):
+    ended = run_command("replay", "problem.toml", "--rate", 0, "--film", "swing.gif")
+    assert ended.code == 0
+    assert "mu_pa" in ended.out
+    assert "frames, latency" in ended.out
+    assert imread("swing.gif").size > 0
+    assert run_command("replay", "problem.toml", "--film", "swing.mp4").code == 2
+    ended = run_command("replay", "problem.toml", "--rate", 1000, "--json")
+    assert json.loads(ended.out.splitlines()[-1])["t_s"] == pytest.approx(0.08)
