@@ -25,7 +25,7 @@ LAYERS = (
     {"output", "synthesis"},
     {"terminal", "method_tables"},
     {"live"},
-    {"design", "study"},
+    {"design", "export", "study"},
     {"cli"},
 )
 
