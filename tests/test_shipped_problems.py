@@ -73,8 +73,10 @@ WRIST = {"young_pa": 2.5e4, "density_kg_m3": 120.0}
 
 @pytest.mark.parametrize("felt", [True, False], ids=["with the sensor", "without"])
 def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
-    coarser = ["transcription.substeps=1", "experiment.swing.window_s=[0.0, 0.6]"]
-    problem = Problem.read(PROBLEMS / "wrist_sensor" / "problem.toml", coarser)
+    # What the steps are off by shows beside error bars as small as those with the sensor.
+    steps = f"transcription.substeps={3 if felt else 1}"
+    shorter = [steps, "experiment.swing.window_s=[0.0, 0.5]"]
+    problem = Problem.read(PROBLEMS / "wrist_sensor" / "problem.toml", shorter)
     if not felt:
         problem = replace(problem, experiments=tuple(map(without_sensors, problem.experiments)))
     finished = run(problem, seek_causes=False)
@@ -82,9 +84,8 @@ def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
     estimates = finished.uncertainty.estimates
     if felt:
         for name, true in WRIST.items():
-            low, high = estimates[name].ci95
-            assert low < true < high, name
-            assert estimates[name].std_error < 0.05 * true, name
+            found = estimates[name]
+            assert abs(found.value - true) < 2.6 * found.std_error < 0.02 * true, name
         return
     assert {estimates[name].std_error for name in WRIST} == {None}
     ratio = estimates["young_pa"].value / estimates["density_kg_m3"].value

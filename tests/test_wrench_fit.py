@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from problem_files import pictures_drawn
 from problems_small import GUESS, TRUTH, hung_cube, relative_errors
+from test_static import HANGING, block
 from wrenches_small import SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
@@ -202,3 +203,17 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     seen = Problem([blind(swung())], unknown)
     told = covariance(seen.collocation(), seen.collocation().pack(p, x)).estimates
     assert told["density_kg_m3"].std_error is None
+
+
+def test_equilibria_under_gravity_tell_the_density_too():
+    static = sensing(block("xyz", gravity_m_s2=HANGING))
+    static = replace(static, body=static.body.with_free_densities([""]))
+    made = simulate(static, TRUTH | {"density_kg_m3": 30.0})
+    felt = with_wrenches(with_markers(static, made.markers_m), made.wrenches)
+    free = {"lambda_pa": cs.Unknown(300.0), "mu_pa": cs.Unknown(400.0)}
+    unknown = {**TRUTH, **free, "density_kg_m3": cs.Unknown(40.0)}
+    found = ReducedSpace()(Problem([felt], unknown).collocation()).parameters
+    for name, true in {"mu_pa": TRUTH["mu_pa"], "density_kg_m3": 30.0}.items():
+        assert found[name] == pytest.approx(true, rel=1e-6)
+    with pytest.raises(cs.InputError, match="density_kg_m3: no guess is given"):
+        cs.run(Problem([felt], unknown | {"density_kg_m3": cs.Unknown()}))

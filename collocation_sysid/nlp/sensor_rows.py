@@ -359,5 +359,5 @@ class SensorRows(Addition):
 def _all(pairs: list[tuple[Index, Index]]) -> tuple[Index, Index]:
     """Rows and columns of all entries from pairs that broadcast."""
     both = [np.broadcast_arrays(*pair) for pair in pairs]
-    rows, columns = zip(*both, strict=True)
-    return tuple(np.concatenate([each.ravel() for each in side]) for side in (rows, columns))
+    rows, columns = ([each[side].ravel() for each in both] for side in (0, 1))
+    return np.concatenate(rows), np.concatenate(columns)
