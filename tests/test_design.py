@@ -385,6 +385,13 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
     assert np.isfinite(found.size)
 
 
+def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
+    recording = Recording(problem(), hung_cube(8), 0.08)
+    judge = Judge(recording, LIMITS, Criterion(), [AT.guess_q], np.zeros((4, 4)))
+    monkeypatch.setattr(designing, "MOST_GIGABYTES", 0.5 * LinearRecording.gigabytes(recording))
+    assert judge.first_guess(FEW, print).at is None
+
+
 def test_a_motion_is_judged_over_all_draws():
     judge = Judge(
         Recording(problem(), hung_cube(8), 0.08),
