@@ -280,6 +280,8 @@ def design(
             f"found {duration_s:g}; expected a number of seconds above 0", None, "--duration"
         )
     recording = Recording(problem, _chosen(problem, experiment), duration_s)
+    recording.bounds(limits)
+    recording.highest_hz(limits)
     if not problem.parameters.free:
         raise InputError("every parameter is fixed; expected one to estimate", problem.path)
     if add:
@@ -291,8 +293,6 @@ def design(
         known = np.zeros((len(draws[0]),) * 2)
     judge = Judge(recording, limits, criterion, draws, known)
     criterion.require_known(judge.errors(0.0, draws[0]))
-    recording.bounds(limits)
-    recording.highest_hz(limits)
     first = judge.first_guess(options, say)
     say("seeking a motion")
     tried = 1 if first.interrupted else options.evaluations

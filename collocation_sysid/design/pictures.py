@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from ..fem.constants import symbol_of
 from ..output.style import (
@@ -14,7 +15,6 @@ from ..output.style import (
     SMALL_PT,
     VERMILION,
     dress,
-    legend,
     legend_above,
     mathematical,
     new_figure,
@@ -72,8 +72,8 @@ def error_bars_picture(found: Design) -> Figure:
     before = "recordings so far" if found.added else "the problem's motion"
     after = "with the designed one" if found.added else "designed motion"
     for bars, label, colour, shift in (
-        (found.before, before, VERMILION, 0.15),
-        (found.after, after, BLUE, -0.15),
+        (found.before, before, VERMILION, -0.15),
+        (found.after, after, BLUE, 0.15),
     ):
         if bars is None:
             continue
@@ -84,9 +84,10 @@ def error_bars_picture(found: Design) -> Figure:
         axes.hlines(rows + shift, low, high, color=colour, lw=2.5, alpha=0.4)
         axes.plot(middle, rows + shift, "o", color=colour, ms=4, mec="none", label=label)
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_yticks(rows, [mathematical(name) or symbol_of(name) for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     dress(axes, "", "predicted standard error [%]", "")
     axes.tick_params(axis="y", labelsize=SMALL_PT)
-    legend(axes)
+    legend_above(axes, columns=2)
     return figure
