@@ -49,7 +49,13 @@ def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
     return PoseSequence(t_s, place_m + swing(0.05), turns.as_quat())
 
 
-def twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) -> Problem:
+def twin(
+    name: str,
+    truth: dict[str, float],
+    seed: int,
+    samples: int = SAMPLES,
+    integrator: str = "newmark",
+) -> Problem:
     """A body that is described rightly."""
     rng = np.random.default_rng(seed)
     size_m, divisions = BODIES[name]
@@ -59,6 +65,6 @@ def twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) 
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
     markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, None, places)
     experiment = Experiment(body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing")
-    tracks = simulate(experiment, truth).markers_m
+    tracks = simulate(experiment, truth, integrator).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
     return Problem([with_markers(experiment, tracks + noise)], GUESS)
