@@ -23,6 +23,7 @@ LAYERS = (
     {"problem"},
     {"check", "earlier", "rollout", "verdict", "run", "refine"},
     {"output", "synthesis"},
+    {"export"},
     {"terminal", "method_tables"},
     {"study"},
     {"cli"},

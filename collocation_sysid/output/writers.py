@@ -188,7 +188,7 @@ def write_frames(
 
 
 @contextmanager
-def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
+def run_folder(path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE) -> Iterator[Path]:
     """Give a temporary folder beside `path` to write into, and name it `path` at the end.
 
     An earlier run at `path` is replaced, at the end and whole. After an exception the temporary
@@ -199,6 +199,8 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
     path : str or Path
     overwrite : bool
         Whether an earlier run may be replaced.
+    mark : str
+        The file that tells an earlier run, or what else there is to be written.
 
     Raises
     ------
@@ -206,11 +208,11 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
         If there is anything else at `path`; at once, so that no work is lost.
     """
     target = Path(path).resolve()
-    require_replaceable(target, overwrite)
+    require_replaceable(target, overwrite, mark)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
-    mark = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = target.with_name(f".{target.name}.{mark}.partial")
+    own = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.name}.{own}.partial")
     temporary.mkdir()
     try:
         yield temporary
@@ -218,10 +220,10 @@ def run_folder(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        require_replaceable(target, overwrite)
-        _put_in_place(temporary, target, target.with_name(f".{target.name}.{mark}.old"))
+        require_replaceable(target, overwrite, mark)
+        _put_in_place(temporary, target, target.with_name(f".{target.name}.{own}.old"))
     except (InputError, OSError) as error:
-        kept = target.with_name(f"{target.name}-{mark}")
+        kept = target.with_name(f"{target.name}-{own}")
         with suppress(OSError):
             temporary = temporary.rename(kept)
         raise InputError(
@@ -252,7 +254,7 @@ def _runs(process: int) -> bool:
     return True
 
 
-def require_replaceable(target: Path, overwrite: bool = True) -> None:
+def require_replaceable(target: Path, overwrite: bool = True, mark: str = RESULT_FILE) -> None:
     """Refuse a place for a run folder that holds anything but an earlier run.
 
     Raises
@@ -268,9 +270,10 @@ def require_replaceable(target: Path, overwrite: bool = True) -> None:
         raise InputError("is a mount point and cannot be replaced; choose a folder in it", target)
     if not any(target.iterdir()):
         return
-    if not (target / RESULT_FILE).is_file():
+    if not (target / mark).is_file():
+        what = "run" if mark == RESULT_FILE else "export"
         raise InputError(
-            f"the folder has files but no {RESULT_FILE}, so it is not an earlier run and is left "
+            f"the folder has files but no {mark}, so it is not an earlier {what} and is left "
             "alone; choose another folder",
             target,
         )
