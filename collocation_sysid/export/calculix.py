@@ -14,11 +14,10 @@ from ..arrays import Array
 from ..errors import InputError
 from ..nlp.rest import rest_state
 from .identified import Identified, IdentifiedRegion
-from .target import Comparison, Exported, heading, left_out, mean_dilatation_lost, numbers
+from .target import Comparison, Exported, heading, left_out, mean_dilatation_lost
 
 DECK = "body.inp"
 LONGEST_S = 600.0
-PER_LINE = 8
 # Of U = Σ (J − 1)^2i / D_i beyond the first: a zero is taken for a very stiff term.
 NO_TERM = 1e20
 # C_i of Arruda and Boyce's series.
@@ -34,7 +33,7 @@ def export(body: Identified) -> Exported:
         card, lost = _material(region, linear)
         limits += [f"{region.name}: {lost}"] if lost else []
         materials += (
-            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{region.density_kg_m3!r}\n"
+            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_fields(region.density_kg_m3)}\n"
             f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
         )
     limits.append("damping is not exported: an equilibrium has none")
@@ -55,12 +54,12 @@ def _step(body: Identified, linear: bool) -> str:
     """Grasped nodes where they are held, gravity, and what else pulls."""
     held = np.argwhere(body.held)
     moved = body.held_m - body.nodes_m
-    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{float(moved[n, a])!r}\n" for n, a in held)
+    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(moved[n, a])}\n" for n, a in held)
     pulled = np.argwhere(body.loads_n)
-    loads = "".join(f"{n + 1},{a + 1},{float(body.loads_n[n, a])!r}\n" for n, a in pulled)
+    loads = "".join(f"{n + 1},{a + 1},{_fields(body.loads_n[n, a])}\n" for n, a in pulled)
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
     way = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
-    weight = f"*DLOAD\nBODY,GRAV,{pull!r},{numbers(way, ',')}\n" if pull else ""
+    weight = f"*DLOAD\nBODY,GRAV,{_fields(pull)},{_fields(*way)}\n" if pull else ""
     return (
         f"*STEP,INC=1000{'' if linear else ',NLGEOM'}\n*STATIC\n{'1.,1.' if linear else '0.1,1.'}\n"
         + (f"*BOUNDARY\n{boundary}" if boundary else "")
@@ -70,7 +69,12 @@ def _step(body: Identified, linear: bool) -> str:
 
 
 def _rows(points: Array) -> str:
-    return "".join(f"{k},{numbers(point, ',')}\n" for k, point in enumerate(points, start=1))
+    return "".join(f"{k},{_fields(*point)}\n" for k, point in enumerate(points, start=1))
+
+
+def _fields(*values: float) -> str:
+    """Numbers of a line: what is past 20 characters of one is cut off, and be it the exponent."""
+    return ",".join(f"{float(value):.12g}" for value in values)
 
 
 def _material(region: IdentifiedRegion, linear: bool) -> tuple[str, str]:
@@ -81,10 +85,10 @@ def _material(region: IdentifiedRegion, linear: bool) -> tuple[str, str]:
         lost = ""
         if region.material == "linear" and not linear:
             lost = "beside large strains the linear material becomes St. Venant and Kirchhoff's"
-        return f"*ELASTIC\n{region.young_pa!r},{region.poisson!r}\n", lost
+        return f"*ELASTIC\n{_fields(region.young_pa, region.poisson)}\n", lost
     if region.material == "mooney-rivlin":
         values = c["c10_pa"], c["c01_pa"], volume
-        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{numbers(values, ',')}\n", ""
+        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{_fields(*values)}\n", ""
     if region.material in ("yeoh", "gent"):
         if region.material == "yeoh":
             factors, lost = (c["c10_pa"], c["c20_pa"], c["c30_pa"]), ""
@@ -95,19 +99,19 @@ def _material(region: IdentifiedRegion, linear: bool) -> tuple[str, str]:
                 f"Gent's energy is a series of three terms: right for Ī₁ − 3 well below {room:.4g}"
             )
         values = *factors, volume, NO_TERM, NO_TERM
-        return f"*HYPERELASTIC,YEOH\n{numbers(values, ',')}\n", lost
+        return f"*HYPERELASTIC,YEOH\n{_fields(*values)}\n", lost
     if region.material == "arruda-boyce":
         stretch = c["chain_stretch"]
         slope = sum(
             2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1) for i, a in enumerate(_CHAINS, 1)
         )
         values = c["mu_pa"] / slope, stretch, volume
-        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{numbers(values, ',')}\n", (
+        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{_fields(*values)}\n", (
             "its energy of the volume is ½ κ ((J² − 1)/2 − ln J), ours ½ κ (J − 1)²: the same at "
             "small changes of volume"
         )
     values = region.mu_pa / 2, volume
-    return f"*HYPERELASTIC,NEO HOOKE\n{numbers(values, ',')}\n", (
+    return f"*HYPERELASTIC,NEO HOOKE\n{_fields(*values)}\n", (
         f"{region.material} becomes the neo-Hookean of Ī₁ with ½ κ (J − 1)²: the same λ and μ at "
         "small strain, another stress from the second order of the strain on"
     )
@@ -140,11 +144,14 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     # What the deck leaves out is left out on both sides.
     alone = replace(body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf)
     ours = rest_state(alone, body.theta).reshape(-1, 3) - body.nodes_m
-    sag = [float(np.linalg.norm(u, axis=1).max()) for u in (theirs, ours)]
-    apart = float(np.linalg.norm(theirs - ours, axis=1).max())
-    share = f" ({apart / sag[1]:.2%} of it)" if sag[1] else ""
-    remark = f"no node is further than {apart:.3g} m apart{share}"
-    return [Comparison("largest displacement at rest", *sag, "m", remark)]
+    sag_m, apart_m = _longest(ours), _longest(theirs - ours)
+    share = f" ({apart_m / sag_m:.2%} of it)" if sag_m else ""
+    remark = f"no node is further than {apart_m:.3g} m apart{share}"
+    return [Comparison("largest displacement at rest", _longest(theirs), sag_m, "m", remark)]
+
+
+def _longest(way_m: Array) -> float:
+    return float(np.linalg.norm(way_m, axis=1).max())
 
 
 def _last_displacements(file: Path, count: int) -> Array | None:

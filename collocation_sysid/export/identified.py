@@ -289,7 +289,6 @@ def _warnings(result: Mapping[str, Any]) -> tuple[str, ...]:
     for name, each in result["parameters"].items():
         if each["at_bound"] and not each["fixed"]:
             found.append(
-                f"{name} = {each['value']:.4g} is at its {each['at_bound']} bound: the data would "
-                "have it elsewhere"
+                f"{name} = {each['value']:.4g} ended at a bound: the data would have it elsewhere"
             )
     return tuple(found)

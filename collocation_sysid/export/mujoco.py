@@ -271,10 +271,11 @@ def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
     assert body.rolled_out_m is not None
     ours = body.rolled_out_m[:, free]
     carried = e.rigid_positions(e.t_s)[:, free]
-    size = [_rms(each - carried) for each in (theirs, ours)]
-    apart = _rms(theirs - ours)
-    remark = f"they are {apart:.3g} m apart (RMS), {apart / size[1]:.2%} of it"
-    return Comparison("RMS deformation over the recording", *size, "m", remark)
+    size_m, apart_m = _rms(ours - carried), _rms(theirs - ours)
+    share = f", {apart_m / size_m:.2%} of it" if size_m else ""
+    remark = f"they are {apart_m:.3g} m apart (RMS){share}"
+    what = "RMS deformation over the recording"
+    return Comparison(what, _rms(theirs - carried), size_m, "m", remark)
 
 
 def _drive(body: Identified, mujoco: ModuleType, data: Any, step: tuple[float, float]) -> None:

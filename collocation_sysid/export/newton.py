@@ -17,6 +17,7 @@ from pathlib import Path
 
 import newton
 import numpy as np
+import warp as wp
 
 body = json.loads(Path(__file__).with_name("body.json").read_text(encoding="utf-8"))
 
@@ -25,10 +26,10 @@ def add_to(builder):
     """Add the body to a newton.ModelBuilder; particles that are grasped have no mass."""
     first = len(builder.particle_mass)
     builder.add_soft_mesh(
-        pos=(0.0, 0.0, 0.0),
-        rot=(0.0, 0.0, 0.0, 1.0),
+        pos=wp.vec3(),
+        rot=wp.quat_identity(),
         scale=1.0,
-        vel=(0.0, 0.0, 0.0),
+        vel=wp.vec3(),
         vertices=body["nodes_m"],
         indices=np.ravel(body["cells"]).tolist(),
         density=1.0,
@@ -42,12 +43,10 @@ def add_to(builder):
 
 def model(device=None):
     """A model of the body alone, for newton.solvers.SolverVBD."""
-    builder = newton.ModelBuilder(gravity=0.0)
+    builder = newton.ModelBuilder(gravity=tuple(body["gravity_m_s2"]))
     add_to(builder)
     builder.color()
-    built = builder.finalize(device=device)
-    built.set_gravity(tuple(body["gravity_m_s2"]))
-    return built
+    return builder.finalize(device=device)
 '''
 
 

@@ -36,7 +36,7 @@ def export(body: Identified) -> Exported:
         )
     if (body.held.any(axis=1) != body.held.all(axis=1)).any():
         raise InputError("a grasp holds single axes, which the scene for SOFA does not take")
-    (region,) = body.regions
+    region = body.regions[0]
     limits, force = left_out(body, moving=False), _law(region)
     limits += _limits(region)
     if (body.held & (np.abs(body.held_m - body.nodes_m) > 1e-9)).any():
