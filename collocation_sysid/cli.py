@@ -564,6 +564,58 @@ def refine(
             _show(Text(f"{result['trust']['verdict']}: {reason}"))
 
 
+@app.command(
+    epilog=_examples(
+        "export runs/swing --to mujoco", "export runs/swing --to calculix --out deck --verify"
+    )
+)
+def export(
+    run_folder: RunFolder,
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="TARGET", help="mujoco, newton, sofa, febio, calculix or json."
+        ),
+    ],
+    out: Out = None,
+    experiment: OneExperiment = None,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Predict in the target what was exported, and compare."),
+    ] = False,
+    allow_code: AllowCode = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write the identified body for another simulator: mesh, material, damping, grasp.
+
+    Says what the target cannot express. By default in a folder export-TARGET of the run.
+    """
+    from dataclasses import asdict
+
+    from .export import Identified, export_run, target_named, verify_export
+    from .output.record import as_json as json_text
+    from .terminal import comparison_table, export_notes
+
+    target, folder = target_named(to), out or run_folder / f"export-{to}"
+    require_possible(folder)
+    body = Identified.read(run_folder, experiment, allow_code)
+    exported = export_run(body, to, folder)
+    found = verify_export(body, to, folder) if verify else []
+    if as_json:
+        content = {
+            "folder": str(folder),
+            "warnings": body.warnings,
+            "not_expressed": exported.limits,
+            "verified": [{**asdict(each), "relative": each.relative} for each in found],
+        }
+        typer.echo(json_text(content))
+        return
+    _show(export_notes(body.warnings, exported.limits))
+    if verify:
+        _show(comparison_table(target.name, found))
+    typer.echo(folder)
+
+
 @app.command(epilog=_examples("plot runs/swing"))
 def plot(
     run_folder: RunFolder,

@@ -116,20 +116,28 @@ class Earlier:
         names = segment.experiment.markers.names
         return {m: found[names[m]] for m in segment.chart.estimated.tolist() if names[m] in found}
 
+    def nuisance_of(self, collocation: Collocation) -> tuple[Array, int]:
+        """Return p at the guess with the nuisance parameters that were found, and how many were.
+
+        Places are those of the problem.
+        """
+        p, matches = collocation.guess_p, 0
+        for segment in collocation.segments:
+            nuisance = segment.nuisance
+            for k, (name, scale) in enumerate(zip(nuisance.names, nuisance.scales, strict=True)):
+                if name in self.nuisance:
+                    p[segment.first.phi + k] = self.nuisance[name] / scale
+                    matches += 1
+        return p, matches
+
     def variables(self, collocation: Collocation) -> Array | None:
         """Simulated variables z at the guess with the nuisance parameters that were found.
 
         None where there are none, or the simulation fails: the guess is all that is known then.
         Places are those of the problem.
         """
-        p, matches = collocation.guess_p, 0
-        for segment in collocation.segments:
-            nuisance = segment.nuisance
-            matches += len(self._known_places(segment))
-            for k, (name, scale) in enumerate(zip(nuisance.names, nuisance.scales, strict=True)):
-                if name in self.nuisance:
-                    p[segment.first.phi + k] = self.nuisance[name] / scale
-                    matches += 1
+        p, matches = self.nuisance_of(collocation)
+        matches += sum(len(self._known_places(segment)) for segment in collocation.segments)
         if not matches:
             return None
         p = np.clip(p, *collocation.bounds_p)

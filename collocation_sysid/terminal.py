@@ -16,6 +16,7 @@ from rich.text import Text
 from .arrays import root_mean
 from .check import BodyFinding, Findings, Recording
 from .check.hold import hold_sentence
+from .export.target import Comparison
 from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
 from .nlp.collocation import Part
@@ -199,6 +200,21 @@ def refinement_table(found: Refinement) -> Table:
             f"{error.extrapolated:.5g}",
             interval,
         )
+    return table
+
+
+def export_notes(warnings: Sequence[str], limits: Sequence[str]) -> Text:
+    """What to know of an export, a line each."""
+    lines = [f"warning: {each}" for each in warnings]
+    return Text("\n".join([*lines, *(f"not expressed: {each}" for each in limits)]))
+
+
+def comparison_table(name: str, found: Sequence[Comparison]) -> Table:
+    """What a simulator predicts beside what we do."""
+    table = Table("", name, "ours", "difference", "", box=None, pad_edge=False)
+    for each in found:
+        values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
+        table.add_row(each.what, *values, f"{each.relative:+.2%}", each.remark)
     return table
 
 

@@ -23,6 +23,7 @@ LAYERS = (
     {"problem"},
     {"check", "earlier", "rollout", "second_start", "verdict", "run", "refine"},
     {"output", "synthesis"},
+    {"export"},
     {"terminal", "method_tables"},
     {"live"},
     {"design", "export", "study"},

@@ -271,8 +271,9 @@ def require_replaceable(target: Path, overwrite: bool = True, mark: str = RESULT
     if not any(target.iterdir()):
         return
     if not (target / mark).is_file():
+        what = "run" if mark == RESULT_FILE else mark.partition(".")[0]
         raise InputError(
-            f"the folder has files but no {mark}, so it is not an earlier run and is left "
+            f"the folder has files but no {mark}, so it is not an earlier {what} and is left "
             "alone; choose another folder",
             target,
         )

@@ -1,0 +1,330 @@
+"""Exports: what files hold and say, and what simulators that are installed make of them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from problem_files import run_command, write_problem
+from problems_small import IDEAL, nodes_where, smooth_poses, times, vertex_markers
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
+from collocation_sysid.export import TARGETS, Identified, export_run, verify_export
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.simulation import simulate
+
+needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
+needs_mujoco = pytest.mark.skipif(
+    importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed"
+)
+BAR_M, DIVISIONS = (0.1, 0.02, 0.02), (5, 1, 1)
+MODULI = {"young_pa": 5e4, "poisson": 0.3}
+OTHERS = {"gamma_r_s": 0.002, "gamma_m_1_s": 0.0}
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    problem = write_problem(folder, {"swing": 8})
+    assert (
+        run_command(
+            "solve", problem, "--out", folder / "run", "-q", "--method", "reduced-space"
+        ).code
+        == 0
+    )
+    return folder / "run"
+
+
+def held_bar(
+    material: str = "st-venant-kirchhoff",
+    values: dict[str, float] = MODULI,
+    element: str = "tet4",
+    axes: str = "xyz",
+    prony: tuple[str, ...] = (),
+    moving: bool = False,
+) -> Identified:
+    """A bar held at one end, as if a run had identified it."""
+    body = Body(box_mesh(BAR_M, DIVISIONS), material, 900.0, element, prony=prony)
+    t_s = times(8)
+    poses = smooth_poses(t_s, sway_m=(0.004, 0.002, 0.003)) if moving else PoseSequence.fixed()
+    still = Grasp(nodes_where(body, 0, 0.0), poses)
+    grasps = [still] if axes == "xyz" else [still, Grasp([5], PoseSequence.fixed(), axes=axes)]
+    markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
+    kind = "dynamic" if moving else "static"
+    experiment = Experiment(body, t_s, grasps, markers, nuisance=IDEAL, kind=kind)
+    theta = body.theta({**OTHERS, **values})
+    shapes = simulate(experiment, theta).positions_m if moving else None
+    return Identified("a bar", "good", (), {}, body, theta, experiment, shapes)
+
+
+def exported(body: Identified, to: str, folder: Path) -> Path:
+    export_run(body, to, folder / to)
+    return folder / to
+
+
+def numbers_in(text: str | None) -> np.ndarray:
+    assert text is not None
+    return np.array(text.split(), dtype=float)
+
+
+# What files hold
+
+
+def test_the_json_holds_what_was_identified(run_folder, tmp_path):
+    assert run_command("export", run_folder, "--to", "json", "--out", tmp_path / "out").code == 0
+    found = json.loads((tmp_path / "out" / "identified.json").read_text())
+    result = json.loads((run_folder / "result.json").read_text())
+    (region,) = found["regions"]
+    assert region["constants"]["mu_pa"] == result["parameters"]["mu_pa"]["value"]
+    assert region["young_pa"] == pytest.approx(result["derived"]["young_pa"]["value"])
+    assert sum(found["node_mass_kg"]) == pytest.approx(30.0 * 0.06 * 0.06 * 0.09)
+    held = np.array(found["nodes_m"])[found["grasps"][0]["nodes"]]
+    np.testing.assert_allclose(held[:, 2], 0.09)
+    poses = np.loadtxt(tmp_path / "out" / "poses_1.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(poses[:, 0], found["grasps"][0]["pose_t_s"])
+
+
+def test_mujoco_gets_nodes_cells_and_the_flex(run_folder, tmp_path):
+    body = Identified.read(run_folder)
+    model = ElementTree.parse(exported(body, "mujoco", tmp_path) / "body.xml")
+    flex, elasticity = model.find(".//flex"), model.find(".//elasticity")
+    assert flex is not None
+    assert elasticity is not None
+    (region,) = body.regions
+    assert float(elasticity.get("young", "")) == region.young_pa
+    assert float(elasticity.get("poisson", "")) == region.poisson
+    assert float(elasticity.get("damping", "")) == region.gamma_r_s
+    np.testing.assert_array_equal(numbers_in(flex.get("element")).reshape(-1, 4), body.body.cells)
+    masses = [
+        float(node.get("mass", ""))
+        for each in model.iterfind(".//worldbody/body")
+        if each.get("name", "").startswith("node")
+        for node in each.iterfind("inertial")
+    ]
+    free = ~body.held.all(axis=1)
+    np.testing.assert_array_equal(masses, body.node_mass_kg[free])
+    assert flex.get("body", "").split().count("grasp0") == (~free).sum()
+
+
+def test_sofa_gets_moduli_damping_and_the_grasp(run_folder, tmp_path):
+    body = Identified.read(run_folder)
+    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn")
+    force = scene.find(".//TetrahedronHyperelasticityFEMForceField")
+    solver = scene.find(".//EulerImplicitSolver")
+    fixed = scene.find(".//FixedProjectiveConstraint")
+    assert force is not None
+    assert solver is not None
+    assert fixed is not None
+    (region,) = body.regions
+    assert force.get("materialName") == "NeoHookean"
+    np.testing.assert_array_equal(
+        numbers_in(force.get("ParameterSet")), [region.mu_pa, region.lambda_pa]
+    )
+    assert float(solver.get("rayleighStiffness", "")) == region.gamma_r_s
+    assert float(solver.get("rayleighMass", "")) == region.gamma_m_1_s
+    np.testing.assert_array_equal(
+        numbers_in(fixed.get("indices")), np.flatnonzero(body.held.any(axis=1))
+    )
+
+
+def test_newton_gets_the_constants_of_its_own_energy(run_folder, tmp_path):
+    body = Identified.read(run_folder)
+    folder = exported(body, "newton", tmp_path)
+    found = json.loads((folder / "body.json").read_text())
+    (region,) = body.regions
+    assert set(found["k_mu"]) == {region.mu_pa}
+    assert set(found["k_lambda"]) == {region.lambda_pa}
+    np.testing.assert_array_equal(found["cells"], body.body.cells)
+    compile((folder / "body.py").read_text(), "body.py", "exec")
+
+
+def test_febio_gets_energy_and_memory(tmp_path):
+    values = {"c10_pa": 4e3, "c01_pa": 1e3, "kappa_pa": 1e5, "prony_1.share": 0.4}
+    body = held_bar("mooney-rivlin", {**values, "prony_1.tau_s": 0.2}, prony=("prony_1",))
+    model = ElementTree.parse(exported(body, "febio", tmp_path) / "body.feb")
+    material = model.find(".//Material/material")
+    assert material is not None
+    assert material.get("type") == "uncoupled viscoelastic"
+    inner = {each.tag: each.text for each in material.iter() if each.text}
+    for tag, value in {"g1": 0.4, "t1": 0.2, "c1": 4e3, "c2": 1e3, "k": 1e5}.items():
+        assert float(inner[tag] or "") == value
+    assert len(model.findall(".//elem")) == len(body.body.cells)
+    nodes = [numbers_in((node.text or "").replace(",", " ")) for node in model.iterfind(".//node")]
+    np.testing.assert_array_equal(nodes, body.nodes_m)
+
+
+def test_calculix_gets_mesh_material_and_grasp(run_folder, tmp_path):
+    body = Identified.read(run_folder)
+    deck = (exported(body, "calculix", tmp_path) / "body.inp").read_text()
+    (region,) = body.regions
+    card = deck.split("*HYPERELASTIC,NEO HOOKE\n")[1].splitlines()[0]
+    np.testing.assert_allclose(
+        np.array(card.split(","), dtype=float), [region.mu_pa / 2, 2 / region.kappa_pa]
+    )
+    boundary = deck.split("*BOUNDARY\n")[1].split("*")[0].splitlines()
+    assert len(boundary) == body.held.sum()
+    nodes = deck.split("*NODE,NSET=ALL\n")[1].split("*")[0].split()
+    rows = np.array([row.split(",") for row in nodes], dtype=float)
+    np.testing.assert_allclose(rows[:, 1:], body.nodes_m, rtol=1e-11, atol=1e-15)
+
+
+def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
+    body = held_bar("neo-hookean", {"young_pa": 5e5 / 3, "poisson": 1 / 3})
+    deck = (exported(body, "calculix", tmp_path) / "body.inp").read_text()
+    lines = [line for line in deck.splitlines() if not line.startswith("*")]
+    assert max(len(field) for line in lines for field in line.split(",")) <= 20
+
+
+# What they say
+
+
+@pytest.mark.parametrize("to", ["mujoco", "newton", "calculix"])
+def test_memory_that_is_lost_is_said(to, tmp_path):
+    values = {**MODULI, "prony_1.share": 0.5, "prony_1.tau_s": 0.2}
+    limits = export_run(held_bar(values=values, prony=("prony_1",)), to, tmp_path / to).limits
+    assert any("memory is not known" in said and "1.5 times" in said for said in limits)
+
+
+@pytest.mark.parametrize("to", TARGETS)
+def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    result = json.loads((run / "result.json").read_text())
+    result["trust"] = {"verdict": "doubtful", "reasons": ["the residuals swing"]}
+    result["parameters"]["mu_pa"]["at_bound"] = True
+    (run / "result.json").write_text(json.dumps(result))
+    ended = run_command("export", run, "--to", to, "--out", tmp_path / "out")
+    assert ended.code == 0, ended.err
+    written = "".join(file.read_text() for file in (tmp_path / "out").iterdir())
+    for said in ("'doubtful': the residuals swing", "mu_pa = 300 ended at a bound"):
+        assert "warning: " in ended.out
+        assert said in ended.out
+        assert said in written
+
+
+def test_a_pure_energy_is_exported_without_reserve(tmp_path):
+    body = held_bar()
+    for to in ("mujoco", "sofa"):
+        said = " ".join(export_run(body, to, tmp_path / to).limits)
+        assert "small strain, another" not in said
+        assert "becomes" not in said
+
+
+# What is refused
+
+
+def test_an_unknown_target_writes_nothing(run_folder, tmp_path):
+    ended = run_command("export", run_folder, "--to", "mujco", "--out", tmp_path / "out")
+    assert ended.code == 2
+    assert "did you mean 'mujoco'" in ended.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_files_are_left_alone(run_folder, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    ended = run_command("export", run_folder, "--to", "json", "--out", tmp_path)
+    assert ended.code == 2
+    assert "not an earlier export" in ended.err
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_an_earlier_export_is_replaced(run_folder, tmp_path):
+    for to in ("sofa", "json"):
+        assert run_command("export", run_folder, "--to", to, "--out", tmp_path / "out").code == 0
+    assert not (tmp_path / "out" / "body.scn").exists()
+
+
+def test_an_experiment_that_is_not_there_is_refused(run_folder, tmp_path):
+    ended = run_command("export", run_folder, "--to", "json", "--experiment", "sway")
+    assert ended.code == 2
+    assert "expected swing" in ended.err
+
+
+def test_what_a_target_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(InputError, match="grasp 2 holds only z"):
+        export_run(held_bar(axes="z"), "mujoco", tmp_path / "out")
+    with pytest.raises(InputError, match="one of linear tetrahedra"):
+        export_run(held_bar(element="tet10"), "sofa", tmp_path / "out")
+    with pytest.raises(InputError, match="not run from here"):
+        verify_export(held_bar(), "sofa", exported(held_bar(), "sofa", tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_simulator_that_is_missing_is_named(tmp_path, monkeypatch):
+    body = held_bar()
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"collocation-sysid\[mujoco\]"):
+        verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match="install CalculiX"):
+        verify_export(body, "calculix", exported(body, "calculix", tmp_path))
+
+
+# What simulators make of them
+
+SAME_ENERGY = {
+    "st-venant-kirchhoff": {"young_pa": 5e4, "poisson": 0.3},
+    "linear": {"young_pa": 5e4, "poisson": 0.3},
+    "mooney-rivlin": {"c10_pa": 7e3, "c01_pa": 3e3, "kappa_pa": 5e4},
+    "yeoh": {"c10_pa": 1e4, "c20_pa": 1e3, "c30_pa": 1e2, "kappa_pa": 5e4},
+}
+
+
+@needs_ccx
+@pytest.mark.parametrize("material", SAME_ENERGY)
+def test_calculix_sags_alike_with_the_same_energy(material, tmp_path):
+    body = held_bar(material, SAME_ENERGY[material])
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
+    assert sag.ours > 0.05 * BAR_M[0]  # not small
+    assert abs(sag.relative) < 1e-4
+
+
+@needs_ccx
+@pytest.mark.parametrize("material", ["neo-hookean", "stable-neo-hookean"])
+def test_calculix_sags_alike_at_small_strain(material, tmp_path):
+    body = held_bar(material, {"young_pa": 5e5, "poisson": 0.3})
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
+    assert sag.ours > 0
+    assert abs(sag.relative) < 0.02
+
+
+@needs_ccx
+def test_quadratic_elements_sag_alike_in_calculix(tmp_path):
+    body = held_bar(element="tet10")
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
+    assert abs(sag.relative) < 0.02
+
+
+@needs_ccx
+def test_an_error_of_calculix_is_told(tmp_path):
+    body = held_bar()
+    folder = exported(body, "calculix", tmp_path)
+    deck = folder / "body.inp"
+    deck.write_text(deck.read_text().replace("*STATIC", "*STATIK"))
+    with pytest.raises(InputError, match="CalculiX failed"):
+        verify_export(body, "calculix", folder)
+
+
+@needs_mujoco
+def test_mujoco_swings_alike(tmp_path):
+    body = held_bar(moving=True)
+    frequency, motion = verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
+    assert frequency.ours > 1.0
+    assert abs(frequency.relative) < 1e-6  # the same energy, mesh and masses
+    assert motion.ours > 1e-3
+    assert abs(motion.relative) < 0.03
+
+
+@needs_mujoco
+def test_mujoco_has_the_frequency_of_other_energies(tmp_path):
+    body = held_bar("neo-hookean")
+    (frequency,) = verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
+    assert abs(frequency.relative) < 0.03
