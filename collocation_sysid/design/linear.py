@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import next_fast_len
 from scipy.interpolate import BSpline
 
 from ..arrays import Array
@@ -67,7 +66,7 @@ class LinearRecording:
         still = recording.fit(recording.experiment(_pulse(recording, np.zeros(6))), q)[0]
         (at_rest,) = still.blocks
         count = recording.samples
-        length = next_fast_len(2 * count, real=True)
+        length = 1 << (2 * count - 1).bit_length()
         answers = []
         for k, height in enumerate(HEIGHTS):
             pulsed = recording.experiment(_pulse(recording, height * np.eye(6)[k]))
