@@ -509,7 +509,7 @@ def design(
     given = Limits.read(limits)
     loaded = Problem.read(problem, set_ or (), allow_code, simulation=not add)
     require_possible(folder)
-    require_replaceable(folder, mark=DESIGN_FILE)
+    require_replaceable(folder, mark=DESIGN_FILE, what="design")
     with DesignProgress(errors, options.evaluations, quiet) as progress:
         try:
             found = designed(

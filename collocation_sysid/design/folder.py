@@ -72,7 +72,7 @@ def write_design(
         If there is anything but an earlier design.
     """
     target = Path(folder)
-    with run_folder(target, mark=DESIGN_FILE) as place:
+    with run_folder(target, mark=DESIGN_FILE, what="design") as place:
         write_poses_csv(place / POSES_FILE, _of_gripper(found))
         experiment = found.experiment
         markers = experiment.markers

@@ -49,7 +49,7 @@ def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
         For an unknown target, a body that it cannot express, or a folder with other files.
     """
     exported = target_named(to).export(body)
-    with run_folder(folder, mark=NUMBERS) as place:
+    with run_folder(folder, mark=NUMBERS, what="export") as place:
         for name, text in exported.files.items():
             (place / name).write_text(text, encoding="utf-8")
         content = plain({**body.as_dict(), "not_expressed": exported.limits})

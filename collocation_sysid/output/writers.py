@@ -188,7 +188,9 @@ def write_frames(
 
 
 @contextmanager
-def run_folder(path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE) -> Iterator[Path]:
+def run_folder(
+    path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
+) -> Iterator[Path]:
     """Give a temporary folder beside `path` to write into, and name it `path` at the end.
 
     An earlier run at `path` is replaced, at the end and whole. After an exception the temporary
@@ -199,8 +201,8 @@ def run_folder(path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE
     path : str or Path
     overwrite : bool
         Whether an earlier run may be replaced.
-    mark : str
-        The file by which one is known.
+    mark, what : str
+        The file by which an earlier one is known, and what messages call it.
 
     Raises
     ------
@@ -208,7 +210,7 @@ def run_folder(path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE
         If there is anything else at `path`; at once, so that no work is lost.
     """
     target = Path(path).resolve()
-    require_replaceable(target, overwrite, mark)
+    require_replaceable(target, overwrite, mark, what)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
     owner = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -220,7 +222,7 @@ def run_folder(path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        require_replaceable(target, overwrite, mark)
+        require_replaceable(target, overwrite, mark, what)
         _put_in_place(temporary, target, target.with_name(f".{target.name}.{owner}.old"))
     except (InputError, OSError) as error:
         kept = target.with_name(f"{target.name}-{owner}")
@@ -254,7 +256,9 @@ def _runs(process: int) -> bool:
     return True
 
 
-def require_replaceable(target: Path, overwrite: bool = True, mark: str = RESULT_FILE) -> None:
+def require_replaceable(
+    target: Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
+) -> None:
     """Refuse a place for a run folder that holds anything but an earlier run.
 
     Raises
@@ -271,7 +275,6 @@ def require_replaceable(target: Path, overwrite: bool = True, mark: str = RESULT
     if not any(target.iterdir()):
         return
     if not (target / mark).is_file():
-        what = "run" if mark == RESULT_FILE else mark.partition(".")[0]
         raise InputError(
             f"the folder has files but no {mark}, so it is not an earlier {what} and is left "
             "alone; choose another folder",
