@@ -54,9 +54,9 @@ def _step(body: Identified, linear: bool) -> str:
     """Grasped nodes where they are held, gravity, and what else pulls."""
     held = np.argwhere(body.held)
     moved = body.held_m - body.nodes_m
-    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(moved[n, a])}\n" for n, a in held)
+    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(float(moved[n, a]))}\n" for n, a in held)
     pulled = np.argwhere(body.loads_n)
-    loads = "".join(f"{n + 1},{a + 1},{_fields(body.loads_n[n, a])}\n" for n, a in pulled)
+    loads = "".join(f"{n + 1},{a + 1},{_fields(float(body.loads_n[n, a]))}\n" for n, a in pulled)
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
     way = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
     weight = f"*DLOAD\nBODY,GRAV,{_fields(pull)},{_fields(*way)}\n" if pull else ""

@@ -190,7 +190,7 @@ def _step_s(body: Identified) -> float:
     root = 1 / np.sqrt(np.repeat(body.node_mass_kg, 3))
     scaled = sp.diags_array(root) @ stiffness @ sp.diags_array(root)
     start = np.random.default_rng(0).normal(size=len(root))
-    largest = eigsh(scaled, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)
+    largest = eigsh(scaled, 1, which="LA", v0=start, return_eigenvectors=False)
     omega = float(np.sqrt(largest[0]))
     ratio = max(region.gamma_r_s for region in body.regions) * omega / 2
     step_s = SAFE * 2 / omega * (np.hypot(1, ratio) - ratio)

@@ -29,7 +29,7 @@ def export(body: Identified) -> Exported:
     InputError
         For quadratic elements, several regions, or grasps of single axes.
     """
-    if body.body.element.nodes != 4 or len(body.regions) > 1:
+    if body.body.element.nodes != 4 or len(body.regions) != 1:
         raise InputError(
             f"the body has {len(body.regions)} region(s) of {body.body.element.name}; the scene "
             "for SOFA takes one of linear tetrahedra: export to calculix, febio or json"
