@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn, cast
 
 import typer
 from rich.console import Console, RenderableType
@@ -23,6 +23,7 @@ from .folders import require_possible, run_name
 from .starting import heed_interrupts
 
 if TYPE_CHECKING:
+    from .design.criterion import Kind, Over
     from .live import Estimator
     from .problem import Problem
     from .study import Limits, PlannedRun
@@ -504,7 +505,7 @@ def design(
 
     folder = out or Path("runs") / f"{run_name(problem)}-design"
     names = tuple(name.strip() for name in for_.split(",")) if for_ is not None else ()
-    wanted = Criterion(criterion, names, over)
+    wanted = Criterion(cast("Kind", criterion), names, cast("Over", over))
     options = DesignOptions(evaluations, pairs, spread, waves, seed)
     given = Limits.read(limits)
     loaded = Problem.read(problem, set_ or (), allow_code, simulation=not add)

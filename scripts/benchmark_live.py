@@ -41,7 +41,7 @@ SWEEPS = 5
 
 def main() -> None:
     """Stream the problems and print what was found."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", choices=[*TRUTH], action="append")
     parser.add_argument("--rows", type=int, help="passed again a frame, in place of a budget")
     parser.add_argument("--budget-ms", type=float)

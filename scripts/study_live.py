@@ -91,7 +91,7 @@ class Tally:
 
 def main() -> None:
     """Stream the twins and print a table now and then."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
     parser.add_argument("--body", default="block")

@@ -118,7 +118,7 @@ class Recording:
     @cached_property
     def since_start_s(self) -> Array:
         """(T,) times of the samples."""
-        return np.arange(self.samples) * self.template.timestep_s
+        return np.asarray(np.arange(self.samples) * self.template.timestep_s, dtype=np.float64)
 
     @cached_property
     def start(self) -> tuple[Array, Array]:

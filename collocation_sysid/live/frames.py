@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.poses import first_matrix_fault, first_pose_fault
 
@@ -40,7 +40,7 @@ class Frame:
     has_wrench: bool = False
 
 
-def as_pose(given: Pose | None, numbers: Sequence[int]) -> tuple[Array, Array] | None:
+def as_pose(given: Pose | None, numbers: Sequence[int] | Index) -> tuple[Array, Array] | None:
     """The poses of the grasps of these numbers; None where one of them is missing.
 
     Raises
@@ -134,7 +134,9 @@ class FrameReader:
         For messages.
     """
 
-    def __init__(self, grasps: Sequence[int], names: Sequence[str], source: str = "input") -> None:
+    def __init__(
+        self, grasps: Sequence[int] | Index, names: Sequence[str], source: str = "input"
+    ) -> None:
         self.grasps, self.names, self.source = list(grasps), list(names), source
         self.line = 0
         self._columns: list[str] | None = None

@@ -147,7 +147,7 @@ class SensorRows(Addition):
         own = self._own(z)
         found = [own[0] - self._on_grid(part, self._forced(part, z))]
         if len(self._lag):
-            found.append(own[1] - self._smoothed(part, *own))
+            found.append(own[1] - self._smoothed(part, own[0], own[1]))
         return (np.stack(found) / self._row_unit).ravel()
 
     # Entries ------------------------------------------------------------------------------------

@@ -110,7 +110,7 @@ def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[st
         apart = np.concatenate([(read - sensor.values)[:, :3] for read, sensor in pairs])
         order, unit = np.argsort(t_s, kind="stable"), "N"
         t_s, apart = t_s[order], apart[order, None]
-        counted = np.isfinite(apart).any(axis=2)
+        counted = np.asarray(np.isfinite(apart).any(axis=2))
     later = t_s > start_s
     squares = np.where(counted, np.nansum(apart**2, axis=2), 0.0)[later]
     samples = int(counted[later].sum())

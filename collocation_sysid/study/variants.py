@@ -258,7 +258,9 @@ def _shear_pa(parameters: Mapping[str, Any], front: str) -> float | None:
 
 def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
     """A constant of another material: as stiff as the file's own, or found by a scan."""
-    usual = shear_pa and usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)
+    if shear_pa is None:
+        return {}
+    usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)
     if usual is None:
         return {}
     return {"guess": usual} if usual else {"guess": usual, "typical": LESS * shear_pa}
