@@ -27,13 +27,16 @@ exclude_patterns = ["_build"]
 html_theme = "furo"
 
 # Scripts with a recorded object in them run where its data have been fetched.
-_measured = {"measured_beam": "srl_beam/beam_gravity_V2_a.c3d"}
+_measured = {
+    "measured_beam": "srl_beam/beam_gravity_V2_a.c3d",
+    "measured_cylinders": "phantom_compression/EF30_0T_A1_force.csv",
+}
 _here = Path(__file__).parent
 _fetched = [name for name, file in _measured.items() if (_here / "../problems" / file).is_file()]
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",
     "gallery_dirs": "generated/gallery",
-    "filename_pattern": "/(plot_|" + "|".join(f"{name}$" for name in _fetched or ["$^"]) + ")",
+    "filename_pattern": "/(" + "|".join(["plot_", *_fetched]) + ")",
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "download_all_examples": False,
