@@ -9,7 +9,7 @@ import meshio
 import numpy as np
 import pytest
 from actuation_small import box_with_cavity
-from problem_files import TRUTH, run_command
+from problem_files import TRUTH, pictures_drawn, run_command
 from problems_small import smooth_poses, times
 
 from collocation_sysid.errors import InputError
@@ -83,7 +83,8 @@ def test_a_driven_box_is_read_solved_and_shown(driven):
     (experiment,) = Problem.read(driven / "problem.toml").experiments
     assert [actuator.name for actuator in experiment.actuators] == ["tendon_1", "air"]
     np.testing.assert_allclose(experiment.tendons[0].amplitude([0.025]), 0.0025)
-    done = run_command("solve", driven / "problem.toml", "--out", driven / "run")
+    with pictures_drawn():
+        done = run_command("solve", driven / "problem.toml", "--out", driven / "run")
     assert done.code == 0, done.err
     said = " ".join(done.out.split())
     assert "tendon_1, more than stated by" in said

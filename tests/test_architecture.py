@@ -26,7 +26,7 @@ LAYERS = (
     {"export"},
     {"terminal", "method_tables"},
     {"live"},
-    {"design", "export", "study"},
+    {"design", "study"},
     {"cli"},
 )
 
