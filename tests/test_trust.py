@@ -226,9 +226,10 @@ def test_strict_fails_where_the_verdict_is_doubtful(tmp_path):
     wrong = settings("experiment.swing.gravity_m_s2=[0.0, -9.81, 0.0]")
     out = ("--out", tmp_path / "run")
     assert run_command("solve", file, *method, "--strict", *out).code == 0
+    lax = run_command("solve", file, *method, *wrong, *out)
     strict = run_command("solve", file, *method, *wrong, "--strict", *out)
-    assert "Verdict: doubtful" in strict.out
-    assert strict.code == 1
+    assert "Verdict: doubtful" in lax.out
+    assert (lax.code, strict.code) == (0, 1)
     assert run_command("report", tmp_path / "run").code == 0
     page = (tmp_path / "run" / "report.html").read_text()
     assert '<div class="verdict doubtful">' in page
