@@ -10,6 +10,7 @@ import numpy as np
 from .arrays import Array, root_mean
 from .errors import SimulationError
 from .experiment import Experiment
+from .fem.batched import side_by_side
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution, wrench_rms
 from .nlp.parameters import Parameters
@@ -47,6 +48,16 @@ class Rollout:
     wrench_rms: tuple[float | None, float | None] = (None, None)
 
 
+def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
+    """Those of all experiments by their names, see `roll_out`."""
+    threads = solution.collocation.threads
+    try:
+        found = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
+    except KeyboardInterrupt:  # the answer itself is there, and worth writing
+        found = ["interrupted"] * len(problem.experiments)
+    return {e.name: each for e, each in zip(problem.experiments, found, strict=True)}
+
+
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
     """Simulate an experiment with a solution's parameters; or say why that fails."""
     options = problem.rollout
@@ -62,8 +73,6 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         )
     except SimulationError as error:
         return str(error)
-    except KeyboardInterrupt:  # the answer itself is there, and worth writing
-        return "interrupted"
     readings = segment.observation.of_samples(trajectory.positions_m, phi)
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]

@@ -26,7 +26,7 @@ from .methods.start import placed_at_guess
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
 from .problem import Problem
-from .rollout import Rollout, roll_out, step_changes
+from .rollout import Rollout, roll_outs, step_changes
 from .second_start import USUAL, second_start
 from .statistics.cause import Cause
 from .statistics.causes import likely_causes
@@ -361,7 +361,7 @@ def run(
     say = log or (lambda _: None)
     solution = solve(problem, method, watch, start)
     say("checking the answer by a forward simulation")
-    rollouts = {e.name: roll_out(problem, e, solution) for e in problem.experiments}
+    rollouts = roll_outs(problem, solution)
     found = _checked(problem, solution, rollouts, say)
     turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
     found = replace(found, notes=(*turns, *found.notes))

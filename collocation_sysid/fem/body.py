@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .batched import Batch, Evaluator, EvaluatorChoice, available_threads
+from .batched import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .damping import Damping
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
@@ -550,9 +550,10 @@ class Body(Model):
                 f"{len(theta)} constants given, expected {len(self.constants)}: "
                 f"{', '.join(self.constants)}"
             )
-        if name not in self._evaluators:
-            batches = [self._batch(name, k) for k in range(len(self.parts))]
-            self._evaluators[name] = [self.make_evaluator(batch) for batch in batches]
+        with COMPILING:
+            if name not in self._evaluators:
+                batches = [self._batch(name, k) for k in range(len(self.parts))]
+                self._evaluators[name] = [self.make_evaluator(batch) for batch in batches]
         width = self._width(name)
         shape = (len(fields[0]), width)
         if out is None:

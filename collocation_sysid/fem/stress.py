@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array, Index
-from .batched import Batch, Evaluator
+from .batched import COMPILING, Batch, Evaluator
 from .elements import Element
 from .expressions import Law, carried_energy, first_piola, second_piola, six_of
 from .kernel import PointKernel
@@ -229,8 +229,9 @@ class Stresses:
         carried: Array | None = None,
     ) -> None:
         body, key = self.body, (name, number)
-        if key not in self._evaluators:
-            self._evaluators[key] = body.make_evaluator(self._batch(name, number))
+        with COMPILING:
+            if key not in self._evaluators:
+                self._evaluators[key] = body.make_evaluator(self._batch(name, number))
         first = body.starts[number]
         values = np.array(theta[first : first + body.parts[number].of_law], dtype=float)
         threads = body.threads if len(out) > FEW else 1

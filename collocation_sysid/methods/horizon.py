@@ -10,8 +10,10 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..errors import SimulationError
+from ..fem.batched import side_by_side
 from ..nlp.collocation import Collocation, Part
 from ..nlp.factorisation import Choice
+from ..nlp.lapack import one_blas_thread
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver, Tangent
@@ -104,6 +106,7 @@ class Horizon:
                 for segment, count in zip(collocation.segments, rows, strict=True)
             ]
 
+    @one_blas_thread()
     def evaluate(self, p: Array, x: list[Array], known: Point | None = None) -> Point:
         """One sweep; a point of the first rows, at the same p and positions, is continued.
 
@@ -112,11 +115,14 @@ class Horizon:
         SimulationError
             Where it is singular or not finite.
         """
-        tangents = []
-        for k, part in enumerate(self.collocation.parts_at(p, x)):
+        parts = self.collocation.parts_at(p, x)
+
+        def swept(k: int) -> Tangent:
             before = known.tangents[k] if known else None
-            tangents.append(self.solvers[k].forward(part.x, part.setting, before))
-        return self.read(p, x, tangents)
+            return self.solvers[k].forward(parts[k].x, parts[k].setting, before)
+
+        threads = self.collocation.threads
+        return self.read(p, x, side_by_side(swept, range(len(parts)), threads))
 
     def read(self, p: Array, x: list[Array], tangents: list[Tangent]) -> Point:
         """A point whose tangents are known, with its markers as the collocation reads them."""

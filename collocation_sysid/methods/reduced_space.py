@@ -25,6 +25,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..checked import Count, Positive
+from ..fem.batched import at_once
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
@@ -104,8 +105,9 @@ def memory_mb(collocation: Collocation) -> float:
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
     numbers = columns * collocation.variables
-    chunks = [BlockSolver(segment).chunk_bytes for segment in collocation.segments]
-    return (8 * numbers + max(chunks)) / 1e6
+    chunks = sorted(BlockSolver(segment).chunk_bytes for segment in collocation.segments)
+    together = at_once(len(chunks), collocation.threads)
+    return (8 * numbers + sum(chunks[-together:])) / 1e6
 
 
 def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
+from ..fem.batched import side_by_side
 from ..nlp.collocation import Collocation
 from ..nlp.marching import march, march_on
 from ..nlp.newton import NewtonOptions, Solver
@@ -73,10 +74,12 @@ def marched(
     options : NewtonOptions, optional
     stopwatch : Stopwatch, optional
     """
-    found, first_failure = [], None
-    for k, part in enumerate(collocation.parts_at(p, known or _nothing(collocation))):
+    parts = collocation.parts_at(p, known or _nothing(collocation))
+
+    def on(k: int) -> tuple[Array, SimulationError | None]:
+        part = parts[k]
         dynamics = part.setting.dynamics
-        x, failure = march_on(
+        return march_on(
             part.segment.corrected(part.phi),
             dynamics if rows is None else dynamics.first_rows(rows[k]),
             part.setting.theta,
@@ -84,9 +87,10 @@ def marched(
             options,
             stopwatch=stopwatch,
         )
-        found.append(x)
-        first_failure = first_failure or failure
-    return found, first_failure
+
+    reached = side_by_side(on, range(len(parts)), collocation.threads)
+    failures = [failure for _, failure in reached if failure is not None]
+    return [x for x, _ in reached], failures[0] if failures else None
 
 
 def completed(collocation: Collocation, p: Array, known: Sequence[Array] | None = None) -> Array:

@@ -238,6 +238,11 @@ class Collocation:
         """Every experiment at z."""
         return self.parts_at(*self.unpack(z))
 
+    @property
+    def threads(self) -> int:
+        """How many its bodies may use."""
+        return min(segment.body.threads for segment in self.segments)
+
     def parts_at(self, p: Array, positions: Sequence[Array]) -> list[Part]:
         """Every experiment at p and positions, or their first rows."""
         return [

@@ -2,42 +2,41 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 
 class Stopwatch:
-    """Adds up the time spent on evaluating elements, on linear algebra, and on building."""
+    """Adds up the time spent on evaluating elements, on linear algebra, and on building.
+
+    Of threads side by side, the time of all.
+    """
 
     def __init__(self) -> None:
         self.build = 0.0
         self.evaluations = 0.0
         self.linear_algebra = 0.0
+        self._adding = threading.Lock()
 
     @contextmanager
-    def building(self) -> Iterator[None]:
+    def _timing(self, kind: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._adding:
+                setattr(self, kind, getattr(self, kind) + time.perf_counter() - began)
+
+    def building(self) -> AbstractContextManager[None]:
         """Time symbolic work and tables."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.build += time.perf_counter() - began
+        return self._timing("build")
 
-    @contextmanager
-    def evaluating(self) -> Iterator[None]:
+    def evaluating(self) -> AbstractContextManager[None]:
         """Time element kernels."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.evaluations += time.perf_counter() - began
+        return self._timing("evaluations")
 
-    @contextmanager
-    def solving(self) -> Iterator[None]:
+    def solving(self) -> AbstractContextManager[None]:
         """Time factorisations and substitutions."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.linear_algebra += time.perf_counter() - began
+        return self._timing("linear_algebra")

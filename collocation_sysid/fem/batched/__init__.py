@@ -13,24 +13,27 @@ from typing import TYPE_CHECKING
 from .batch import Batch, Evaluator, VectorCodeError
 from .choice import EVALUATORS, EvaluatorChoice, choose_evaluator, make_evaluator
 from .combine import Combiner, Plan, combine_natively, combine_with_numpy
-from .threads import available_threads, in_slices
+from .threads import COMPILING, at_once, available_threads, in_slices, side_by_side
 
 if TYPE_CHECKING:
     from ...arrays import Index
     from .skyline import Skyline
 
 __all__ = [
+    "COMPILING",
     "EVALUATORS",
     "Batch",
     "Evaluator",
     "EvaluatorChoice",
     "VectorCodeError",
+    "at_once",
     "available_threads",
     "choose_evaluator",
     "in_slices",
     "make_combiner",
     "make_evaluator",
     "make_skyline",
+    "side_by_side",
 ]
 
 

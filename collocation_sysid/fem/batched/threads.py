@@ -1,12 +1,23 @@
-"""Share a range of timesteps among threads."""
+"""Share a range of timesteps, or the experiments, among threads."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+# Of several threads that need a kernel the first builds it.
+COMPILING = threading.Lock()
+# Threads that do a whole experiment each share nothing of it with others.
+_alone = threading.local()
 
 
 def available_threads() -> int:
@@ -28,7 +39,7 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
     """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread."""
     threads = min(threads, count)
-    if threads <= 1:
+    if threads <= 1 or getattr(_alone, "whole", False):
         run(0, count)
         return
     bounds = [count * k // threads for k in range(threads + 1)]
@@ -37,3 +48,28 @@ def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None
     run(bounds[0], bounds[1])
     for other in others:
         other.result()
+
+
+def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
+    """``run`` of every item, in their order; each on a thread of its own, see `at_once`.
+
+    Much of an experiment's row is too short to pass the interpreter's lock on and back: more
+    experiments than cores at a time fill the gaps.
+    """
+    count = at_once(len(items), threads)
+    if count == 1:
+        return [run(item) for item in items]
+
+    def whole(item: T) -> R:
+        _alone.whole = True
+        return run(item)
+
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(whole, items))
+
+
+def at_once(items: int, threads: int) -> int:
+    """How many items are done side by side."""
+    if threads == 1 or getattr(_alone, "whole", False):
+        return 1
+    return max(1, min(items, 2 * threads))
