@@ -22,6 +22,9 @@ T = TypeVar("T")
 
 # With the factor of the iterate before, a last step must be this much shorter.
 STALE = 0.01
+# Steps with the factor of the solution before are taken while each is this much shorter than the
+# last, so often at most, and until what is left is this share of a last step.
+FAST, OFTEN, LEFT = 0.1, 8, 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ class Solver:
         self.pattern = experiment.pattern
         self.factoriser = Factoriser.of(self.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+        self._kept: Factor | None = None
 
     def newton(
         self,
@@ -100,7 +104,8 @@ class Solver:
 
         A step is accepted when the next one, computed with the same factor, is shorter
         (Deuflhard's natural monotonicity test), no element is inverted, and with
-        `keep_definite` only while −∂r/∂x stays positive definite.
+        `keep_definite` only while −∂r/∂x stays positive definite. Without, the factor of the
+        solution before serves as long as steps shrink fast.
 
         Parameters
         ----------
@@ -112,16 +117,38 @@ class Solver:
             stiffness at x has it: moved alone, they would crush the elements next to them.
         """
         x = x.copy() if goal is None else self._moved(x, goal, linearise)
+        found = None if keep_definite else self._near(x, residual)
+        if found is not None:
+            return found
         self._require_upright(x)
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         step = factor.solve(value[self.free])
         for _ in range(self.options.iterations):
             if self._is_last(step):
+                self._kept = factor
                 x[self.free] += step
                 return x
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
         raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
+
+    def _near(self, x: Array, residual: Residual) -> Array | None:
+        """The solution near x with the factor that is kept, where that leads there fast."""
+        if self._kept is None:
+            return None
+        x, before = x.copy(), np.inf
+        for _ in range(OFTEN):
+            with self.stopwatch.solving():
+                step = self._kept.solve(self._timed(residual, x)[self.free])
+            length = float(np.linalg.norm(step))
+            if not length <= FAST * before:
+                return None
+            x[self.free] += step
+            rate = length / before if before < np.inf else 1.0
+            if self._is_last(rate * step, LEFT):
+                return x if self.is_upright(x) else None
+            before = length
+        return None
 
     def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """The state with the held dofs at their goal, to first order in equilibrium."""

@@ -52,6 +52,9 @@ class SimdEvaluator:
         self._carried = None
         if batch.carried is not None:
             self._carried = _block_major(batch.carried[lane_element], by_block)
+        # Asked for once: that takes as long as a small kernel.
+        tables = self._geometry, self._nodes, self._destinations
+        self._tables = [table.ctypes.data for table in tables]
         functions = [phase.pieces for phase in kernel.phases]
         if kernel.coupling:
             functions.append(kernel.coupling)
@@ -80,13 +83,7 @@ class SimdEvaluator:
     ) -> None:
         """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         addresses = [field.ctypes.data for field in fields]
-        constants = [
-            self._geometry.ctypes.data,
-            self._nodes.ctypes.data,
-            self._destinations.ctypes.data,
-            theta.ctypes.data,
-            out.ctypes.data,
-        ]
+        constants = [*self._tables, theta.ctypes.data, out.ctypes.data]
         if self._carried is not None and carried is not None:
             constants += [carried.shape[1], self._carried.ctypes.data, carried.ctypes.data]
         stride = fields[0].shape[1]
