@@ -24,11 +24,11 @@ from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
 from ..nlp.collocation import Collocation, Part
-from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions, Solver
 from ..nlp.parameters import Parameter, Parameters
 from ..nlp.rest import rest_state
 from .ladder import SHARES, part_of
+from .start import marched
 
 # Young's moduli that are tried, those beyond where the best is at an end, and the most of these.
 STIFFEST_PA, SOFTEST_PA, STEPS = 1e7, 1e2, 15
@@ -314,29 +314,23 @@ class _Trial:
     def _simulated(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
-        nothing = [np.zeros((0, segment.dofs)) for segment in self.collocation.segments]
-        found = []
-        for k, part in enumerate(self.collocation.parts_at(p, nothing)):
-            experiment, theta = part.segment.corrected(part.phi), part.setting.theta
-            known = None if warm is None else _rest(part, warm[k])
-            dynamics = part.setting.dynamics.first_rows(rows[k])
-            x, failure = march_on(experiment, dynamics, theta, known, LOOSE)
-            if failure is not None:
-                return [], failure
-            found.append(x)
-        return found, None
+        known = [np.zeros((0, segment.dofs)) for segment in self.collocation.segments]
+        if warm is not None:
+            parts = zip(self.collocation.parts_at(p, known), warm, strict=True)
+            known = [_rest(part, x) for part, x in parts]
+        return marched(self.collocation, p, known, rows, LOOSE)
 
 
-def _rest(part: Part, warm: Array) -> Array | None:
-    """(1, 3n) the rest state near another one; None where there is none, or it is not the start."""
+def _rest(part: Part, warm: Array) -> Array:
+    """(1, 3n) the rest state near another one; (0, 3n) where there is none, or it is no start."""
     experiment = part.segment.corrected(part.phi)
     if experiment.start != "equilibrium":
-        return None
+        return part.x
     solver = Solver(experiment, LOOSE)
     try:
         return rest_state(experiment, part.setting.theta, start=warm, solver=solver)[None]
     except SimulationError:
-        return None
+        return part.x
 
 
 class _Tried:

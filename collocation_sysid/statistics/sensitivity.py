@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array
+from ..fem.batched import side_by_side
 from ..nlp.collocation import Collocation, Part
 from ..nlp.lapack import one_blas_thread
 from ..nlp.reaction import HeldForces
@@ -60,13 +61,14 @@ def responses(collocation: Collocation, z: Array) -> list[Response]:
     SimulationError
         Where the equations of a step are singular.
     """
-    found = []
-    for part in collocation.parts(z):
+
+    def of(part: Part) -> Response:
         segment, dofs = part.segment, part.segment.sensed_dofs
         held = HeldForces.nothing(len(part.x), len(dofs), len(segment.moving))
         rows = BlockSolver(segment).sensitivities(part.x, part.setting, held)
-        found.append(read_along(part, rows, held))
-    return found
+        return read_along(part, rows, held)
+
+    return side_by_side(of, collocation.parts(z), collocation.threads)
 
 
 def read_along(part: Part, rows: Iterable[Array], held: HeldForces) -> Response:
