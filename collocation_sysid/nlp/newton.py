@@ -117,10 +117,11 @@ class Solver:
             stiffness at x has it: moved alone, they would crush the elements next to them.
         """
         x = x.copy() if goal is None else self._moved(x, goal, linearise)
-        found = None if keep_definite else self._near(x, residual)
-        if found is not None:
-            return found
         self._require_upright(x)
+        if self._kept is not None and not keep_definite:
+            x, done = self._nearer(x, residual, self._kept)
+            if done:
+                return x
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         step = factor.solve(value[self.free])
@@ -132,23 +133,22 @@ class Solver:
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
         raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
 
-    def _near(self, x: Array, residual: Residual) -> Array | None:
-        """The solution near x with the factor that is kept, where that leads there fast."""
-        if self._kept is None:
-            return None
-        x, before = x.copy(), np.inf
+    def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
+        """As near to the solution as the kept factor leads fast, and whether that is there."""
+        found, before, done = x.copy(), None, False
         for _ in range(OFTEN):
             with self.stopwatch.solving():
-                step = self._kept.solve(self._timed(residual, x)[self.free])
+                step = kept.solve(self._timed(residual, found)[self.free])
             length = float(np.linalg.norm(step))
-            if not length <= FAST * before:
-                return None
-            x[self.free] += step
-            rate = length / before if before < np.inf else 1.0
-            if self._is_last(rate * step, LEFT):
-                return x if self.is_upright(x) else None
+            rate = length / before if before else 1.0
+            if not rate <= 1.0:
+                return x, False
+            found[self.free] += step
+            done = self._is_last(rate * step, LEFT)
+            if done or (before and rate > FAST):
+                break
             before = length
-        return None
+        return (found, done) if self.is_upright(found) else (x, False)
 
     def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """The state with the held dofs at their goal, to first order in equilibrium."""
