@@ -66,6 +66,9 @@ class Skyline:
         self._diagonal = source[on_diagonal][np.argsort(rows[on_diagonal])]
         # A skew part's entries have another sign beyond the diagonal.
         self._signs = np.where(rows < columns, -1.0, 1.0)[order]
+        # Asked for once: that takes as long as a small kernel.
+        (self._reached,) = _addresses(self._reach)
+        self._fixed = _addresses(self._source, self._places, self._signs)
         self._kernels = {k: (_compiled("fill", k), _compiled("factorise", k)) for k in (1, 2)}
         self._solve = _compiled("solve", 1)
 
@@ -93,13 +96,12 @@ class Skyline:
         size, width = self.shape
         sides.fill(0)
         fill, factorise = self._kernels[len(sides)]
-        parts = (np.ascontiguousarray(part, dtype=float) for part in (symmetric, skew))
-        maps, values = (self._source, self._places), (self._signs, *parts)
+        parts = [np.ascontiguousarray(part, dtype=float) for part in (symmetric, skew)]
         results = np.zeros((2, size + width))
-        ends = sides[0], sides[-1]
-        fill(len(self._source), *_addresses(*maps, *values, *ends))
+        ends = _addresses(sides[0], sides[-1])
+        fill(len(self._source), *self._fixed, *_addresses(*parts), *ends)
         diagonal = symmetric[self._diagonal]
-        factorise(size, width, *_addresses(self._reach, *ends, *results))
+        factorise(size, width, self._reached, *ends, *_addresses(*results))
         with np.errstate(divide="ignore", invalid="ignore"):
             return results[0, :size], results[1, :size] / diagonal
 
@@ -108,8 +110,8 @@ class Skyline:
         size, width = self.shape
         rows = np.empty((len(right), size + width))
         rows[:, :size], rows[:, size:] = right, 0.0
-        arrays = self._reach, first, second, pivots, rows
-        self._solve(size, width, *rows.shape, *_addresses(*arrays))
+        arrays = first, second, pivots, rows
+        self._solve(size, width, *rows.shape, self._reached, *_addresses(*arrays))
         return rows[:, :size]
 
 
