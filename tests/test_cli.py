@@ -30,7 +30,8 @@ from rich.console import Console
 from rich.text import Text
 
 import collocation_sysid as cs
-from collocation_sysid import cli, terminal
+from collocation_sysid import terminal
+from collocation_sysid.cli import common
 from collocation_sysid.experiment import read_markers, read_poses
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
@@ -486,8 +487,8 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
     for live, lines in ((True, 4), (False, 1)):
         file = io.StringIO()
         shown = Console(file=file, force_terminal=live, width=40, color_system=None)
-        monkeypatch.setattr(cli, "Console", lambda shown=shown, **_: shown)
-        cli._show(Text(words))
+        monkeypatch.setattr(common, "Console", lambda shown=shown, **_: shown)
+        common.show(Text(words))
         found = file.getvalue().splitlines()
         assert len(found) == lines
         assert {word for line in found for word in line.split()} == {"misfit"}
