@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..kernel import Contraction, Phase, PointKernel
 from .batch import Array, Batch
 from .instructions import FUSE, function_values
-from .jit import CompiledFunction, vector_lanes
+from .jit import CompiledFunction, address, vector_lanes
 from .loops import DOUBLE, DOUBLES, I32, I32S, I64, Builder, Value, counting
 from .threads import in_slices
 
@@ -79,16 +79,16 @@ class SimdEvaluator:
         carried: Array | None = None,
     ) -> None:
         """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
-        addresses = [field.ctypes.data for field in fields]
+        addresses = [address(field) for field in fields]
         constants = [
-            self._geometry.ctypes.data,
-            self._nodes.ctypes.data,
-            self._destinations.ctypes.data,
-            theta.ctypes.data,
-            out.ctypes.data,
+            address(self._geometry),
+            address(self._nodes),
+            address(self._destinations),
+            address(theta),
+            address(out),
         ]
         if self._carried is not None and carried is not None:
-            constants += [carried.shape[1], self._carried.ctypes.data, carried.ctypes.data]
+            constants += [carried.shape[1], address(self._carried), address(carried)]
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array, Index
 from .instructions import FUSE
-from .jit import CompiledFunction, vector_lanes
+from .jit import CompiledFunction, address, vector_lanes
 from .loops import DOUBLE, DOUBLES, I32, I64, Builder, Value, counting
 
 # Pivots that act on a row at a time: it is then read and written once for all of them.
@@ -114,7 +114,7 @@ class Skyline:
 
 
 def _addresses(*arrays: NDArray[Any]) -> list[int]:
-    return [array.ctypes.data for array in arrays]
+    return [address(array) for array in arrays]
 
 
 @cache
