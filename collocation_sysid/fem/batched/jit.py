@@ -94,7 +94,7 @@ class CompiledFunction:
 def address(array: NDArray[Any]) -> int:
     """Where an array's memory begins; ``array.ctypes.data`` takes three times as long."""
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        return ctypes.addressof(ctypes.c_char.from_buffer(array.data))
     except (TypeError, ValueError):  # read-only, empty, or not contiguous
         return array.ctypes.data
 
