@@ -216,7 +216,7 @@ def bar_with_nuisance(steps: int = 8) -> Experiment:
 
 def driven_bar(steps: int = 8) -> Experiment:
     """A bar with a cavity, held at one end, that a tendon bends and a pressure fills."""
-    whole, t_s = box_mesh((0.12, 0.06, 0.06), (4, 3, 3)), times(steps)
+    whole, t_s = box_mesh((0.12, 0.06, 0.06), (3, 3, 3)), times(steps)
     inside = (np.abs(whole.centres_m - [0.06, 0.03, 0.03]) < [0.03, 0.01, 0.01]).all(axis=1)
     body = Body(TetMesh(whole.points_m, whole.tetrahedra[~inside]), density_kg_m3=30.0)
     points = [(x, 0.05, 0.03 + 0.1 * x) for x in (0.0, 0.05, 0.08, 0.118)]

@@ -41,7 +41,7 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
 
 
 def test_explicit_grasps_have_multipliers_too():
-    made = noisy(hung_cube())
+    made = noisy(hung_cube(6))
     collocation = Collocation([made], GUESS, explicit_grasps=True)
     solution = AugmentedLagrangian()(collocation)
     assert solution.status is Status.CONVERGED
@@ -49,7 +49,7 @@ def test_explicit_grasps_have_multipliers_too():
 
 
 def test_it_leaves_far_less_slack_than_a_penalty_of_the_same_weight():
-    collocation = collocation_of("hung-cube", noise_m=1e-3)
+    collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
     paid = Penalty("levenberg-marquardt", schedule="constant", rho=1e6, violation=1.0)(collocation)
     multiplied = AugmentedLagrangian(rho_max=1e6)(collocation)
     assert multiplied.max_violation_n < 1e-3 * paid.max_violation_n
@@ -57,13 +57,13 @@ def test_it_leaves_far_less_slack_than_a_penalty_of_the_same_weight():
 
 def test_gradients_alone_get_near_with_multipliers():
     collocation = collocation_of("released-cube", 0.0, 5)
-    options = AugmentedLagrangian("cg-descent", rho=1e2, max_iterations=400)
+    options = AugmentedLagrangian("cg-descent", rho=1e2, max_iterations=200)
     solution = options(collocation)
     assert solution.rms_m < 0.05 * solution.history[0].rms_m
 
 
 def test_a_rho_max_too_small_is_told():
-    collocation = collocation_of("hung-cube", noise_m=1e-3)
+    collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
     options = AugmentedLagrangian(rho=1e1, rho_max=1e1, max_iterations=40)
     solution = options(collocation)
     assert solution.status in (Status.STALLED, Status.ITERATION_LIMIT)

@@ -417,7 +417,7 @@ def test_number_of_threads_does_not_change_a_bit(small_mesh, evaluator, rng):
     assert_same(one, two, rng, tolerance=0.0)
 
 
-@pytest.mark.parametrize("elements", range(1, 10))
+@pytest.mark.parametrize("elements", [1, 3, 8, 9])
 def test_any_number_of_elements_fills_the_vectors(small_mesh, elements, rng):
     mesh = TetMesh(small_mesh.points_m, small_mesh.tetrahedra[:elements])
     simd, reference = (Body(mesh, density_kg_m3=30.0, evaluator=name) for name in EVALUATORS)

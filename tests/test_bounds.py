@@ -31,7 +31,7 @@ def let_go(seed: int) -> Experiment:
     return replace(seen, markers=replace(seen.markers, sigma_m=np.full(4, SIGMA_M)))
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
     free = (
         Parameter("lambda_pa", TRUTH["lambda_pa"], fixed=True),

@@ -25,7 +25,7 @@ from collocation_sysid.problem import Problem
 
 @cache
 def cube(noise_m: float = 0.0) -> Collocation:
-    return Collocation([noisy(hung_cube(4), noise_m, seed=5)], GUESS)
+    return Collocation([noisy(hung_cube(4, (1, 1, 2)), noise_m, seed=5)], GUESS)
 
 
 @cache
@@ -78,7 +78,7 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_explicit_grasps_lead_to_the_same_answer(plugin: str):
-    collocation = Collocation([measured(hung_cube(4))], GUESS, explicit_grasps=True)
+    collocation = Collocation([measured(hung_cube(4, (1, 1, 2)))], GUESS, explicit_grasps=True)
     solution = PLUGINS[plugin]()(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)

@@ -43,7 +43,7 @@ def beale(x):
 
 
 def ill_conditioned(x):
-    weights = np.logspace(0, 6, len(x))
+    weights = np.logspace(0, 4, len(x))
     return 0.5 * weights @ x**2, weights * x
 
 
@@ -76,7 +76,7 @@ FUNCTIONS = {
     "rosenbrock in 100": (rosenbrock, np.tile([-1.2, 1.0], 50)),
     "powell singular": (powell_singular, np.array([3.0, -1.0, 0.0, 1.0])),
     "beale": (beale, np.array([1.0, 1.0])),
-    "quadratic of condition 1e6": (ill_conditioned, np.ones(30)),
+    "quadratic of condition 1e4": (ill_conditioned, np.ones(30)),
     "dixon-price in 10": (dixon_price, np.ones(10)),
     "wood": (wood, np.array([-3.0, -1.0, -3.0, -1.0])),
 }

@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from problem_files import TRUTH, Outcome, run_command, write_problem
 from rich.console import Console
 
-from collocation_sysid import cli
+from collocation_sysid.cli import studies
 from collocation_sysid.study import display, process
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
@@ -188,7 +188,7 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
 
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     shown = io.StringIO()
-    monkeypatch.setattr(cli, "errors", Console(force_terminal=True, width=80, file=shown))
+    monkeypatch.setattr(studies, "errors", Console(force_terminal=True, width=80, file=shown))
     monkeypatch.setenv("TERM", "xterm")
     assert compare().code == 0
     assert "0/1 runs" in shown.getvalue()

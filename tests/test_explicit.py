@@ -153,7 +153,7 @@ def assert_same(found: Solution, expected: Solution, tolerance: float) -> None:
 
 @pytest.mark.parametrize(("branches", "noise_m"), [(2, 0.0), (1, 1e-4)])
 def test_interior_point_finds_the_optimum_of_reduced_space(branches: int, noise_m: float):
-    collocation = fitted(branches, 25, noise_m)
+    collocation = fitted(branches, 16, noise_m)
     expected = ReducedSpace(tolerance=1e-10)(collocation)
     found = InteriorPoint(tolerance=1e-10)(collocation)
     assert_same(found, expected, 1e-6)
@@ -165,7 +165,7 @@ def test_interior_point_finds_the_optimum_of_reduced_space(branches: int, noise_
 
 
 def test_regions_with_branches_of_their_own_are_told_apart():
-    collocation = Collocation([swung(of_regions(), REGIONS, 25)], guesses(REGIONS, 1.2))
+    collocation = Collocation([swung(of_regions(), REGIONS, 16)], guesses(REGIONS, 1.2))
     found = InteriorPoint(tolerance=1e-10)(collocation)
     assert_same(found, ReducedSpace(tolerance=1e-10)(collocation), 1e-6)
     for name, value in REGIONS.items():
@@ -188,11 +188,11 @@ METHODS = [
 )
 def test_methods_that_see_the_whole_program_find_the_truth(kind: str, method, tolerance: float):
     if kind == "let-go":
-        experiment = recorded("bar-let-go", 12)
+        experiment = recorded("bar-let-go", 8)
     else:
         start = "undeformed" if kind == "undeformed" else "equilibrium"
         changes = {"loaded_since_s": 0.04} if kind == "loaded" else {}
-        experiment = swung(of_branches(1), ONE, 15, start=start, **changes)
+        experiment = swung(of_branches(1), ONE, 10, start=start, **changes)
     found = method(Collocation([experiment], guesses(ONE, 1.2)))
     assert found.status.converged, found.message
     for name, value in ONE.items():

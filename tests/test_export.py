@@ -135,6 +135,22 @@ def test_sofa_gets_moduli_damping_and_the_grasp(run_folder, tmp_path):
     )
 
 
+def test_sofa_gets_the_mesh_the_masses_and_the_weight(run_folder, tmp_path):
+    body = Identified.read(run_folder)
+    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn").getroot()
+    given = {each.tag: each.attrib for each in scene.iter()}
+    mesh = given["TetrahedronSetTopologyContainer"]
+    np.testing.assert_array_equal(numbers_in(mesh["position"]).reshape(-1, 3), body.nodes_m)
+    np.testing.assert_array_equal(numbers_in(mesh["tetrahedra"]).reshape(-1, 4), body.body.cells)
+    masses_kg = numbers_in(given["DiagonalMass"]["vertexMass"])
+    assert masses_kg.sum() == pytest.approx(30.0 * 0.06 * 0.06 * 0.09)
+    assert len(masses_kg) == len(body.nodes_m)
+    np.testing.assert_array_equal(numbers_in(scene.get("gravity")), body.experiment.gravity_m_s2)
+    assert 0 < float(scene.get("dt", "")) < body.experiment.timestep_s
+    order = [each.tag for each in scene.iter()]  # components find those that stand before them
+    assert order.index("MechanicalObject") < order.index("DiagonalMass")
+
+
 def test_newton_gets_the_constants_of_its_own_energy(run_folder, tmp_path):
     body = Identified.read(run_folder)
     folder = exported(body, "newton", tmp_path)
@@ -159,6 +175,51 @@ def test_febio_gets_energy_and_memory(tmp_path):
     assert len(model.findall(".//elem")) == len(body.body.cells)
     nodes = [numbers_in((node.text or "").replace(",", " ")) for node in model.iterfind(".//node")]
     np.testing.assert_array_equal(nodes, body.nodes_m)
+
+
+def in_febio(body: Identified, folder: Path) -> ElementTree.Element:
+    return ElementTree.parse(exported(body, "febio", folder) / "body.feb").getroot()
+
+
+def indices_in(text: str | None) -> np.ndarray:
+    """Nodes of FEBio, which counts from one."""
+    return numbers_in((text or "").replace(",", " ")).astype(int) - 1
+
+
+def test_febio_gets_moduli_grasp_and_weight(run_folder, tmp_path):
+    body = Identified.read(run_folder)
+    model = in_febio(body, tmp_path)
+    assert model.get("version") == "4.0"
+    (region,) = body.regions
+    (material,) = model.iterfind("Material/material")
+    assert material.get("type") == "neo-Hookean"
+    for tag, value in {"density": 30.0, "E": region.young_pa, "v": region.poisson}.items():
+        assert float(material.findtext(tag, "")) == pytest.approx(value)
+    (domain,), (elements,) = model.iterfind("MeshDomains/*"), model.iterfind("Mesh/Elements")
+    assert (domain.get("name"), domain.get("mat")) == (elements.get("name"), material.get("name"))
+    sets = {each.get("name"): indices_in(each.text) for each in model.iterfind("Mesh/NodeSet")}
+    for axis, held in zip("xyz", body.held.T, strict=True):
+        np.testing.assert_array_equal(sets[f"held_{axis}"], np.flatnonzero(held))
+    conditions = list(model.iterfind("Boundary/bc"))
+    assert {each.get("node_set") for each in conditions} == set(sets)
+    assert {each.get("type") for each in conditions} == {"zero displacement"}
+    force = model.find("Loads/body_load/force")
+    assert force is not None
+    against = numbers_in((force.text or "").replace(",", " "))
+    np.testing.assert_array_equal(against, -body.experiment.gravity_m_s2)
+    controllers = {each.get("id") for each in model.iterfind("LoadData/load_controller")}
+    assert force.get("lc") in controllers
+
+
+def test_mid_nodes_stand_in_febios_order(tmp_path):
+    body = held_bar(element="tet10")
+    model = in_febio(body, tmp_path)
+    (elements,) = model.iterfind("Mesh/Elements")
+    assert elements.get("type") == "tet10"
+    edges = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])
+    for element in elements:
+        places = body.nodes_m[indices_in(element.text)]
+        np.testing.assert_allclose(places[4:], places[edges].mean(axis=1), atol=1e-12)
 
 
 def test_calculix_gets_mesh_material_and_grasp(run_folder, tmp_path):

@@ -180,12 +180,11 @@ def test_deviations_must_be_positive():
 # Finding them
 
 
-# Every kind by one method; by the others one kind that the markers read, one that moves them.
+# Every kind by one method; by the others one that moves the body, by one of them what is read too.
 FOUND_BY = [
     *product(ONE_OF_EACH, ("reduced-space",)),
-    *product(
-        ("offset", "tilt"), ("interior-point", "shooting", "augmented-lagrangian", "continuation")
-    ),
+    *product(("tilt",), ("interior-point", "shooting", "augmented-lagrangian", "continuation")),
+    ("offset", "interior-point"),
 ]
 
 
@@ -243,7 +242,8 @@ def test_a_clock_at_its_limit_says_so():
     tracks = measured(cube).markers.positions_m
     late = 12  # samples, of which the quarter of the recording allows 8
     still = np.repeat(tracks[:1], late, axis=0)
-    found = run(Problem([with_markers(cube, np.concatenate([still, tracks[:-late]]))], GUESS))
+    late_by = with_markers(cube, np.concatenate([still, tracks[:-late]]))
+    found = run(Problem([late_by], GUESS), seek_causes=False)
     assert found.trust.verdict == "doubtful"
     assert any(
         "time shift [s] ended at the largest value allowed" in reason

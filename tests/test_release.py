@@ -12,6 +12,7 @@ import pytest
 import collocation_sysid as cs
 
 ROOT = Path(__file__).parents[1]
+CHANGELOG = (ROOT / "CHANGELOG.md").read_text()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -20,6 +21,11 @@ def test_the_version_stands_in_one_place():
     assert "version:" not in (ROOT / "CITATION.cff").read_text().replace("cff-version:", "")
     for file in (ROOT / "collocation_sysid").rglob("*.py"):
         assert f'"{PROJECT["version"]}"' not in file.read_text()
+
+
+def test_the_changelog_tells_of_the_version():
+    dated = re.findall(r"^## \[([\d.]+)\] - \d{4}-\d\d-\d\d$", CHANGELOG, re.MULTILINE)
+    assert dated[0] == PROJECT["version"]
 
 
 def test_the_package_is_typed():

@@ -163,7 +163,9 @@ def test_faultless_twins_are_good(seed):
 
 @pytest.mark.parametrize("fault", ["gravity", slow("clock 100 ms late"), slow("markers exchanged")])
 def test_faults_that_spoil_the_answer_are_doubtful(fault):
-    assert judged(fault).trust.verdict == "doubtful"
+    found = judged(fault)
+    assert found.trust.verdict == "doubtful"
+    assert found.causes[0].cause in FAULTS[fault].causes
 
 
 @pytest.mark.slow

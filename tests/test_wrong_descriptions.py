@@ -185,7 +185,10 @@ def test_a_clock_that_is_estimated_is_told(rng):
     assert any("ms" in said and "than their times say" in said for said in reasons), reasons
 
 
-@pytest.mark.parametrize("fault", AFTER)
+@pytest.mark.parametrize(
+    "fault",  # of gravity `test_trust` asks for the verdict and the cause
+    [pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f for f in AFTER],
+)
 def test_a_wrong_description_is_named_after_solving(fault: str, rng):
     causes = likely_causes(solve(FAULTS[fault](soft("bar"), rng)))
     assert causes, fault

@@ -12,10 +12,12 @@ import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from llvmlite import __version__ as llvmlite_version
 from llvmlite import binding as llvm
 from llvmlite import ir
+from numpy.typing import NDArray
 
 from . import object_cache
 
@@ -87,6 +89,14 @@ class CompiledFunction:
     def __call__(self, *arguments: object) -> None:
         """Run it on integers and addresses, as in the signature."""
         self._call(*arguments)
+
+
+def address(array: NDArray[Any]) -> int:
+    """Where an array's memory begins; ``array.ctypes.data`` takes three times as long."""
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array.data))
+    except (TypeError, ValueError):  # read-only, empty, or not contiguous
+        return array.ctypes.data
 
 
 def _cached_object(build: Callable[[], ir.Module], key: str, machine: llvm.TargetMachine) -> bytes:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..kernel import Contraction, Phase, PointKernel
 from .batch import Array, Batch
 from .instructions import FUSE, function_values
-from .jit import CompiledFunction, vector_lanes
+from .jit import CompiledFunction, address, vector_lanes
 from .loops import DOUBLE, DOUBLES, I32, I32S, I64, Builder, Value, counting
 from .threads import in_slices
 
@@ -52,9 +52,8 @@ class SimdEvaluator:
         self._carried = None
         if batch.carried is not None:
             self._carried = _block_major(batch.carried[lane_element], by_block)
-        # Asked for once: that takes as long as a small kernel.
         tables = self._geometry, self._nodes, self._destinations
-        self._tables = [table.ctypes.data for table in tables]
+        self._tables = [address(table) for table in tables]
         functions = [phase.pieces for phase in kernel.phases]
         if kernel.coupling:
             functions.append(kernel.coupling)
@@ -82,10 +81,10 @@ class SimdEvaluator:
         carried: Array | None = None,
     ) -> None:
         """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
-        addresses = [field.ctypes.data for field in fields]
-        constants = [*self._tables, theta.ctypes.data, out.ctypes.data]
+        addresses = [address(field) for field in fields]
+        constants = [*self._tables, address(theta), address(out)]
         if self._carried is not None and carried is not None:
-            constants += [carried.shape[1], self._carried.ctypes.data, carried.ctypes.data]
+            constants += [carried.shape[1], address(self._carried), address(carried)]
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array, Index
 from .instructions import FUSE
-from .jit import CompiledFunction, vector_lanes
+from .jit import CompiledFunction, address, vector_lanes
 from .loops import DOUBLE, DOUBLES, I32, I64, Builder, Value, counting
 
 # Pivots that act on a row at a time: it is then read and written once for all of them.
@@ -66,7 +66,6 @@ class Skyline:
         self._diagonal = source[on_diagonal][np.argsort(rows[on_diagonal])]
         # A skew part's entries have another sign beyond the diagonal.
         self._signs = np.where(rows < columns, -1.0, 1.0)[order]
-        # Asked for once: that takes as long as a small kernel.
         (self._reached,) = _addresses(self._reach)
         self._fixed = _addresses(self._source, self._places, self._signs)
         self._kernels = {k: (_compiled("fill", k), _compiled("factorise", k)) for k in (1, 2)}
@@ -116,7 +115,7 @@ class Skyline:
 
 
 def _addresses(*arrays: NDArray[Any]) -> list[int]:
-    return [array.ctypes.data for array in arrays]
+    return [address(array) for array in arrays]
 
 
 @cache

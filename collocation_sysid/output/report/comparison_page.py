@@ -35,11 +35,7 @@ def comparison_page(folder: str | Path) -> str:
             runs=len(summary["runs"]),
             tables=[_checked(table) for table in summary["tables"]],
             pictures=[
-                {
-                    "source": picture(file),
-                    "caption": CAPTIONS.get(file.stem, file.stem),
-                    "wide": True,
-                }
+                picture(file, CAPTIONS.get(file.stem, file.stem))
                 for file in sorted(folder.glob("*.png"))
                 if file.is_file()
             ],

@@ -12,6 +12,9 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined, TemplateError
 
 from ...files import require_regular
 
+# Pictures wider than this can be moved sideways on a phone rather than shrunk.
+WIDE_PX = 1000
+
 
 def rendered(template: str, **values: Any) -> str:
     """A page from a template of this folder; text is escaped.
@@ -55,8 +58,14 @@ def millimetres(metres: float | None) -> str:
     return "–" if metres is None else f"{1e3 * metres:.3g} mm"
 
 
-def picture(file: Path) -> str:
-    """A PNG as an address that holds its data."""
+def picture(file: Path, caption: str) -> dict[str, Any]:
+    """A PNG as an address that holds its data, its caption, and whether it is wide."""
     require_regular(file)
-    data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f"data:image/png;base64,{data}"
+    content = file.read_bytes()
+    data = base64.b64encode(content).decode("ascii")
+    width_px = int.from_bytes(content[16:20])  # in the header
+    return {
+        "source": f"data:image/png;base64,{data}",
+        "caption": caption,
+        "wide": width_px > WIDE_PX,
+    }

@@ -22,8 +22,6 @@ MEANINGS = {
 }
 # What tells stiffness first, where there are several.
 FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
-# Pictures wider than this can be moved sideways on a phone rather than shrunk.
-WIDE_PX = 1000
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
 WORST, APART = 8, 5
 
@@ -251,12 +249,6 @@ def _peaks(
     return found
 
 
-def _width_px(file: Path) -> int:
-    """Width of a PNG, by its header."""
-    with file.open("rb") as stream:
-        return int.from_bytes(stream.read(20)[16:])
-
-
 def _pictures(run: Path) -> list[dict[str, Any]]:
     """Every PNG of the folder, those known here first."""
     order = list(CAPTIONS)
@@ -273,8 +265,7 @@ def _pictures(run: Path) -> list[dict[str, Any]]:
         about = file.stem.removeprefix(kind(file)).strip("_")
         caption = CAPTIONS.get(kind(file), file.stem)
         title = f"{about}: {caption}" if about and kind(file) else caption
-        wide = _width_px(file) > WIDE_PX
-        found.append({"source": picture(file), "caption": title, "wide": wide})
+        found.append(picture(file, title))
     return found
 
 

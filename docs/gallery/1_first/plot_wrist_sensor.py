@@ -42,7 +42,7 @@ unknown = {"young_pa": cs.Unknown(1e4), **known}
 with_sensor = cs.run(cs.Problem([recording], {**unknown, "density_kg_m3": cs.Unknown(50.0)}))
 print(with_sensor.table())
 for density, colour in ((50.0, "C0"), (100.0, "C1"), (200.0, "C2")):
-    without = cs.run(cs.Problem([blind], {**unknown, "density_kg_m3": density}))
+    without = cs.solve(cs.Problem([blind], {**unknown, "density_kg_m3": density}))
     plt.plot(density, 1e-3 * without.parameters["young_pa"], "o", color=colour)
     assert abs(without.parameters["young_pa"] / density / 200 - 1) < 0.02
 plt.plot([0, 220], [0, 220 * 0.2], ":", label="E/ρ as the motion tells it")
