@@ -12,6 +12,7 @@ from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..nlp.collocation import Collocation, Part
 from ..nlp.factorisation import Choice
+from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver, Tangent
@@ -21,6 +22,8 @@ from .start import marched
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
 MARCHED = NewtonOptions(tolerance=1e-6)
+# Of equilibria near known ones. Those that are not found at once are too far for it.
+SETTLED = NewtonOptions(tolerance=1e-9, halvings=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +121,27 @@ class Horizon:
             tangents.append(self.solvers[k].forward(part.x, part.setting, before))
         return self.read(p, x, tangents)
 
+    def settled(self, p: Array, x: list[Array]) -> list[Array]:
+        """The same trajectories, those of static experiments in equilibrium where one is near.
+
+        A step along the tangent stretches what is slender and turns far: its loss says little.
+        """
+        found = []
+        for part in self.collocation.parts_at(p, x):
+            dynamics, near = part.setting.dynamics, part.x
+            if dynamics.static:
+                settled, failure = march_on(
+                    part.segment.corrected(part.phi),
+                    dynamics.first_rows(len(near)),
+                    part.setting.theta,
+                    options=SETTLED,
+                    stopwatch=self.stopwatch,
+                    near=near,
+                )
+                near = settled if failure is None else near
+            found.append(near)
+        return found
+
     def read(self, p: Array, x: list[Array], tangents: list[Tangent]) -> Point:
         """A point whose tangents are known, with its markers as the collocation reads them."""
         collocation = self.collocation
@@ -155,10 +179,13 @@ class Horizon:
         )
 
     def extend(
-        self, p: Array, x: list[Array] | None = None
+        self, p: Array, x: list[Array] | None = None, near: list[Array] | None = None
     ) -> tuple[list[Array], SimulationError | None]:
-        """Trajectories at p as far as they go, continuing those given; and why they stopped."""
-        return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch)
+        """Trajectories at p as far as they go, continuing those given; and why they stopped.
+
+        Equilibria are looked for first where those of `near` are.
+        """
+        return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch, near)
 
 
 def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:

@@ -23,11 +23,10 @@ import numpy as np
 from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
-from ..nlp.collocation import Collocation, Part
+from ..nlp.collocation import Collocation
 from ..nlp.marching import march_on
-from ..nlp.newton import NewtonOptions, Solver
+from ..nlp.newton import NewtonOptions
 from ..nlp.parameters import Parameter, Parameters
-from ..nlp.rest import rest_state
 from .ladder import SHARES, part_of
 
 # Young's moduli that are tried, those beyond where the best is at an end, and the most of these.
@@ -284,13 +283,13 @@ class _Trial:
         return self._compared(p, positions), None
 
     def at(self, young_pa: float, warm: list[Array] | None) -> tuple[float, list[Array] | None]:
-        """The misfit at a stiffness, NaN where it cannot be simulated, and the first rows."""
+        """The misfit at a stiffness, NaN where it cannot be simulated, and trajectories."""
         p = self._p(young_pa)
         positions, failure = self._simulated(p, warm, self.rows)
         if failure is not None:
             self.failure = failure
             return np.nan, None
-        return self._compared(p, positions), [x[0] for x in positions]
+        return self._compared(p, positions), positions
 
     def runs(self, young_pa: float) -> bool:
         """Whether the whole recordings can be simulated at a stiffness."""
@@ -318,25 +317,13 @@ class _Trial:
         found = []
         for k, part in enumerate(self.collocation.parts_at(p, nothing)):
             experiment, theta = part.segment.corrected(part.phi), part.setting.theta
-            known = None if warm is None else _rest(part, warm[k])
+            near = None if warm is None else warm[k]
             dynamics = part.setting.dynamics.first_rows(rows[k])
-            x, failure = march_on(experiment, dynamics, theta, known, LOOSE)
+            x, failure = march_on(experiment, dynamics, theta, None, LOOSE, near=near)
             if failure is not None:
                 return [], failure
             found.append(x)
         return found, None
-
-
-def _rest(part: Part, warm: Array) -> Array | None:
-    """(1, 3n) the rest state near another one; None where there is none, or it is not the start."""
-    experiment = part.segment.corrected(part.phi)
-    if experiment.start != "equilibrium":
-        return None
-    solver = Solver(experiment, LOOSE)
-    try:
-        return rest_state(experiment, part.setting.theta, start=warm, solver=solver)[None]
-    except SimulationError:
-        return None
 
 
 class _Tried:

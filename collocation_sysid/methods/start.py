@@ -59,6 +59,7 @@ def marched(
     rows: Sequence[int] | None = None,
     options: NewtonOptions | None = None,
     stopwatch: Stopwatch | None = None,
+    near: Sequence[Array] | None = None,
 ) -> tuple[list[Array], SimulationError | None]:
     """Trajectories at p as far as they go, continuing those known; and why the first stopped.
 
@@ -72,6 +73,8 @@ def marched(
         How many are wanted; all by default.
     options : NewtonOptions, optional
     stopwatch : Stopwatch, optional
+    near : sequence of (N, 3n) ndarray, optional
+        Trajectories at other parameters: where equilibria are looked for first.
     """
     found, first_failure = [], None
     for k, part in enumerate(collocation.parts_at(p, known or _nothing(collocation))):
@@ -83,6 +86,7 @@ def marched(
             part.x if len(part.x) else None,
             options,
             stopwatch=stopwatch,
+            near=None if near is None else near[k],
         )
         found.append(x)
         first_failure = first_failure or failure
