@@ -30,6 +30,7 @@ html_theme = "furo"
 _measured = {
     "measured_beam": "srl_beam/beam_gravity_V2_a.c3d",
     "measured_cylinders": "phantom_compression/EF30_0T_A1_force.csv",
+    "measured_tentacle": "soft_tentacle/m1_u01_markers.csv",
 }
 _here = Path(__file__).parent
 _fetched = [name for name, file in _measured.items() if (_here / "../problems" / file).is_file()]

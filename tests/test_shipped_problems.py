@@ -192,6 +192,14 @@ def test_a_neo_hookean_says_that_the_platens_stick():
     assert sliding.parameters["mu_pa"] > 1.2 * sticking.parameters["mu_pa"]
 
 
+@pytest.mark.slow
+def test_a_tentacle_bent_by_tendons_is_fitted_to_a_few_millimetres():
+    found = run(measured("soft_tentacle", "TENTACLE_DATA"), seek_causes=False)
+    assert found.solution.status.converged
+    assert 3.4e5 < found.parameters["young_pa"] < 4.1e5
+    assert found.solution.rms_m < 0.007
+
+
 # What motion capture does to markers ----------------------------------------------------------
 
 

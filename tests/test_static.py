@@ -149,6 +149,31 @@ def test_one_sample_is_enough():
     np.testing.assert_allclose(positions[0, :, 2], 0.7 * experiment.body.nodes_m[:, 2], atol=1e-11)
 
 
+def drooping_bar() -> Experiment:
+    """A slender bar, clamped at one end, whose tip hangs lower than it is far out; one sample."""
+    body, t_s = box((0.3, 0.02, 0.02), (15, 1, 1)), np.zeros(1)
+    grasp = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
+    markers = vertex_markers(body, nodes_where(body, 0, 0.3), t_s)
+    bar = Experiment(body, t_s, [grasp], markers, name="bar", nuisance=IDEAL, kind="static")
+    seen_m = simulate(bar, DROOPING).markers_m
+    assert (seen_m[0, :, 2] < -seen_m[0, :, 0]).all()
+    return with_markers(bar, seen_m)
+
+
+DROOPING = {"lambda_pa": 2e3, "mu_pa": 2e3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+
+
+def test_a_body_that_bends_far_is_found_in_few_sweeps_and_saved(tmp_path):
+    """A step along the tangent stretches it, and would be refused unless it were short."""
+    guess = {"lambda_pa": cs.Unknown(guess=3e3), "mu_pa": cs.Unknown(guess=3e3)}
+    found = run(cs.Problem([drooping_bar()], DROOPING | guess), seek_causes=False)
+    assert found.parameters["mu_pa"] == pytest.approx(DROOPING["mu_pa"], rel=1e-6)
+    assert found.solution.iterations < 10
+    with pictures_drawn():
+        found.save(tmp_path / "run")
+    assert len(list((tmp_path / "run" / "frames").iterdir())) == 1
+
+
 def test_a_large_step_of_a_platen_is_taken_in_parts():
     once = block("xyz", t_s=np.array([0.0, 1.0]), z_m=np.array([0.0, -0.05]))
     slowly = block("xyz", t_s=np.arange(11.0), z_m=-0.005 * np.arange(11))

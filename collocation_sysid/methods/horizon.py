@@ -14,6 +14,7 @@ from ..fem.batched import side_by_side
 from ..nlp.collocation import Collocation, Part
 from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
+from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver, Tangent
@@ -23,6 +24,8 @@ from .start import marched
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
 MARCHED = NewtonOptions(tolerance=1e-6)
+# Of equilibria near known ones. Those that are not found at once are too far for it.
+SETTLED = NewtonOptions(tolerance=1e-9, halvings=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +127,28 @@ class Horizon:
         threads = self.collocation.threads
         return self.read(p, x, side_by_side(swept, range(len(parts)), threads))
 
+    def settled(self, p: Array, x: list[Array]) -> list[Array]:
+        """The same trajectories, those of static experiments in equilibrium where one is near.
+
+        A step along the tangent stretches what is slender and turns far: its loss says little.
+        """
+
+        def of(part: Part) -> Array:
+            dynamics, near = part.setting.dynamics, part.x
+            if not dynamics.static:
+                return near
+            settled, failure = march_on(
+                part.segment.corrected(part.phi),
+                dynamics.first_rows(len(near)),
+                part.setting.theta,
+                options=SETTLED,
+                stopwatch=self.stopwatch,
+                near=near,
+            )
+            return settled if failure is None else near
+
+        return side_by_side(of, self.collocation.parts_at(p, x), self.collocation.threads)
+
     def read(self, p: Array, x: list[Array], tangents: list[Tangent]) -> Point:
         """A point whose tangents are known, with its markers as the collocation reads them."""
         collocation = self.collocation
@@ -161,10 +186,13 @@ class Horizon:
         )
 
     def extend(
-        self, p: Array, x: list[Array] | None = None
+        self, p: Array, x: list[Array] | None = None, near: list[Array] | None = None
     ) -> tuple[list[Array], SimulationError | None]:
-        """Trajectories at p as far as they go, continuing those given; and why they stopped."""
-        return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch)
+        """Trajectories at p as far as they go, continuing those given; and why they stopped.
+
+        Equilibria are looked for first where those of `near` are.
+        """
+        return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch, near)
 
 
 def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:

@@ -11,7 +11,9 @@ with r the markers' residuals and S_p, S the markers' parts of p and Z.
 
 A trial is accepted when the loss of its own projected trajectory (r + S_p there) has decreased,
 and when its remaining infeasibility, measured by the length of p in metres, is short against
-the step. That converges from where trajectories can be simulated; a ladder of horizons, the
+the step. Static rows of a trial are brought to equilibrium first, where that is near.
+
+That converges from where trajectories can be simulated; a ladder of horizons, the
 first quarter, half and whole of the recording, widens it to where only the start can be. Where
 even a rung cannot be simulated as a whole, the rows that can be are solved first.
 """

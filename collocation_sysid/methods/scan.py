@@ -23,10 +23,9 @@ import numpy as np
 from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
-from ..nlp.collocation import Collocation, Part
-from ..nlp.newton import NewtonOptions, Solver
+from ..nlp.collocation import Collocation
+from ..nlp.newton import NewtonOptions
 from ..nlp.parameters import Parameter, Parameters
-from ..nlp.rest import rest_state
 from .ladder import SHARES, part_of
 from .start import marched
 
@@ -284,13 +283,13 @@ class _Trial:
         return self._compared(p, positions), None
 
     def at(self, young_pa: float, warm: list[Array] | None) -> tuple[float, list[Array] | None]:
-        """The misfit at a stiffness, NaN where it cannot be simulated, and the first rows."""
+        """The misfit at a stiffness, NaN where it cannot be simulated, and trajectories."""
         p = self._p(young_pa)
         positions, failure = self._simulated(p, warm, self.rows)
         if failure is not None:
             self.failure = failure
             return np.nan, None
-        return self._compared(p, positions), [x[0] for x in positions]
+        return self._compared(p, positions), positions
 
     def runs(self, young_pa: float) -> bool:
         """Whether the whole recordings can be simulated at a stiffness."""
@@ -314,23 +313,7 @@ class _Trial:
     def _simulated(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
-        known = [np.zeros((0, segment.dofs)) for segment in self.collocation.segments]
-        if warm is not None:
-            parts = zip(self.collocation.parts_at(p, known), warm, strict=True)
-            known = [_rest(part, x) for part, x in parts]
-        return marched(self.collocation, p, known, rows, LOOSE)
-
-
-def _rest(part: Part, warm: Array) -> Array:
-    """(1, 3n) the rest state near another one; (0, 3n) where there is none, or it is no start."""
-    experiment = part.segment.corrected(part.phi)
-    if experiment.start != "equilibrium":
-        return part.x
-    solver = Solver(experiment, LOOSE)
-    try:
-        return rest_state(experiment, part.setting.theta, start=warm, solver=solver)[None]
-    except SimulationError:
-        return part.x
+        return marched(self.collocation, p, None, rows, LOOSE, near=warm)
 
 
 class _Tried:

@@ -203,7 +203,7 @@ class Search:
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
-            trial = rung.evaluate(p, point.moved(step))
+            trial = rung.evaluate(p, rung.settled(p, point.moved(step)))
         except SimulationError:
             return None
         return trial if trial.finite else None
@@ -242,7 +242,7 @@ class Search:
     def _restored(self, rung: Horizon, point: Point) -> Point:
         """The point with a simulated trajectory, where that exists."""
         self.sweeps += 1
-        x, failure = rung.extend(point.p)
+        x, failure = rung.extend(point.p, near=point.x)
         if failure is not None:
             return point
         try:

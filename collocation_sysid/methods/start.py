@@ -60,6 +60,7 @@ def marched(
     rows: Sequence[int] | None = None,
     options: NewtonOptions | None = None,
     stopwatch: Stopwatch | None = None,
+    near: Sequence[Array] | None = None,
 ) -> tuple[list[Array], SimulationError | None]:
     """Trajectories at p as far as they go, continuing those known; and why the first stopped.
 
@@ -73,6 +74,8 @@ def marched(
         How many are wanted; all by default.
     options : NewtonOptions, optional
     stopwatch : Stopwatch, optional
+    near : sequence of (N, 3n) ndarray, optional
+        Trajectories at other parameters: where equilibria are looked for first.
     """
     parts = collocation.parts_at(p, known or _nothing(collocation))
 
@@ -86,6 +89,7 @@ def marched(
             part.x if len(part.x) else None,
             options,
             stopwatch=stopwatch,
+            near=None if near is None else near[k],
         )
 
     reached = side_by_side(on, range(len(parts)), collocation.threads)

@@ -57,6 +57,7 @@ def march_on(
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
     stopwatch: Stopwatch | None = None,
+    near: Array | None = None,
 ) -> tuple[Array, SimulationError | None]:
     """Continue a trajectory as far as it goes.
 
@@ -64,6 +65,8 @@ def march_on(
     ----------
     known : (k, 3n) ndarray, optional
         The first rows; the experiment's start by default.
+    near : (N, 3n) ndarray, optional
+        A trajectory at other parameters: where equilibria are looked for first.
 
     Returns
     -------
@@ -78,7 +81,8 @@ def march_on(
     v0 = np.zeros(x.shape[1])
     if known is None:
         try:
-            x[0], v0 = start_state(experiment, theta, solvers.holding(held[0]))
+            first_near = None if near is None else near[0]
+            x[0], v0 = start_state(experiment, theta, solvers.holding(held[0]), first_near)
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
@@ -99,10 +103,12 @@ def march_on(
         row = RowEquations(dynamics, theta, x, forces, t, carried)
         solver = solvers.holding(held[t])
         goal = held_positions[t].ravel()[solver.held]
-        if dynamics.static:
+        if not dynamics.static:
+            guess = extrapolated(x[:t], dynamics.step_s * v0)
+        elif near is None:
             guess = _carried_on(x[:t], solver.held, goal)
         else:
-            guess = extrapolated(x[:t], dynamics.step_s * v0)
+            guess = near[t]
         try:
             x[t] = solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:

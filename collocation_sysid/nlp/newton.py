@@ -236,7 +236,7 @@ def followed(
 
     They grow again after two that succeed.
 
-    A guess of x(1) is tried first, and the way there is taken where that fails.
+    A guess of x(1) is tried first; where that fails the way there is taken, if it may be halved.
 
     Raises
     ------
@@ -247,7 +247,8 @@ def followed(
         try:
             return solve(guess, 1.0)
         except NewtonFailure:
-            pass
+            if not halvings:
+                raise
     rate, reached, increment, easy = np.zeros_like(x), 0.0, 1.0, False
     while reached < 1.0:
         step = min(increment, 1.0 - reached)

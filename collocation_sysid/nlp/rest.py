@@ -85,12 +85,14 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
     return positions
 
 
-def start_state(experiment: Experiment, theta: Array, solver: Solver) -> tuple[Array, Array]:
-    """x_0 and v_0, each (3n,), after the experiment's start rule."""
+def start_state(
+    experiment: Experiment, theta: Array, solver: Solver, near: Array | None = None
+) -> tuple[Array, Array]:
+    """x_0 and v_0, each (3n,), after the experiment's start rule; `near` is another x_0."""
     velocity = experiment.start_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
     if experiment.start == "equilibrium":
-        return rest_state(experiment, theta, solver=solver), v0
+        return rest_state(experiment, theta, start=near, solver=solver), v0
     if experiment.start_positions_m is not None:
         return experiment.start_positions_m.ravel().copy(), v0
     return experiment.rigid_positions(experiment.t_s[:1]).ravel(), v0

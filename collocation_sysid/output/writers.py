@@ -162,7 +162,8 @@ def write_frames(
     cell_data : mapping of name to (E,), the same in every frame
     """
     times, positions = np.asarray(t_s, dtype=float), np.asarray(positions_m, dtype=float)
-    velocities = np.gradient(positions, times, axis=0, edge_order=1)
+    alone = len(times) == 1
+    velocities = np.zeros_like(positions) if alone else np.gradient(positions, times, axis=0)
     series = {name: np.asarray(values) for name, values in (point_series or {}).items()}
     frames = Path(folder) / "frames"
     frames.mkdir(exist_ok=True)

@@ -50,7 +50,7 @@ def tracks(
     figure = Figure(figsize=(PAGE_MM / 25.4, height / 25.4))
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
-    margin = 0.03 * (t_s[-1] - t_s[0])
+    margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0
     start, stop = t_s[0] - margin, t_s[-1] + margin
     dots = {"ls": "", "marker": ".", "ms": 3.5, "color": BLACK, "mec": "none", "alpha": 0.7}
     for row, marker in enumerate(shown):
