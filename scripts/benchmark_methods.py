@@ -35,6 +35,7 @@ from collocation_sysid import (
     simulate,
 )
 from collocation_sysid.experiment import Nuisance, place_markers
+from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.simulation import with_markers
@@ -83,9 +84,21 @@ class Row:
 
 def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) -> Experiment:
     """A hung and swung cylinder with tracks from the midpoint scheme."""
+    body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh")
+    experiment = swung(body, steps)
+    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
+    return with_markers(experiment, tracks)
+
+
+def cylinder(mesh: str) -> TetMesh:
+    """The cylinder of so many rings and layers."""
     rings, layers = map(int, mesh.split("x"))
-    shape = cylinder_mesh(0.04, 0.16, rings, layers)
-    body = Body(shape, density_kg_m3=20.0, damping="rayleigh")
+    return cylinder_mesh(0.04, 0.16, rings, layers)
+
+
+def swung(body: Body, steps: int) -> Experiment:
+    """A cylinder hung by its base and swung, its markers still to be seen."""
     t_s = np.arange(steps, dtype=np.float64) * STEP_S
     poses = swing(
         t_s,
@@ -102,10 +115,7 @@ def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) ->
     markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     grasp, ideal = Grasp(held, poses), Nuisance.none()
-    experiment = Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
-    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
-    tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
-    return with_markers(experiment, tracks)
+    return Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
 
 
 def measure(mesh: str, steps: int, method: str) -> Row:

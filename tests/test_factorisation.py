@@ -5,13 +5,16 @@ import pytest
 import scipy.sparse as sp
 from problems_small import TRUTH, box
 
+from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
 from collocation_sysid.nlp.factorisation import Factoriser
+from collocation_sysid.nlp.supernodal import library
 from collocation_sysid.nlp.unsymmetric import whole
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
 BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
 FULL = SymmetricPattern.of_cells(np.arange(90)[None], 90)
+WIDE = SymmetricPattern.of_cells(np.arange(300)[None], 300)
 SMALL = SymmetricPattern.of_cells(np.arange(7)[None], 7)
 CHOICES = [
     ("band", BAR.pattern),
@@ -21,6 +24,9 @@ CHOICES = [
     ("auto", SMALL),
 ]
 IDS = ["bar-band", "bar-sparse", "full-auto", "full-sparse", "small-auto"]
+if library() is not None:
+    CHOICES += [("supernodal", BAR.pattern), ("supernodal", FULL), ("supernodal", SMALL)]
+    IDS += ["bar-supernodal", "full-supernodal", "small-supernodal"]
 
 
 def test_the_bar_is_narrow_and_the_full_matrix_is_not():
@@ -107,6 +113,45 @@ def test_a_skew_part_may_outweigh_the_symmetric_one(size: float):
     solved = Factoriser(pattern, free, "band").factorise(values, skew).solve(right)
     accurate = np.linalg.solve(matrix, right)
     np.testing.assert_allclose(solved, accurate, atol=1e-12 * np.abs(accurate).max())
+
+
+@pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
+@pytest.mark.parametrize("size", [0.1, 1.0, 100.0], ids=["refined", "slowly", "whole"])
+def test_in_wide_bands_the_skew_part_is_solved_for_whether_or_not_it_is_small(
+    size: float, transposed: bool
+):
+    free = without_first_nodes(WIDE)
+    values, skew = random_values(WIDE, 100.0), size * random_values(WIDE, 0.0, seed=3)
+    skew[WIDE.diagonal] = 0
+    matrix = whole(WIDE, values, skew).toarray()[np.ix_(free, free)]
+    factoriser = Factoriser(WIDE, free, "band")
+    assert factoriser.skyline is None
+    factor = factoriser.factorise(values, skew)
+    right = np.random.default_rng(1).normal(size=(len(free), 2))
+    accurate = np.linalg.solve(matrix.T if transposed else matrix, right)
+    solved = factor.solve(right, transposed)
+    np.testing.assert_allclose(solved, accurate, atol=1e-10 * np.abs(accurate).max())
+    assert factor.positive_definite
+
+
+def test_factors_that_live_together_do_not_share_their_memory():
+    """Also where memory is given back and taken again."""
+    free, right = without_first_nodes(FULL), np.ones(FULL.size - 12)
+    for choice in dict(CHOICES):
+        factoriser = Factoriser(FULL, free, choice)
+        matrices = [random_values(FULL, 100.0, seed) for seed in range(4)]
+        factors = [factoriser.factorise(values) for values in matrices[:2]]
+        del factors[0]
+        factors += [factoriser.factorise(values) for values in matrices[2:]]
+        for factor, values in zip(factors, matrices[1:], strict=True):
+            solved = factor.solve(right)
+            np.testing.assert_allclose(kept(FULL, values, free) @ solved, right, atol=1e-10)
+
+
+def test_what_is_asked_for_and_not_installed_is_told(monkeypatch):
+    monkeypatch.setattr("collocation_sysid.nlp.supernodal.library", lambda: None)
+    with pytest.raises(InputError, match=r"collocation-sysid\[large\]"):
+        Factoriser(SMALL, np.arange(7), "supernodal")
 
 
 def test_a_factor_in_a_room_is_that_of_the_last_matrix_put_there():

@@ -363,8 +363,10 @@ class Body(Model):
         rows = self._evaluate("linearisation", [x, v], theta, out, carried)
         size, entries = self.pattern.size, self.pattern.entries
         width = len(self.constants) * size
-        force, by_position, by_velocity, by_theta, skew = np.split(
-            rows, np.cumsum([size, entries, entries, width]), axis=1
+        # Slices: `numpy.split` takes as long as the elements of a small body.
+        ends = np.cumsum([0, size, entries, entries, width]).tolist()
+        force, by_position, by_velocity, by_theta, skew = (
+            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], None], strict=True)
         )
         drag = self._drag(theta, tied_kg)
         force -= drag * v

@@ -2,8 +2,8 @@
 
 A row of the grid takes what the last few rows left (positions, forces, the columns Z by the
 parameters that move the body) and leaves the same for the next. Newton's steps end where they are
-short; the last one's factor and slopes serve the columns, as in the reduced-space method: as a
-rule one linearisation and one factorisation where a guess is good, two where it is extrapolated.
+short; the last factor and slopes serve the columns, as in the reduced-space method: as a rule there
+is one linearisation and one factorisation, and where the guess is extrapolated forces alone again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from ..nlp.tangent import Forward, GivenMotion, Memory, Step
 from .information import Information
 from .model import Model, Poses
 
-# Newton's last step over the body's size: the next one would be its square.
-LAST_STEP = 1e-5
+# Newton's last step over the body's size: the next one would be its square. Slopes of a state that
+# many times as far away serve for it too: they are off by as small a share.
+LAST_STEP, SAME_SLOPES = 1e-5, 30
 # Iterations before the way of the grasp is taken in parts, and to what accuracy that is done.
 QUICK = 6
 CAREFUL = NewtonOptions(tolerance=1e-6)
@@ -256,27 +257,31 @@ class Sweep:
     def _quick(self, t: int, equations: RowEquations, x: Array) -> tuple[Step, Array, Array]:
         """Newton's method without safeguards, as long as its steps get shorter."""
         solver, row, theta = self.solver, equations.row, self.setting.theta
-        pattern, free, last = solver.pattern, solver.free, np.inf
+        pattern, free, last, step = solver.pattern, solver.free, np.inf, None
+        short = LAST_STEP * self.size_m
         for _ in range(QUICK):
-            xi, nu = equations.states(x)
-            at = equations.forces.linearise(xi, nu, theta)
-            matrix = row.block(at.by_position[0], at.by_velocity[0], pattern)
-            skew = row.skew_block(at.by_position_skew[0])
-            residual = equations.balanced(at.force[0], x)[free]
-            try:
-                factor = solver.factoriser.factorise(matrix, skew)
-            except np.linalg.LinAlgError as error:
-                raise NewtonFailure(x, f"the equations are singular: {error}") from error
-            newton = factor.solve(residual)
+            if step is None or last > SAME_SLOPES * short:
+                xi, nu = equations.states(x)
+                at = equations.forces.linearise(xi, nu, theta)
+                matrix = row.block(at.by_position[0], at.by_velocity[0], pattern)
+                skew = row.skew_block(at.by_position_skew[0])
+                try:
+                    factor = solver.factoriser.factorise(matrix, skew)
+                except np.linalg.LinAlgError as error:
+                    raise NewtonFailure(x, f"the equations are singular: {error}") from error
+                parts = at.force[0], at.by_position[0], at.by_velocity[0], at.by_theta[0]
+                step = Step(t, row, *parts, factor, at.by_position_skew[0], nu[0])
+                force = at.force[0]
+            else:
+                force = equations.force(x)
+            newton = step.factor.solve(equations.balanced(force, x)[free])
             length = float(np.abs(newton).max(initial=0.0))
             if not length < last / 2:
                 raise NewtonFailure(x, "Newton's steps do not get shorter")
             x[free] += newton
-            if length <= LAST_STEP * self.size_m:
-                parts = at.force[0], at.by_position[0], at.by_velocity[0], at.by_theta[0]
-                step = Step(t, row, *parts, factor, at.by_position_skew[0], nu[0])
+            if length <= short:
                 # What the row says F_t is, after the last step: w_0 F_t + … = s_0 M x_t.
-                force = at.force[0].copy()
+                force = force.copy()
                 inertia = row.s[0] * row.mass_kg * x
                 force[free] = ((inertia - equations.known) / row.w[0])[free]
                 return step, x, force

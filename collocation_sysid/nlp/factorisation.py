@@ -1,23 +1,23 @@
 """Factorise matrices on the mesh graph, again and again with one pattern.
 
 Reverse Cuthill–McKee makes the mesh graph a narrow band; a factorisation without exchanges of rows,
-within its skyline or, if it is wide, LAPACK's Cholesky, then also tells whether the matrix is
-positive definite. Indefinite matrices go to SuperLU, and so do all where its fill-in is estimated
-to cost less than the band. What has a skew part besides, see `unsymmetric`, needs no exchanges
-either where the symmetric part is positive definite and the skew one does not outweigh it; else,
-and in wide bands, LAPACK's LU takes it.
+within its skyline or, if it is wide, Cholesky's, then also tells whether the matrix is positive
+definite. Wide bands are those of LAPACK, or of a supernodal method where that is installed.
+Indefinite matrices go to SuperLU, and so do all where its fill-in is estimated to cost less than
+the band. What has a skew part besides, see `unsymmetric`, needs no exchanges either where the
+symmetric part is positive definite and the skew one does not outweigh it: within a skyline it is
+factorised whole, else by its symmetric part and refined. What remains SuperLU takes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
@@ -25,24 +25,29 @@ from scipy.sparse.linalg import SuperLU, splu
 from ..arrays import Array, Index
 from ..fem.batched import in_slices, make_skyline
 from ..fem.pattern import SymmetricPattern
-from .lapack import cholesky_in_place, lu_in_place
+from .lapack import cholesky_in_place
+from .supernodal import Pardiso, SupernodalFactor, library
 
 if TYPE_CHECKING:
     from ..fem.batched.skyline import Skyline
 
-Choice = Literal["auto", "band", "sparse"]
+Choice = Literal["auto", "band", "sparse", "supernodal"]
 
 # LAPACK works on a band about this many times as fast as SuperLU on its columns (measured: 40
 # against 4 GFlop/s on one core), and below this work there is nothing to choose.
 BAND_SPEED = 10.0
 LITTLE_WORK = 1e8
 
-# In wider bands LAPACK is faster (measured: 17 GFlop/s at 200, its Cholesky 21 at 300).
+# In wider bands LAPACK is faster (measured: 17 GFlop/s at 200, its Cholesky 21 at 300), and what is
+# supernodal is faster still (`scripts/benchmark_sizes.py`).
 NARROW = 250
 # Without exchanges a diagonal entry may grow so many times; of definite matrices it never does.
 GROWTH = 10.0
+# Corrections by the skew part end where the next would be so small, far below what a Newton or
+# Gauss–Newton step is accurate to; they must shrink so fast, else another factor pays.
+ACCURACY, CONTRACTION, TINY = 1e-10, 0.2, 1e-300
 
-_pbtrs, _gbtrs = get_lapack_funcs(("pbtrs", "gbtrs"), dtype=np.float64)
+(_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 NONE = np.zeros(0)
 
 
@@ -93,21 +98,28 @@ class _SkylineFactor:
 
 
 @dataclass(frozen=True, eq=False)
-class _BandLU:
-    """Where rows may have been exchanged, in one band that has room for what that fills."""
+class _RefinedFactor:
+    """Of S + K, K skew: Σ_k (−S⁻¹K)^k S⁻¹, or `whole` where that does not contract."""
 
-    band: Array
-    exchanges: NDArray[np.int32]
-    order: Index
-    positive_definite: bool
+    symmetric: Factor
+    skew: sp.csc_array
+    whole: Callable[[], Factor]
+    positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        width = (len(self.band) - 1) // 3
-        permuted = right[self.order]
-        solved, _ = _gbtrs(self.band, width, width, permuted, self.exchanges, trans=transposed)
-        result = np.empty_like(right)
-        result[self.order] = solved.reshape(right.shape)
-        return result
+        found = correction = self.symmetric.solve(right)
+        size = last = np.abs(found).max(axis=0, initial=TINY)
+        shrinks = 1.0
+        # What the next correction would be is not worth another solution.
+        while (shrinks * last > ACCURACY * size).any():
+            pushed = self.skew @ correction
+            correction = self.symmetric.solve(pushed if transposed else -pushed)
+            length = np.abs(correction).max(axis=0, initial=TINY)
+            shrinks = float((length / last).max(initial=0.0))
+            if not shrinks <= CONTRACTION:
+                return self.whole().solve(right, transposed)
+            found, last = found + correction, length
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +138,13 @@ class Factoriser:
     ----------
     pattern : SymmetricPattern
     free : (k,) sorted degrees of freedom kept
-    choice : {"auto", "band", "sparse"}
-        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
+    choice : {"auto", "band", "sparse", "supernodal"}
+        Banded Cholesky, SuperLU, supernodal Cholesky, or whichever is estimated to cost least.
+
+    Raises
+    ------
+    InputError
+        Where a supernodal method is asked for and not installed.
     """
 
     def __init__(self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> None:
@@ -154,6 +171,9 @@ class Factoriser:
         # Whether an entry has the skew part's own sign; none on the diagonal.
         self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
         self._entries = pattern.entries
+        self._pool: list[Pardiso] = []
+        if choice == "supernodal":
+            self._pool.append(self._pardiso())
 
     @classmethod
     def of(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
@@ -165,8 +185,21 @@ class Factoriser:
         """Whether banded Cholesky is chosen."""
         if self.choice != "auto":
             return self.choice == "band"
-        band_work = self._size * self.half_bandwidth**2
-        return band_work <= LITTLE_WORK or band_work <= BAND_SPEED * self._sparse_work
+        if self.supernodal:
+            return False
+        return self._band_work <= max(LITTLE_WORK, BAND_SPEED * self._sparse_work)
+
+    @cached_property
+    def supernodal(self) -> bool:
+        """Whether supernodal Cholesky is chosen."""
+        if self.choice != "auto":
+            return self.choice == "supernodal"
+        wide = self.half_bandwidth > NARROW and self._band_work > LITTLE_WORK
+        return wide and library() is not None
+
+    @property
+    def _band_work(self) -> int:
+        return self._size * self.half_bandwidth**2
 
     @property
     def numbers(self) -> int:
@@ -174,14 +207,14 @@ class Factoriser:
         if self.banded:
             width = self.skyline.shape[1] if self.skyline else self.half_bandwidth + 1
             return self._size * width
+        if self.supernodal:
+            return self._supernodal_numbers
         return 3 * int(self._column_counts.sum())  # L, U, and their row numbers at half the size
 
     @property
     def unsymmetric_numbers(self) -> int:
         """Numbers that one factor of another matrix holds."""
-        if self.banded:
-            return (2 if self.skyline else 3) * self.numbers
-        return self.numbers
+        return (2 if self.skyline else 1) * self.numbers
 
     @cached_property
     def skyline(self) -> Skyline | None:
@@ -213,31 +246,65 @@ class Factoriser:
             If the matrix is singular or not finite.
         """
         skew = skew if skew.any() else NONE
-        if self.skyline:
-            factor = self._within(self.skyline, values, skew, room)
-            if factor:
-                return factor
+        within = self._within(values, skew, room)
+        if within:
+            return within
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
-        if not self.banded:
-            return self._sparse(values, skew)
-        if skew.size:
-            return self._band_lu(values, skew)
-        if not self.skyline:
-            band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
-            band.T.reshape(-1)[self._band_places] = values[self._kept]
-            if cholesky_in_place(band):
-                return _BandFactor(band, self._order)
-        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
+        symmetric = (self._within(values, NONE, room) if skew.size else None) or (
+            self._cholesky(values) or self._sparse(values)
+        )
+        if not skew.size:
+            return symmetric
+        definite = symmetric.positive_definite
+
+        @cache
+        def whole() -> Factor:
+            return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), definite)
+
+        entries = self._signs * skew[self._full_source]
+        return _RefinedFactor(symmetric, self._matrix(entries), whole) if definite else whole()
+
+    def _cholesky(self, values: Array) -> Factor | None:
+        """The factor of a matrix that is positive definite, where SuperLU is not chosen."""
+        if self.supernodal:
+            factor = SupernodalFactor(
+                self._pool.pop() if self._pool else self._pardiso(), self._pool
+            )
+            return factor if factor.pardiso.factorise(values[self._upper[2]]) else None
+        if not self.banded or self.skyline:
+            return None
+        band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
+        band.T.reshape(-1)[self._band_places] = values[self._kept]
+        return _BandFactor(band, self._order) if cholesky_in_place(band) else None
+
+    def _pardiso(self) -> Pardiso:
+        return Pardiso(*self._upper[:2])
+
+    @cached_property
+    def _supernodal_numbers(self) -> int:
+        if not self._pool:
+            self._pool.append(self._pardiso())
+        return self._pool[-1].numbers
+
+    @cached_property
+    def _upper(self) -> tuple[Index, Index, Index]:
+        """Starts of the upper triangle's rows, their columns, and where their values are."""
+        here = self._full_rows <= self._full_columns
+        rows, columns = self._full_rows[here], self._full_columns[here]
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(self._size + 1))
+        return starts, columns[order], self._full_source[here][order]
 
     def room(self, sides: int) -> Array | None:
         """Room for a factor, of two sides where the matrix is not symmetric, if it can be given."""
         return self.skyline.room(sides) if self.skyline else None
 
-    def _within(
-        self, skyline: Skyline, values: Array, skew: Array, room: Array | None
-    ) -> Factor | None:
+    def _within(self, values: Array, skew: Array, room: Array | None) -> Factor | None:
         """The factor within the skyline, unless the matrix needs exchanges of rows."""
+        skyline = self.skyline
+        if skyline is None:
+            return None
         count = 2 if skew.size else 1
         sides = skyline.room(count) if room is None else room[:count]
         pivots, growth = skyline.factorise(sides, values, skew)
@@ -245,28 +312,6 @@ class Factoriser:
         if not ((pivots > 0) & (pivots < np.inf) & (growth < GROWTH)).all():
             return None
         return _SkylineFactor(skyline, sides, pivots, self._order)
-
-    def _band_lu(self, values: Array, skew: Array) -> Factor:
-        width = self.half_bandwidth
-        band = np.zeros((3 * width + 1, self._size), order="F")
-        entries = band.T.reshape(-1)
-        lower, upper = self._lu_places
-        symmetric, other = values[self._kept], skew[self._kept]
-        entries[upper] = symmetric - other
-        entries[lower] = symmetric + other
-        exchanges = lu_in_place(band)
-        if exchanges is None:
-            raise np.linalg.LinAlgError("the matrix is singular")
-        definite = bool((band[2 * width] > 0).all())
-        if (exchanges != np.arange(1, self._size + 1)).any():
-            definite = self.factorise(values).positive_definite
-        return _BandLU(band, exchanges - 1, self._order, definite)
-
-    @cached_property
-    def _lu_places(self) -> tuple[Index, Index]:
-        """Where an entry of the lower triangle and its mirror image are in the band of LU."""
-        (i, j), width = self._ranks, self.half_bandwidth
-        return j * (3 * width + 1) + 2 * width + i - j, i * (3 * width + 1) + 2 * width + j - i
 
     def factorise_each(
         self,
@@ -291,25 +336,25 @@ class Factoriser:
         in_slices(run, count, threads)
         return [factors[k] for k in range(count)]
 
-    def _sparse(self, values: Array, skew: Array) -> Factor:
-        lu = self._superlu(values, pivot_below=0.0, skew=skew)
-        if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
-            return _SparseFactor(lu, positive_definite=True)
+    def _sparse(self, values: Array) -> Factor:
+        if not self.banded and not self.supernodal:
+            lu = self._superlu(values, pivot_below=0.0)
+            if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
+                return _SparseFactor(lu, positive_definite=True)
         # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
-        lu = self._superlu(values, pivot_below=0.1, skew=skew)
-        return _SparseFactor(lu, positive_definite=False)
+        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
+
+    def _matrix(self, entries: Array) -> sp.csc_array:
+        places = self._full_rows, self._full_columns
+        return sp.csc_array((entries, places), shape=(self._size, self._size))
 
     def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
         entries = values[self._full_source]
         if skew.size:
             entries += self._signs * skew[self._full_source]
-        matrix = sp.csc_array(
-            (entries, (self._full_rows, self._full_columns)),
-            shape=(self._size, self._size),
-        )
         try:
             return splu(
-                matrix,
+                self._matrix(entries),
                 permc_spec="MMD_AT_PLUS_A",
                 options={"SymmetricMode": True},
                 diag_pivot_thresh=pivot_below,

@@ -1,7 +1,7 @@
-"""LAPACK's banded Cholesky and LU without the interpreter lock, so that threads share the work.
+"""LAPACK's banded Cholesky without the interpreter lock, so that threads share the work.
 
-SciPy's own wrappers hold the lock while they factorise; its Cython interface gives the addresses
-of the same routines.
+SciPy's own wrappers hold the lock while they factorise; its Cython interface gives the address
+of the same routine.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ def _routine(name: str, arguments: int) -> Any:
 
 
 _DPBTRF = _routine("dpbtrf", 6)
-_DGBTRF = _routine("dgbtrf", 8)
 
 
 @cache
@@ -68,32 +67,3 @@ def cholesky_in_place(band: NDArray[np.float64]) -> bool:
         ctypes.addressof(failed_at),
     )
     return failed_at.value == 0
-
-
-def lu_in_place(band: NDArray[np.float64]) -> NDArray[np.int32] | None:
-    """Factorise a matrix given by its band; its row exchanges, or None where it is singular.
-
-    Parameters
-    ----------
-    band : (3 · half-bandwidth + 1, n) Fortran-ordered ndarray
-        Entry (i, j) in row 2 · half-bandwidth + i − j; overwritten by the factors.
-
-    Returns
-    -------
-    (n,) ndarray
-        The row that each row was exchanged with, counted from one.
-    """
-    rows, columns = band.shape
-    size, width, leading = (ctypes.c_int(k) for k in (columns, (rows - 1) // 3, rows))
-    exchanges, failed_at = np.empty(columns, dtype=np.int32), ctypes.c_int(0)
-    _DGBTRF(
-        ctypes.addressof(size),
-        ctypes.addressof(size),
-        ctypes.addressof(width),
-        ctypes.addressof(width),
-        band.ctypes.data,
-        ctypes.addressof(leading),
-        exchanges.ctypes.data,
-        ctypes.addressof(failed_at),
-    )
-    return exchanges if failed_at.value == 0 else None

@@ -112,7 +112,7 @@ class BlockSolver:
     rows : int, optional
         Grid times to take, all by default.
     stopwatch : Stopwatch, optional
-    factorisation : {"auto", "band", "sparse"}
+    factorisation : {"auto", "band", "sparse", "supernodal"}
         See `nlp.factorisation`.
     """
 
@@ -310,7 +310,9 @@ class BlockSolver:
     def chunk(self) -> int:
         """Timesteps that are evaluated and factorised at a time."""
         most = ROOMS if self.factoriser.skyline else self.dynamics.rows
-        return max(1, min(self.dynamics.rows, most, int(CHUNK_BYTES / self._step_bytes)))
+        # Each thread has one to factorise, however large it is.
+        least = min(self.body.threads, self.dynamics.rows)
+        return max(least, min(self.dynamics.rows, most, int(CHUNK_BYTES / self._step_bytes)))
 
     @property
     def chunk_bytes(self) -> int:

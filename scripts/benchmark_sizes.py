@@ -1,0 +1,123 @@
+"""Where time and memory go in larger bodies: simulation and a sweep at 500 to 20,000 nodes.
+
+The swung cylinder of `benchmark_methods.py`, with the default damping or Rayleigh's. Each line is a
+process of its own: peak memory is its own. A sweep is a feasibility step and the sensitivities by
+four parameters; a few timesteps tell what one costs.
+
+    python scripts/benchmark_sizes.py                              # all sizes, one and two threads
+    python scripts/benchmark_sizes.py --size 4953 --steps 200      # peak memory of 200 steps
+    python scripts/benchmark_sizes.py --size 2013 --factorisation band sparse supernodal
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung
+
+from collocation_sysid import Body, Collocation
+from collocation_sysid.nlp.marching import march_on
+from collocation_sysid.nlp.newton import NewtonOptions
+from collocation_sysid.nlp.stopwatch import Stopwatch
+from collocation_sysid.nlp.tangent import BlockSolver
+
+# Nodes: rings x layers of the cylinder, element, and steps that are enough to tell.
+SIZES = {
+    481: ("3x12", "tet4", 40),
+    2013: ("4x32", "tet4", 20),
+    2145: ("2x16", "tet10", 20),
+    4953: ("6x38", "tet4", 10),
+    20191: ("10x60", "tet4", 5),
+}
+CHOICES = ("auto", "band", "sparse", "supernodal")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds of one part, and how they are shared out."""
+
+    total_s: float
+    stopwatch: Stopwatch
+
+    def told(self, steps: int) -> str:
+        spent = self.stopwatch
+        shares = spent.evaluations / self.total_s, spent.linear_algebra / self.total_s
+        return (
+            f"{1e3 * self.total_s / steps:8.1f} ms a step (elements {shares[0]:4.0%}, "
+            f"linear algebra {shares[1]:4.0%})"
+        )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", type=int, nargs="+", choices=[*SIZES], default=[*SIZES])
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--factorisation", nargs="+", choices=CHOICES, default=["auto"])
+    parser.add_argument("--damping", default="kelvin-voigt")
+    parser.add_argument("--steps", type=int)
+    given = parser.parse_args()
+    for size in given.size:
+        for choice in given.factorisation:
+            for threads in given.threads:
+                arguments = size, given.steps, threads, choice, given.damping
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    print(pool.apply(measured, arguments), flush=True)
+
+
+def measured(size: int, steps: int | None, threads: int, choice: str, damping: str) -> str:
+    """A line on one body."""
+    mesh, element, few = SIZES[size]
+    steps = steps or few
+    body = Body(
+        cylinder(mesh), density_kg_m3=20.0, damping=damping, element=element, threads=threads
+    )
+    collocation = Collocation([swung(body, steps + 1)], PARAMETERS)
+    (segment,) = collocation.segments
+    setting = segment.setting(np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0))
+    before_mb = peak_mb()
+    began, spent = time.perf_counter(), Stopwatch()
+    x, failure = march_on(
+        segment.experiment,
+        setting.dynamics,
+        setting.theta,
+        options=NewtonOptions(tolerance=1e-6),
+        stopwatch=spent,
+    )
+    if failure:
+        raise failure
+    march = Cost(time.perf_counter() - began, spent)
+    spent = Stopwatch()
+    solver = BlockSolver(segment, stopwatch=spent, factorisation=choice)
+    # The analysis of the pattern is made once for all sweeps.
+    numbers = solver.chunk_bytes
+    began = time.perf_counter()
+    solver.forward(x, setting)
+    sweep = Cost(time.perf_counter() - began, spent)
+    return (
+        f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
+        f"{kind(solver):10s} march {march.told(steps)}  sweep {sweep.told(steps)}  "
+        f"at a time {solver.chunk} steps, {numbers / 1e6:.0f} MB; "
+        f"peak {peak_mb():.0f} MB, before {before_mb:.0f} MB"
+    )
+
+
+def kind(solver: BlockSolver) -> str:
+    """What factorises."""
+    chosen = solver.factoriser
+    if chosen.skyline:
+        return "skyline"
+    return "band" if chosen.banded else "supernodal" if chosen.supernodal else "sparse"
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()
