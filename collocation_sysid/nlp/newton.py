@@ -115,7 +115,7 @@ class Solver:
         self._require_upright(x)
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
-        step = factor.solve(value[self.free])
+        step = self._step(factor, value)
         for _ in range(self.options.iterations):
             if self._is_last(step):
                 x[self.free] += step
@@ -133,7 +133,7 @@ class Solver:
             value, *matrix = self._timed(linearise, x)
             pulled = self.pattern.products(matrix[0][None], way[None])[0]
             factor = self._factorise(matrix, x, keep_definite=False)
-            found[self.free] += factor.solve((value - pulled)[self.free])
+            found[self.free] += self._step(factor, value - pulled)
         return found
 
     def _backtrack(
@@ -157,7 +157,7 @@ class Solver:
                     value, *matrix = self._timed(linearise, trial)
                 else:
                     value, matrix = self._timed(residual, trial), None
-                next_step = factor.solve(value[self.free])
+                next_step = self._step(factor, value)
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                     if self._is_last(next_step, STALE) and not keep_definite:
                         return trial, factor, next_step
@@ -165,7 +165,7 @@ class Solver:
                         value, *matrix = self._timed(linearise, trial)
                     try:
                         own = self._factorise(matrix, trial, keep_definite)
-                        return trial, own, own.solve(value[self.free])
+                        return trial, own, self._step(own, value)
                     except NewtonFailure:
                         pass
             share /= 2
@@ -184,6 +184,10 @@ class Solver:
         if keep_definite and not factor.positive_definite:
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
+
+    def _step(self, factor: Factor, residual: Array) -> Array:
+        with self.stopwatch.solving():
+            return factor.solve(residual[self.free])
 
     def _timed(self, function: Callable[[Array], T], x: Array) -> T:
         with self.stopwatch.evaluating():
