@@ -55,7 +55,7 @@ def costs(
     z : (variables,) the start
     nonzeros : int
         Of the Jacobian and the Hessian that interior point gets, together.
-    factorisation : {"auto", "band", "sparse"}
+    factorisation : {"auto", "band", "sparse", "supernodal"}
     """
     width = max(unknowns_of_a_timestep(collocation))
     return (

@@ -66,8 +66,9 @@ class ReducedSpace(Options):
     hessian : {"gauss-newton", "exact"}
         Near the answer, what Gauss–Newton leaves out is learned from the steps, or computed
         exactly from the Lagrangian: a second sweep an iteration, for large residuals.
-    factorisation : {"auto", "band", "sparse"}
-        Banded Cholesky, SuperLU, or whichever is estimated to cost less.
+    factorisation : {"auto", "band", "sparse", "supernodal"}
+        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated
+        to cost least.
     """
 
     name: ClassVar[str] = "reduced-space"

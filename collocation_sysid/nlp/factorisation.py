@@ -37,9 +37,10 @@ Choice = Literal["auto", "band", "sparse", "supernodal"]
 # against 4 GFlop/s on one core), and below this work there is nothing to choose.
 BAND_SPEED = 10.0
 LITTLE_WORK = 1e8
+# From this work of a band on, some 3,000 nodes of a stout body, supernodal sweeps are faster.
+MUCH_WORK = 2e9
 
-# In wider bands LAPACK is faster (measured: 17 GFlop/s at 200, its Cholesky 21 at 300), and what is
-# supernodal is faster still (`scripts/benchmark_sizes.py`).
+# In wider bands LAPACK is faster (measured: 17 GFlop/s at 200, its Cholesky 21 at 300).
 NARROW = 250
 # Without exchanges a diagonal entry may grow so many times; of definite matrices it never does.
 GROWTH = 10.0
@@ -194,7 +195,7 @@ class Factoriser:
         """Whether supernodal Cholesky is chosen."""
         if self.choice != "auto":
             return self.choice == "supernodal"
-        wide = self.half_bandwidth > NARROW and self._band_work > LITTLE_WORK
+        wide = self.half_bandwidth > NARROW and self._band_work > MUCH_WORK
         return wide and library() is not None
 
     @property

@@ -124,7 +124,7 @@ class Solver:
                 return x
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
-        step = factor.solve(value[self.free])
+        step = self._step(factor, value)
         for _ in range(self.options.iterations):
             if self._is_last(step):
                 self._kept = factor
@@ -137,8 +137,7 @@ class Solver:
         """As near to the solution as the kept factor leads fast, and whether that is there."""
         found, before, done = x.copy(), None, False
         for _ in range(OFTEN):
-            with self.stopwatch.solving():
-                step = kept.solve(self._timed(residual, found)[self.free])
+            step = self._step(kept, self._timed(residual, found))
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
             if not rate <= 1.0:
@@ -160,7 +159,7 @@ class Solver:
             value, *matrix = self._timed(linearise, x)
             pulled = self.pattern.products(matrix[0][None], way[None])[0]
             factor = self._factorise(matrix, x, keep_definite=False)
-            found[self.free] += factor.solve((value - pulled)[self.free])
+            found[self.free] += self._step(factor, value - pulled)
         return found
 
     def _backtrack(
@@ -184,7 +183,7 @@ class Solver:
                     value, *matrix = self._timed(linearise, trial)
                 else:
                     value, matrix = self._timed(residual, trial), None
-                next_step = factor.solve(value[self.free])
+                next_step = self._step(factor, value)
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                     if self._is_last(next_step, STALE) and not keep_definite:
                         return trial, factor, next_step
@@ -192,7 +191,7 @@ class Solver:
                         value, *matrix = self._timed(linearise, trial)
                     try:
                         own = self._factorise(matrix, trial, keep_definite)
-                        return trial, own, own.solve(value[self.free])
+                        return trial, own, self._step(own, value)
                     except NewtonFailure:
                         pass
             share /= 2
@@ -211,6 +210,10 @@ class Solver:
         if keep_definite and not factor.positive_definite:
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
+
+    def _step(self, factor: Factor, residual: Array) -> Array:
+        with self.stopwatch.solving():
+            return factor.solve(residual[self.free])
 
     def _timed(self, function: Callable[[Array], T], x: Array) -> T:
         with self.stopwatch.evaluating():
