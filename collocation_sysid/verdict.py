@@ -29,6 +29,9 @@ from .statistics.trust import (
 )
 from .statistics.uncertainty import Uncertainty
 
+# Noise of cameras over a body's size is less.
+NO_CAMERA = 0.01
+
 
 def concerns(
     solution: Solution,
@@ -50,6 +53,7 @@ def concerns(
         yield from parameter_concerns(uncertainty)
     elif solution.collocation.nq:
         yield "no error bars could be found", "doubtful"
+    yield from allowance_concerns(solution)
     yield from marker_concerns(diagnoses)
     for part in solution.collocation.parts(solution.z):
         nuisance = part.segment.nuisance
@@ -89,6 +93,25 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
     unscaled = scale_concern(experiments, solution.collocation.parameters)
     if unscaled is not None:
         yield unscaled, "doubtful"
+
+
+def allowance_concerns(solution: Solution) -> Iterator[Concern]:
+    """A `sigma_m` of equilibria that allows for more than cameras miss.
+
+    Of recordings that go on in time, residuals tell by their autocorrelation; of these nothing does.
+    """
+    for experiment in (segment.experiment for segment in solution.collocation.segments):
+        if not experiment.static or not experiment.markers.samples:
+            continue
+        sigma_m = float(np.max(experiment.markers.sigma_m))
+        share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
+        if share > NO_CAMERA:
+            yield (
+                f"sigma_m = {1e3 * sigma_m:.3g} mm is {share:.2g} of the body's size, more than "
+                "cameras miss: if the model's error decides, error bars of independent errors are "
+                "too short",
+                "check",
+            )
 
 
 def _of_rollout(

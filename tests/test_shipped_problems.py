@@ -198,6 +198,7 @@ def test_a_tentacle_bent_by_tendons_is_fitted_to_a_few_millimetres():
     assert found.solution.status.converged
     assert 3.4e5 < found.parameters["young_pa"] < 4.1e5
     assert found.solution.rms_m < 0.007
+    assert any("more than cameras miss" in said for said in found.trust.reasons)
 
 
 # What motion capture does to markers ----------------------------------------------------------

@@ -172,6 +172,12 @@ def test_a_body_that_bends_far_is_found_in_few_sweeps_and_saved(tmp_path):
     with pictures_drawn():
         found.save(tmp_path / "run")
     assert len(list((tmp_path / "run" / "frames").iterdir())) == 1
+    # Single samples tell nothing of an error that markers share.
+    assert found.trust.verdict == "good"
+    bar = found.problem.experiments[0]
+    coarse = replace(bar, markers=replace(bar.markers, sigma_m=0.005))
+    allowed = run(cs.Problem([coarse], DROOPING | guess), seek_causes=False)
+    assert "sigma_m = 5 mm is 0.017 of the body's size" in " ".join(allowed.trust.reasons)
 
 
 def test_a_large_step_of_a_platen_is_taken_in_parts():
