@@ -98,7 +98,7 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
     """A `sigma_m` of equilibria that allows for more than cameras miss.
 
-    Of recordings that go on in time, residuals tell by their autocorrelation; of these nothing does.
+    Recordings that go on in time tell it by their autocorrelation; of these nothing does.
     """
     for experiment in (segment.experiment for segment in solution.collocation.segments):
         if not experiment.static or not experiment.markers.samples:
