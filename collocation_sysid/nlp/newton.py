@@ -24,7 +24,7 @@ T = TypeVar("T")
 STALE = 0.01
 # Steps with the factor of the solution before are taken while each is this much shorter than the
 # last, so often at most, and until what is left is this share of a last step.
-FAST, OFTEN, LEFT = 0.1, 8, 1e-3
+FAST, OFTEN, LEFT = 0.1, 8, 1e-5
 
 
 @dataclass(frozen=True)
