@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from checks import directional_derivative
+from memories_small import guesses, recorded, truth
 from problems_small import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
@@ -111,3 +112,12 @@ def test_options_that_mean_nothing_are_refused():
         ReducedSpace(hessian="limited-memory")  # type: ignore
     with pytest.raises(InputError, match="huber"):
         with_noise(1e-3, huber=0.0)
+
+
+def test_an_exact_hessian_is_refused_where_there_is_none_before_anything_is_solved():
+    def watch(_: object) -> None:
+        raise AssertionError("a sweep was made")
+
+    remembers = Collocation([recorded("hung-cube", 4)], guesses(truth(1)))
+    with pytest.raises(InputError, match=r"materials with memory .*expected 'gauss-newton'"):
+        ReducedSpace(hessian="exact")(remembers, watch)

@@ -12,6 +12,26 @@ from .horizon import Point
 from .multipliers import constraint_multipliers
 
 
+def require_second_derivatives(collocation: Collocation) -> None:
+    """Refuse what has none.
+
+    Raises
+    ------
+    InputError
+        For materials with memory, and measured wrenches.
+    """
+    if collocation.remembers:
+        raise InputError(
+            "hessian = 'exact' has no second derivatives of materials with memory (prony); "
+            "expected 'gauss-newton'"
+        )
+    if any(segment.sensors for segment in collocation.segments):
+        raise InputError(
+            "hessian = 'exact' has no second derivatives of measured wrenches; expected "
+            "'gauss-newton'"
+        )
+
+
 def exact_curvature(
     collocation: Collocation, point: Point, stopwatch: Stopwatch | None = None
 ) -> Array:
@@ -25,16 +45,6 @@ def exact_curvature(
     SimulationError
         Where a timestep's equations are singular.
     """
-    if collocation.remembers:
-        raise InputError(
-            "hessian = 'exact' has no second derivatives of materials with memory (prony); "
-            "expected 'gauss-newton'"
-        )
-    if any(segment.sensors for segment in collocation.segments):
-        raise InputError(
-            "hessian = 'exact' has no second derivatives of measured wrenches; expected "
-            "'gauss-newton'"
-        )
     projected = [x + tangent.step for x, tangent in zip(point.x, point.tangents, strict=True)]
     z = collocation.pack(point.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)

@@ -32,6 +32,7 @@ from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
 from ..nlp.tangent import BlockSolver
+from .curvature import require_second_derivatives
 from .ladder import SHARES, Shares
 from .method import Watch
 from .options import Options
@@ -91,6 +92,8 @@ class ReducedSpace(Options):
         Lines of the history count sweeps, rejected ones included; the first are those of short
         horizons.
         """
+        if self.hessian == "exact":
+            require_second_derivatives(collocation)
         recorder = Recorder(self.name, collocation, watch)
         search = Search(self, recorder, start)
         status, message = recorder.search(search.run)
