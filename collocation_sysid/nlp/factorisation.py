@@ -269,10 +269,12 @@ class Factoriser:
     def _cholesky(self, values: Array) -> Factor | None:
         """The factor of a matrix that is positive definite, where SuperLU is not chosen."""
         if self.supernodal:
-            factor = SupernodalFactor(
-                self._pool.pop() if self._pool else self._pardiso(), self._pool
-            )
-            return factor if factor.pardiso.factorise(values[self._upper[2]]) else None
+            try:
+                pardiso = self._pool.pop()
+            except IndexError:  # not asked for beforehand: other threads take from it too
+                pardiso = self._pardiso()
+            factor = SupernodalFactor(pardiso, self._pool)
+            return factor if pardiso.factorise(values[self._upper[2]]) else None
         if not self.banded or self.skyline:
             return None
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
