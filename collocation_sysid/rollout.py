@@ -13,7 +13,6 @@ from .experiment import Experiment
 from .fem.batched import side_by_side
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution, wrench_rms
-from .nlp.parameters import Parameters
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem
@@ -109,7 +108,9 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     alone = replace(
         collocation,
         experiments=[replace(experiment, validation=False)],
-        parameters=Parameters.of({name: found[name] for name in body.used_names(list(found))}),
+        parameters=collocation.parameters.fixed_at(
+            {name: found[name] for name in body.used_names(list(found))}
+        ),
     )
     (segment,) = alone.segments
     # All that is left to estimate is φ.

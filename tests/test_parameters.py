@@ -535,3 +535,13 @@ def test_parameters_that_do_not_fit_the_regions_are_refused(name: str):
 def test_a_name_given_twice_is_refused():
     with pytest.raises(InputError, match="mu_pa: given twice, expected one value"):
         Parameters((IN_LAME.items[1], *IN_LAME.items))
+
+
+def test_what_was_found_below_zero_can_be_fixed_there():
+    """So are the constants of a recording that is predicted only."""
+    free = Parameters.of({"c10_pa": 1e4, "c01_pa": Unknown(-1e3, scale="linear")})
+    fixed = free.fixed_at({"c01_pa": -1.4e3})
+    assert (fixed.names, fixed.free) == (("c01_pa",), ())
+    assert fixed.values(np.zeros(0)) == {"c01_pa": -1.4e3}
+    with pytest.raises(InputError, match=r"c01_pa.*fixed = -1400, expected a number >= 0"):
+        Parameters.of({"c01_pa": -1.4e3})

@@ -135,7 +135,8 @@ class Parameter:
             )
 
     def _check_fixed(self) -> None:
-        least = constant_named(self.name).least
+        constant = constant_named(self.name)
+        least = constant.at_least if self.scale == "linear" else constant.least
         value = np.nan if self.guess is None else self.guess
         if not (np.isfinite(value) and value >= least):
             expected = "a number" if least < 0 else "a number >= 0"
@@ -251,6 +252,13 @@ class Parameters:
     def of(cls, given: Mapping[str, Unknown | Tied | float]) -> Parameters:
         """Parameters by name; a number is a fixed value."""
         return cls(tuple(parameter(name, value) for name, value in given.items()))
+
+    def fixed_at(self, values: Mapping[str, float]) -> Parameters:
+        """Those of these names, all with these values."""
+        own = (item for item in self.items if item.name in values)
+        return Parameters(
+            tuple(replace(item, guess=values[item.name], fixed=True, tied=None) for item in own)
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
