@@ -52,13 +52,10 @@ def test_quality_is_one_for_the_regular_tetrahedron():
     assert quality.edge_max_m == pytest.approx(np.sqrt(8))
 
 
-def test_quality_names_the_worst_element_in_a_sentence():
+def test_quality_of_a_flat_element_is_below_the_median():
     points = np.vstack([CORNERS, [[0.4, 0.4, 0.4]]])
     quality = TetMesh(points, [[0, 1, 2, 3], [1, 2, 3, 4]]).quality()
-    assert quality.worst_element == 1
     assert quality.quality_min < quality.quality_median < 1
-    assert "5 nodes, 2 tetrahedra" in quality.describe()
-    assert "element 1" in quality.describe()
 
 
 def test_arrays_are_read_only(box):

@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Array
 from ..fem.body import Body
 from ..fem.mesh import TetMesh
+from ..fem.mesh_checks import edge_lengths, mean_ratios
 from ..fem.moduli import engineering
 
 # Mean-ratio quality below which an element's shape functions are poor.
@@ -24,7 +25,6 @@ SLENDER, CELLS_ACROSS = 2.5, {"tet4": 4.0, "tet10-p0": 2.0}
 LINEAR = "tet4"
 FOR_BENDING, FOR_VOLUME = 'set object.element = "tet10"', 'set object.element = "tet10-p0"'
 
-_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
@@ -68,11 +68,10 @@ class Slenderness:
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
     """The elements of lowest quality, worst first."""
     corners = mesh.points_m[mesh.tetrahedra]
-    lengths = np.stack([np.linalg.norm(corners[:, b] - corners[:, a], axis=1) for a, b in _EDGES])
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
-    quality = 12 * (3 * mesh.volumes_m3) ** (2 / 3) / (lengths**2).sum(axis=0)
-    longest = lengths.max(axis=0)
+    quality = mean_ratios(mesh.points_m, mesh.tetrahedra)
+    longest = edge_lengths(mesh.points_m, mesh.tetrahedra).max(axis=1)
     return tuple(
         ElementShape(int(e), float(quality[e]), float(longest[e] / heights[e]), float(longest[e]))
         for e in np.argsort(quality, kind="stable")[:count]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import zipfile
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,8 +15,6 @@ from .formats.plain import read_grid
 from .formats.text import Grid, Row, decode, listed, numbers, read_bytes
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
-
-QuaternionOrder = Literal["xyzw", "wxyz"]
 
 POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 

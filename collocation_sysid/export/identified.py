@@ -194,14 +194,6 @@ class Identified:
         return self.experiment.node_forces_n([self.start_s])[0] + weight
 
     @cached_property
-    def node_drag_n_s_m(self) -> Array:
-        """(n,) what γ_m brakes each node with, −force over velocity."""
-        # A rigid translation deforms nothing: no other damping acts.
-        along = np.ones_like(self.body.nodes_m)
-        tied = np.repeat(self.tied_kg, 3)
-        return -self.body.force(self.body.nodes_m, along, self.theta, tied)[0, ::3]
-
-    @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
         """The parts of the body."""
         body, found = self.body, []

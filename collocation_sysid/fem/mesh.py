@@ -20,7 +20,7 @@ from .mesh_checks import (
     checked_points,
     checked_tetrahedra,
     cleaned,
-    measured_quality,
+    mean_ratios,
     signed_volumes,
     unique_edges,
 )
@@ -247,7 +247,10 @@ class TetMesh:
 
     def quality(self) -> MeshQuality:
         """Measure the elements."""
-        return measured_quality(self.points_m, self.tetrahedra, self.edges)
+        lengths = np.linalg.norm(np.diff(self.points_m[self.edges], axis=1), axis=2)
+        ratios = mean_ratios(self.points_m, self.tetrahedra)
+        edges_m = lengths.min(), lengths.mean(), lengths.max()
+        return MeshQuality(*map(float, (*edges_m, ratios.min(), np.median(ratios))))
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:

@@ -144,54 +144,23 @@ def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MeshQuality:
-    """Size and shape of a mesh's elements.
+    """Lengths of a mesh's edges, and the mean ratios of its elements."""
 
-    The quality of an element is its mean ratio 12 (3V)^(2/3) / Σ l² over its six edges: 1 for
-    the regular tetrahedron, towards 0 the flatter it gets.
-    """
-
-    nodes: int
-    elements: int
-    volume_m3: float
     edge_min_m: float
     edge_mean_m: float
     edge_max_m: float
     quality_min: float
     quality_median: float
-    worst_element: int
-
-    def describe(self) -> str:
-        """Return the numbers as a sentence."""
-        low, mean, high = (1e3 * x for x in (self.edge_min_m, self.edge_mean_m, self.edge_max_m))
-        return (
-            f"{self.nodes} nodes, {self.elements} tetrahedra, {self.volume_m3:.4g} m³; "
-            f"edges {low:.3g} to {high:.3g} mm (mean {mean:.3g} mm); "
-            f"mean-ratio quality {self.quality_min:.2f} at worst (element {self.worst_element}), "
-            f"{self.quality_median:.2f} in the median."
-        )
 
 
-def measured_quality(
-    points_m: np.ndarray, tetrahedra: np.ndarray, edges: np.ndarray
-) -> MeshQuality:
-    """Measure positively oriented tetrahedra and their `unique_edges`."""
-    volumes = signed_volumes(points_m, tetrahedra)
-    quality = 12 * (3 * volumes) ** (2 / 3) / (_edge_lengths(points_m, tetrahedra) ** 2).sum(axis=1)
-    lengths = np.linalg.norm(np.diff(points_m[edges], axis=1), axis=2)
-    return MeshQuality(
-        nodes=len(points_m),
-        elements=len(tetrahedra),
-        volume_m3=float(volumes.sum()),
-        edge_min_m=float(lengths.min()),
-        edge_mean_m=float(lengths.mean()),
-        edge_max_m=float(lengths.max()),
-        quality_min=float(quality.min()),
-        quality_median=float(np.median(quality)),
-        worst_element=int(quality.argmin()),
-    )
+def mean_ratios(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """12 (3V)^(2/3) / Σ l² over an element's edges, (E,): 1 if regular, towards 0 if flat."""
+    volumes, squares = signed_volumes(points_m, tetrahedra), edge_lengths(points_m, tetrahedra) ** 2
+    return 12 * (3 * volumes) ** (2 / 3) / squares.sum(axis=1)
 
 
-def _edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """(E, 6) lengths of the elements' edges."""
     ends = points[tetrahedra[:, _EDGES]]
     return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
 
@@ -220,7 +189,7 @@ def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
 
 def _refuse_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
     volumes = np.abs(signed_volumes(points, tetrahedra))
-    cubes = _edge_lengths(points, tetrahedra).mean(axis=1) ** 3
+    cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
     bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
     if len(bad):
         raise InputError(

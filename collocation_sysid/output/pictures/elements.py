@@ -8,10 +8,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...fem.mesh_checks import signed_volumes
+from ...fem.mesh_checks import edge_lengths, mean_ratios
 from ..style import BLUE, COLUMN_MM, VERMILION, dress, framed_figure
 
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 BINS = 24
 
 
@@ -26,10 +25,8 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
     nodes_m : (n, 3) undeformed
     tetrahedra : (E, 4) corners
     """
-    squares = (np.diff(nodes_m[tetrahedra[:, _EDGES]], axis=2) ** 2).sum(axis=(1, 2, 3))
-    quality = 12 * (3 * signed_volumes(nodes_m, tetrahedra)) ** (2 / 3) / squares
-    quality = np.minimum(quality, 1.0)  # rounding
-    size_mm = 1e3 * np.sqrt(squares / 6)
+    quality = np.minimum(mean_ratios(nodes_m, tetrahedra), 1.0)  # rounding
+    size_mm = 1e3 * np.sqrt((edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1))
     figure = framed_figure(COLUMN_MM, 42, 13, 2, 9.5, 5.5)
     left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
     widest = float(size_mm.max())
