@@ -7,7 +7,7 @@ RUN := runs/foam_cylinder
 
 TRIED := build/tried
 
-.PHONY: help solve test test-dependencies check bench docs dist clean
+.PHONY: help solve test test-long test-dependencies check bench docs dist clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' Makefile
@@ -18,6 +18,9 @@ solve: $(CORE) ## identify the foam cylinder's parameters
 
 test: $(DEV) ## run the tests
 	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+
+test-long: $(DEV) ## run whole runs, the notebook and the gallery
+	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "long and not slow"
 
 test-dependencies: ## run the tests with the lowest dependencies, and with the newest
 	@mkdir -p build && $(PYTHON) scripts/lowest_dependencies.py > build/lowest.txt && : > build/newest.txt

@@ -14,6 +14,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_coverage import CASES, KINDS, Outcome, run
 
+pytestmark = pytest.mark.long
+
 TWINS, MANY = 2, 15  # of each case; two cases have the same noise
 SIGMA_M = 1e-3
 # What chance leaves out in one of a thousand tests.

@@ -449,6 +449,7 @@ def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
 # The command line -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     monkeypatch.chdir(tiny)
     monkeypatch.setenv("COLUMNS", "80")

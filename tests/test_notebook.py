@@ -36,6 +36,7 @@ def notebook_cells() -> list[dict]:
     return json.loads(NOTEBOOK.read_text())["cells"]
 
 
+@pytest.mark.long
 def test_the_cells_run_from_top_to_bottom(monkeypatch: pytest.MonkeyPatch) -> None:
     """The notebook states numbers; its own assertions check them."""
     drawn: list[Figure] = []

@@ -15,6 +15,8 @@ from problem_files import TRUTH, pictures_drawn, run_command, settings, write_pr
 from collocation_sysid.output.remedies import LAST, REMEDIES, remedies_for, remedy_for
 from collocation_sysid.output.report.run_page import verdict
 
+pytestmark = pytest.mark.long
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTHS = {"narrow": 380, "wide": 1280}
 

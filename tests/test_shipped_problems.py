@@ -233,6 +233,7 @@ def standard_errors_off(solution: Solution) -> np.ndarray:
     return np.abs(errors) / np.sqrt(np.diag(attainable().covariance))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("as_shipped", [True, False])
 def test_huber_and_offsets_together_recover_the_truth_from_the_noisy_cylinder(as_shipped: bool):
     solution = noisy_run().solution if as_shipped else noisy_fit(huber=True, offsets=True)

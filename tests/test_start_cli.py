@@ -13,6 +13,8 @@ from problem_files import TRUTH, contents, pictures_drawn, run_command, settings
 import collocation_sysid as cs
 from collocation_sysid.earlier import Earlier
 
+pytestmark = pytest.mark.long
+
 UNGUESSED = settings(*(f"parameters.{name}={{}}" for name in TRUTH))
 
 

@@ -163,6 +163,7 @@ def drooping_bar() -> Experiment:
 DROOPING = {"lambda_pa": 2e3, "mu_pa": 2e3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 
 
+@pytest.mark.long
 def test_a_body_that_bends_far_is_found_in_few_sweeps_and_saved(tmp_path):
     """A step along the tangent stretches it, and would be refused unless it were short."""
     guess = {"lambda_pa": cs.Unknown(guess=3e3), "mu_pa": cs.Unknown(guess=3e3)}

@@ -18,6 +18,8 @@ import study_noise
 import study_table1
 from studies import HEADS, TRUTH, Variant, markdown, run_variants, worst_error
 
+pytestmark = pytest.mark.long
+
 SIGMA_M = 1e-3
 
 

@@ -161,6 +161,7 @@ def test_faultless_twins_are_good(seed):
     assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["gravity", slow("clock 100 ms late"), slow("markers exchanged")])
 def test_faults_that_spoil_the_answer_are_doubtful(fault):
     found = judged(fault)
@@ -174,6 +175,7 @@ def test_no_hidden_fault_is_good(fault):
     assert judged(fault).trust.verdict != "good"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("factor", "words"), [slow(0.3, "as large as"), (3.0, "too large")])
 def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     problem = twin("block", SOFT, 100)
@@ -222,6 +224,7 @@ def test_an_answer_that_did_not_converge_is_doubtful():
     assert "did not converge" in lost.trust.reasons[0]
 
 
+@pytest.mark.long
 def test_strict_fails_where_the_verdict_is_doubtful(tmp_path):
     file = write_problem(tmp_path, {"swing": 25})
     method = settings("solver.method=reduced-space", "transcription.scheme=midpoint")

@@ -50,6 +50,7 @@ def blind(experiment: Experiment) -> Experiment:
     return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
 
 
+@pytest.mark.long
 def test_methods_find_the_same_optimum():
     collocation = Collocation([swung(steps=20)], GUESS)
     reduced = ReducedSpace()(collocation)

@@ -185,6 +185,7 @@ def test_a_clock_that_is_estimated_is_told(rng):
     assert any("ms" in said and "than their times say" in said for said in reasons), reasons
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "fault",  # of gravity `test_trust` asks for the verdict and the cause
     [pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f for f in AFTER],

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import scipy.sparse as sp
@@ -280,7 +280,7 @@ class Body(Model):
         """(3n,) mass of every dof."""
         return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
-    @property
+    @cached_property
     def unsymmetric(self) -> bool:
         """Whether the slopes of the force have a skew part."""
         return any(part.damping.stress is not None for part in self.parts)
@@ -393,7 +393,7 @@ class Body(Model):
         counts = [2 * len(part.prony) for part in self.parts]
         return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
 
-    @property
+    @cached_property
     def linearisation_width(self) -> int:
         """Length of one timestep's row of `linearise`."""
         entries = (2 + self.unsymmetric) * self.pattern.entries
@@ -443,7 +443,7 @@ class Body(Model):
             theta_theta[:, density, density - 1] = theta_theta[:, density - 1, density] = mixed
         return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew)
 
-    @property
+    @cached_property
     def curvature_width(self) -> int:
         """Length of one timestep's row of `curvature`."""
         k = len(self.constants)
@@ -484,7 +484,8 @@ class Body(Model):
 
     def _drag(self, theta: Theta, tied_kg: Array | None) -> Array:
         """(3n,) or (T, 3n) of f = −drag v by mass-proportional damping [N·s/m]."""
-        return np.sum([theta[k] * mass for k, mass in self._damped(theta, tied_kg)], axis=0)
+        # `numpy.sum` of a list takes longer than the products.
+        return reduce(np.add, (theta[k] * mass for k, mass in self._damped(theta, tied_kg)))
 
     def _drag_slopes(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Places in θ, and the slopes of that by them."""

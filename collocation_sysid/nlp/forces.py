@@ -9,6 +9,7 @@ experiment's pattern.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +50,7 @@ class Mass:
         """M (T, 3n) [kg]."""
         return _sum_of_rows(self.body.mass_of_dofs(theta), self.tied_kg)
 
-    @property
+    @cached_property
     def tied(self) -> Array | None:
         """(3n,) or (T, 3n) what is tied; None where nothing is."""
         if not len(self.tied_kg) or self.tied_kg.strides[0]:
@@ -150,14 +151,21 @@ class Forces:
         """The same with tensions and pressures that are off by values (A, 2), see `Drives`."""
         return replace(self, drives=self.drives.off_by(values))
 
-    @property
+    @cached_property
     def _gravity(self) -> Array:
         """(3n,)."""
         return np.tile(self.gravity_m_s2, self.body.pattern.size // 3)
 
     def external_n(self, theta: Theta) -> Array:
         """(T, 3n) those that do not depend on the state: weight, and forces on nodes."""
+        if not self.body.mass_slopes:
+            return self._external_n
         return self.mass.at(theta) * self._gravity + self.applied_n
+
+    @cached_property
+    def _external_n(self) -> Array:
+        """The same of densities as stated; once for the iterations of a small body's row."""
+        return _sum_of_rows(self.body.dof_mass, self.mass.tied_kg) * self._gravity + self.applied_n
 
     def total(self, xi: Array, nu: Array, theta: Array, carried: Carried | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
