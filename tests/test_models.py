@@ -30,6 +30,7 @@ from collocation_sysid.study.choice import advice, model_rows
 from collocation_sysid.study.prediction import model_record, without
 from collocation_sysid.study.variants import (
     file_variants,
+    models,
     parse_branches,
     parse_materials,
     toml,
@@ -278,6 +279,20 @@ def test_materials_and_branches_are_combined(bar):
     ]
 
 
+def test_files_are_combined_with_materials(bar, tiny):
+    other = tiny / "other.toml"
+    other.write_text(bar.read_text().replace("= 30.0", "= 31.0"))
+    found = models([Problem.read(bar), Problem.read(other)], (), BOTH)
+    assert [(v.label, v.path) for v in found] == [
+        ("problem: neo-hookean", bar),
+        ("problem: yeoh", bar),
+        ("other: neo-hookean", other),
+        ("other: yeoh", other),
+    ]
+    planned = plan_models(Problem.read(bar), found)
+    assert len({run.key for run in planned}) == len(planned) == 2 * len(found)
+
+
 def test_a_value_is_written_as_toml_reads_it():
     value = {"a.b": {"guess": 1e-5, "bounds": [1, -2.5]}, "text": 'a "quoted" ß', "flag": True}
     assert tomllib.loads(f"value = {toml(value)}")["value"] == value
@@ -289,7 +304,7 @@ def test_bad_models_are_refused_in_one_line(bar, tiny):
     with pytest.raises(InputError, match="whole numbers up to 20, such as 0,1,2"):
         parse_branches("1,x")
     with pytest.raises(InputError, match="yeoh alone; expected two or more"):
-        variants(bar, (), ("yeoh",), (), TIMES_S)
+        models([Problem.read(bar)], (), ("yeoh",))
     with pytest.raises(InputError, match="found 'core'; expected none: it has no regions"):
         variants(bar, (), BOTH, (), TIMES_S, "core")
     TWO_REGIONS(tiny)

@@ -89,7 +89,8 @@ def compare(
 
     With --materials, --prony or --with each model is fitted to all recordings, and to all but each
     of them, which it then predicts; of one recording the last third is held out. In a body with
-    regions all of it has the model, or --region. --with takes other problem files as models.
+    regions all of it has the model, or --region. --with takes other problem files as models, each
+    with all of the materials and numbers of branches.
 
     Finished runs are kept in the output folder: the same command resumes.
     """
@@ -101,10 +102,6 @@ def compare(
     names = parse_methods(methods) if methods is not None else ()
     limits = Limits(workers, scheduler, time_limit)
     loaded = Problem.read(problem, set_ or (), allow_code)
-    if with_ and (materials is not None or prony is not None):
-        raise InputError(
-            "found --materials or --prony too; expected other files alone", None, "--with"
-        )
     if with_ or materials is not None or prony is not None:
         choices = materials, prony, region
         planned = _planned_models(loaded, choices, with_ or (), names, set_ or (), allow_code)
@@ -133,7 +130,7 @@ def _planned_models(
     materials, prony, region = choices
     from ..problem import Problem
     from ..study import plan_models
-    from ..study.variants import file_variants, parse_branches, parse_materials, variants
+    from ..study.variants import models, parse_branches, parse_materials
 
     if len(methods) > 1:
         raise InputError(
@@ -142,18 +139,12 @@ def _planned_models(
             None,
             "--methods",
         )
-    if files:
-        problems = [problem, *(Problem.read(file, overrides, allow_code) for file in files)]
-        found = file_variants(problems, overrides)
-        return plan_models(problem, found, methods[0] if methods else None, allow_code)
+    problems = [problem, *(Problem.read(file, overrides, allow_code) for file in files)]
     named = parse_materials(materials) if materials is not None else ()
     counts = parse_branches(prony) if prony is not None else ()
-    fitted = [e for e in problem.experiments if not e.validation]
-    times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
-    assert problem.path is not None  # it was read
-    found = variants(problem.path, overrides, named, counts, times_s, region)
+    found = models(problems, overrides, named, counts, region)
     for variant in found:  # a model that cannot be would fail every run
-        Problem.read(problem.path, variant.overrides, allow_code)
+        Problem.read(variant.path, variant.overrides, allow_code)
     return plan_models(problem, found, methods[0] if methods else None, allow_code)
 
 

@@ -165,14 +165,12 @@ def plan_models(
     InputError
         For a model that the problem file cannot have, and a problem without a file.
     """
-    path = _path_of(problem)
     planned = []
     for held_out in ("", *recordings(problem)):
         for variant in variants:
-            own = variant.path or path
-            file, _ = read_problem_file(own, variant.overrides)
+            file, _ = read_problem_file(variant.path, variant.overrides)
             solver, swept = method or file.solver.method, {"model": variant.label}
-            run = _planned(own, file, solver, variant.overrides, 0, swept, held_out)
+            run = _planned(variant.path, file, solver, variant.overrides, 0, swept, held_out)
             planned.append(replace(run, allow_code=allow_code))
     return planned
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,13 @@ class Variant:
     ----------
     label : str
     overrides : tuple of "key=value" that make it of the problem file
-    path : Path or None
-        A problem file of its own.
+    path : Path
+        Its problem file.
     """
 
     label: str
     overrides: tuple[str, ...]
-    path: Path | None = None
+    path: Path
 
 
 def parse_materials(text: str) -> tuple[str, ...]:
@@ -79,6 +79,46 @@ def parse_branches(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(counts))
 
 
+def models(
+    problems: Sequence[Problem],
+    overrides: Sequence[str],
+    materials: Sequence[str] = (),
+    branches: Sequence[int] = (),
+    region: str | None = None,
+) -> list[Variant]:
+    """Every problem file with every material and every number of branches.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        Of the same recordings, each with its file.
+    overrides, materials, branches, region
+        See `variants`.
+
+    Raises
+    ------
+    InputError
+        For less than two models, and what the files or variants refuse.
+    """
+    found = file_variants(problems, overrides)
+    if materials or branches:
+        fitted = [e for e in problems[0].experiments if not e.validation]
+        times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
+        files, found = found, []
+        for file in files:
+            of_file = variants(file.path, overrides, materials, branches, times_s, region)
+            front = f"{file.label}: " * (len(files) > 1)
+            found += [replace(v, label=front + v.label, path=file.path) for v in of_file]
+    if len(found) < 2:
+        raise InputError(
+            f"found the model {found[0].label} alone; expected two or more to compare, such as "
+            "neo-hookean,yeoh",
+            None,
+            "--materials" if materials else "--prony",
+        )
+    return found
+
+
 def variants(
     path: Path,
     overrides: Sequence[str],
@@ -103,7 +143,7 @@ def variants(
     Raises
     ------
     InputError
-        For less than two models, an unknown region, and branches that belong to others.
+        For an unknown region, and branches that belong to others.
     """
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True)
@@ -130,14 +170,7 @@ def variants(
             changes["parameters"] = parameters
             settings = tuple(f"{key}={toml(value)}" for key, value in changes.items())
             said = f"{region}: " * (region is not None) + ", ".join(label)
-            found.append(Variant(said, (*overrides, *settings)))
-    if len(found) < 2:
-        raise InputError(
-            f"found the model {found[0].label} alone; expected two or more to compare, such as "
-            "neo-hookean,yeoh",
-            None,
-            "--materials" if materials else "--prony",
-        )
+            found.append(Variant(said, (*overrides, *settings), path))
     return found
 
 
