@@ -436,6 +436,18 @@ def test_of_models_that_predict_alike_the_one_with_fewer_parameters_is_taken():
     assert "hardly tell them apart" in advice(rows)
 
 
+def test_models_that_predict_alike_tell_what_they_disagree_about():
+    def model(name: str, times: float, young_pa: float) -> dict:
+        found = row_of(name, 4, {"a": (times * WAVY).tolist()}, 900)
+        found["found"][""]["parameters"] = {"young_pa": young_pa}
+        return found
+
+    said = advice(rows_of(model("a", 1.001, 70e3), model("b", 1.0, 100e3), model("c", 2.0, 200e3)))
+    assert "By those that predict alike, E is 7e+04 to 1e+05 Pa" in said
+    said = advice(rows_of(model("a", 1.001, 70e3), model("b", 1.0, 71e3), model("c", 2.0, 200e3)))
+    assert "E is" not in said
+
+
 def test_a_model_that_fits_better_but_predicts_worse_is_not_taken():
     small = row_of("small", 4, {"a": STEADY.tolist()}, 900)
     large = row_of("large", 6, {"a": (1.4 * WAVY).tolist()}, 700)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..fem.constants import bare, symbol_of
 from ..statistics.evidence import Evidence
 from .plan import PlannedRun
 from .store import Record
@@ -26,6 +27,8 @@ ALIKE = 0.01
 # Anderson 2002, section 2.6); and standard errors of a prediction.
 NO_SUPPORT, SUPPORT = 10.0, 2.0
 SURE, LIKELY = 2.0, 1.0
+# Ratio of small-strain stiffnesses beyond which models that predict alike disagree.
+APART = 1.05
 
 
 def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> list[Row]:
@@ -155,7 +158,22 @@ def advice(rows: Sequence[Row]) -> str:
         return " ".join([f"{use}: no other predicts what is held out.", *lost])
     rival = min(predicted, key=lambda row: row["log_ratio"])
     said = [f"{use}: {_compared(chosen, rival)}.", _sureness(chosen, rival), *lost]
-    return " ".join(said)
+    return " ".join([*said, *_stiffness_told([chosen, *predicted])])
+
+
+def _stiffness_told(rows: Sequence[Row]) -> list[str]:
+    """How far the models that predict as well as the best disagree about E at small strain."""
+    alike = [r for r in rows if r["log_ratio"] <= max(ALIKE, SURE * r["log_ratio_error"])]
+    said = []
+    for name in dict.fromkeys(n for r in alike for n in r["parameters"] if bare(n) == "young_pa"):
+        values = [r["parameters"][name] for r in alike if r["parameters"].get(name)]
+        low, high = min(values, default=1.0), max(values, default=1.0)
+        if high > APART * low:
+            said.append(
+                f"By those that predict alike, {symbol_of(name)} is {low:.3g} to {high:.3g} Pa: "
+                "these recordings do not tell it better."
+            )
+    return said
 
 
 def _lost(row: Row, chosen: Row) -> str:

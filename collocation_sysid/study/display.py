@@ -14,6 +14,9 @@ from .plan import PlannedRun
 from .report import SHOWN_FAILURES, Report, View
 from .store import Record
 
+# Columns from which on long heads are parted.
+MANY = 5
+
 
 class StudyProgress:
     """One live line on a terminal, a line for each run elsewhere.
@@ -134,7 +137,9 @@ def _table(view: View) -> Table:
         if place < view.names:  # dotted keys may take two lines
             table.add_column(head.replace(".", ".\n", 1), overflow="fold")
         else:
-            table.add_column(head, justify="right", overflow="fold")
+            # Names of materials in many columns are parted where they have a hyphen.
+            parted = head.replace("-", "-\n") if len(view.heads) > MANY else head
+            table.add_column(parted, justify="right", overflow="fold")
     for row in view.rows:
         table.add_row(*map(Text, row))
     return table
