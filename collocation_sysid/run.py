@@ -271,8 +271,8 @@ def solve(
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
         raise InputError(
-            f"{solver.name} does not share its experiments; expected the method 'reduced-space', "
-            "or leave the scheduler out",
+            f"{getattr(solver, 'name', solver)} does not share its experiments; expected "
+            "the method 'reduced-space', or leave the scheduler out",
             None,
             "--scheduler",
         )

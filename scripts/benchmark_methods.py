@@ -21,6 +21,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -179,7 +180,7 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
         made = with_markers(first, first.markers.positions_m + noise_m)
         recordings.append(replace(made, name=f"swing {k}"))
 
-    def solve(client: Client | None, threads: int) -> tuple[float, float, float]:
+    def solve(client: Any, threads: int) -> tuple[float, float, float]:
         first.body.threads = threads
         collocation = Collocation(recordings, PARAMETERS)
         workers = OnCluster(client) if client else None
@@ -195,7 +196,7 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
         return wall_s, busiest_s, here_s
 
     with ExitStack() as stack:
-        clients: list[Client] = []
+        clients: list[Any] = []
         for count in (1, 2):
             cluster = LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0")
             clients.append(stack.enter_context(Client(stack.enter_context(cluster))))

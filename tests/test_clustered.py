@@ -49,9 +49,9 @@ def lose(there: Any, number: int) -> None:
 
 def several(steps: int = 8) -> list[cs.Experiment]:
     """Recordings of two bodies, of one of them three."""
-    cube = replace(noisy(hung_cube(steps)), name="first")
-    again = replace(noisy(hung_cube(steps + 3), seed=1), name="again", body=cube.body)
-    nuisance = replace(noisy(cube_with_nuisance(steps)), name="with nuisance")
+    cube = replace(noisy(hung_cube(steps), 1e-4), name="first")
+    again = replace(noisy(hung_cube(steps + 3), 1e-4, seed=1), name="again", body=cube.body)
+    nuisance = replace(noisy(cube_with_nuisance(steps), 1e-4), name="with nuisance")
     return [cube, again, replace(measured(cube_with_gaps(steps + 4)), name="gaps"), nuisance]
 
 
@@ -72,9 +72,10 @@ def test_a_run_on_workers_is_that_on_threads(there):
     )
     assert_alike(found.solution, known.solution)
     assert found.solution.timing.linear_algebra > 0
-    errors = [[e.std_error for e in run.estimates.values()] for run in (found, known)]
-    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
-    assert all(errors[1])
+    errors = {n: e.std_error for n, e in known.estimates.items() if e.std_error is not None}
+    assert errors.keys() >= {"lambda_pa", "mu_pa", "gamma_r_s"}
+    for name, error in errors.items():
+        assert found.estimates[name].std_error == pytest.approx(error, rel=1e-9)
 
 
 def test_markers_without_places_are_read_in_the_same_elements(there):

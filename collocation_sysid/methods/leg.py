@@ -7,6 +7,7 @@ does not grow, is all that the search needs to know. Parameters p are the experi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -227,8 +228,9 @@ def _read(
     if huber is not None:
         pairs = [huberised(values, by, huber) for values, by in pairs]
     residual, slope = map(np.concatenate, zip(*pairs, strict=True))
+    rotated: Any = np.linalg.qr(np.column_stack([slope, residual]), mode="r")
     report = Report(
-        triangle=np.linalg.qr(np.column_stack([slope, residual]), mode="r"),
+        triangle=rotated,
         crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
         feasibility_m=float(np.abs(tangent.step).max()),
         moved_m=0.0 if before is None else float(np.abs(part.x - before.x).max()),

@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..fem.batched import alone, side_by_side
 from ..fem.body import Body
+from ..nlp.charts import Chart
 from ..nlp.collocation import Collocation
 from ..nlp.segment import Segment
 
@@ -139,8 +140,10 @@ class OnCluster:
 
         def whole(given: Segment) -> Any:
             sent, chart = once(given.experiment, experiment), _bare(given.chart)
-            stated = [getattr(given, field.name) for field in fields(given)][1:-1]
-            return self._submit(home, _segment_of, sent, *stated, chart)
+            rest = {
+                n: v for n, v in given.__getstate__().items() if n not in ("experiment", "chart")
+            }
+            return self._submit(home, _segment_of, sent, chart, rest)
 
         return once(segment, whole)
 
@@ -214,6 +217,5 @@ def _with_body(experiment: Experiment, body: Body) -> Experiment:
     return _bare(experiment, body)
 
 
-def _segment_of(experiment: Experiment, *stated: Any) -> Segment:
-    *options, chart = stated
-    return Segment(experiment, *options, _bare(chart, experiment.body))
+def _segment_of(experiment: Experiment, chart: Chart, rest: dict[str, Any]) -> Segment:
+    return Segment(experiment, chart=_bare(chart, experiment.body), **rest)
