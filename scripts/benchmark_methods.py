@@ -21,7 +21,6 @@ import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -169,7 +168,8 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
     """Print how much faster two workers, and two threads, are than one, in turns.
 
     Beside the wall's time stands processor time, of the busiest worker and of this process, which
-    other work on the machine lengthens little. Experiments are sent anew in every solve.
+    other work on the machine lengthens little. Bodies and recordings are there already, as threads
+    have them, and so are the kernels.
     """
     from distributed import Client, LocalCluster
 
@@ -180,29 +180,30 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
         made = with_markers(first, first.markers.positions_m + noise_m)
         recordings.append(replace(made, name=f"swing {k}"))
 
-    def solve(client: Any, threads: int) -> tuple[float, float, float]:
+    collocation = Collocation(recordings, PARAMETERS)
+
+    def solve(workers: OnCluster | None, threads: int) -> tuple[float, float, float]:
         first.body.threads = threads
-        collocation = Collocation(recordings, PARAMETERS)
-        workers = OnCluster(client) if client else None
-        busy_s = client.run(time.process_time) if client else {}
+        busy_s = workers.client.run(time.process_time) if workers else {}
         here_s, began = time.process_time(), time.perf_counter()
         solution = ReducedSpace()(collocation, workers=workers)
         wall_s, here_s = time.perf_counter() - began, time.process_time() - here_s
         busiest_s = 0.0
-        if client:
-            after_s = client.run(time.process_time)
+        if workers:
+            after_s = workers.client.run(time.process_time)
             busiest_s = max(after_s[address] - spent_s for address, spent_s in busy_s.items())
         print(f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s")
         return wall_s, busiest_s, here_s
 
     with ExitStack() as stack:
-        clients: list[Any] = []
+        clusters: list[OnCluster] = []
         for count in (1, 2):
             cluster = LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0")
-            clients.append(stack.enter_context(Client(stack.enter_context(cluster))))
+            client = stack.enter_context(Client(stack.enter_context(cluster)))
+            clusters.append(OnCluster(client))
         cases = {
-            "one worker": (clients[0], 1),
-            "two workers": (clients[1], 1),
+            "one worker": (clusters[0], 1),
+            "two workers": (clusters[1], 1),
             "one thread": (None, 1),
             "two threads": (None, 2),
         }
