@@ -85,7 +85,8 @@ class OnCluster:
     def hold(self, collocation: Collocation) -> list[Any]:
         """See `Workers`; bodies and experiments are sent once."""
         segments = collocation.segments
-        if not all(segment.experiment in self._sent for segment in segments):
+        known = all(segment.experiment in self._sent for segment in segments)
+        if not known or len(self._homes) != len(segments):
             costs = [segment.variables for segment in segments]
             self._homes = _shared_out(costs, self.client.nthreads())
         return [self._segment(s, home) for s, home in zip(segments, self._homes, strict=True)]
