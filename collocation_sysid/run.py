@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from .methods.reduced_space import ReducedSpace
 from .methods.scan import Scan, rescue, started
 from .methods.solution import Solution, Status
 from .methods.start import placed_at_guess
+from .methods.workers import Workers, workers_of
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
 from .problem import Problem
@@ -241,6 +242,7 @@ def solve(
     method: str | Method | None = None,
     watch: Watch | None = None,
     start: str | Path | Earlier | None = None,
+    scheduler: str | None = None,
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
 
@@ -255,14 +257,36 @@ def solve(
     start : str, Path or Earlier, optional
         An earlier answer or the folder of its run, of any mesh or timestep; it takes the place of
         the guesses where names match.
+    scheduler : str, optional
+        Address of a dask.distributed scheduler, whose workers share the experiments of the search;
+        for reduced space only.
 
     Raises
     ------
     InputError
         For an unknown method, a start that is no run or has no parameter of these, where no start
-        is found, and when the solver refuses the problem.
+        is found, for a scheduler that does not answer or has lost its workers, and when the
+        solver refuses the problem.
     """
     solver = problem.solver(method)
+    if scheduler is not None and not isinstance(solver, ReducedSpace):
+        raise InputError(
+            f"{getattr(solver, 'name', solver)} does not share its experiments; expected "
+            "the method 'reduced-space', or leave the scheduler out",
+            None,
+            "--scheduler",
+        )
+    with workers_of(scheduler) as workers:
+        return _solved(problem, solver, watch, start, workers)
+
+
+def _solved(
+    problem: Problem,
+    solver: Method,
+    watch: Watch | None,
+    start: str | Path | Earlier | None,
+    workers: Workers | None,
+) -> Solution:
     earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start
     problem = problem if earlier is None else earlier.started(problem)
     try:
@@ -273,6 +297,8 @@ def solve(
         if earlier is not None and not scan:
             collocation = earlier.placed(collocation)
             variables = earlier.variables(collocation)
+        if workers is not None and isinstance(solver, ReducedSpace):
+            solver = partial(solver, workers=workers)
         solution = _read_where_found(solver, collocation, watch, variables)
         if scan is None and solution.status in LOST:
             scan, solution = _again(solver, solution, watch)
@@ -340,13 +366,14 @@ def run(
     log: Log | None = None,
     start: str | Path | Earlier | None = None,
     seek_causes: bool = True,
+    scheduler: str | None = None,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
 
     Parameters
     ----------
     problem : Problem
-    method, watch, start
+    method, watch, start, scheduler
         See `solve`.
     log : callable, optional
         Called with what is being done now, a text.
@@ -359,7 +386,7 @@ def run(
         As `solve` does.
     """
     say = log or (lambda _: None)
-    solution = solve(problem, method, watch, start)
+    solution = solve(problem, method, watch, start, scheduler)
     say("checking the answer by a forward simulation")
     rollouts = roll_outs(problem, solution)
     found = _checked(problem, solution, rollouts, say)

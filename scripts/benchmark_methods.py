@@ -6,6 +6,7 @@ every run starts from table1's guess in a process of its own. Writes a table, JS
     python scripts/benchmark_methods.py                      # the paper's size, both methods
     python scripts/benchmark_methods.py --scaling            # T = 50 … 1600, 95 … 5000 nodes
     python scripts/benchmark_methods.py --mesh 4x32 --steps 1000 --methods reduced-space
+    python scripts/benchmark_methods.py --cluster --mesh 3x12 --steps 50   # one and two workers
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import resource
 import sys
 import time
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +41,8 @@ from collocation_sysid.experiment import Nuisance, place_markers
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.workers import OnCluster
 from collocation_sysid.nlp.simulation import with_markers
 
 BOTH = ["interior-point", "reduced-space"]
@@ -159,6 +164,63 @@ def in_own_process(mesh: str, steps: int, method: str) -> Row:
         return pool.apply(measure, (mesh, steps, method))
 
 
+def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) -> None:
+    """Print how much faster two workers, and two threads, are than one, in turns.
+
+    Beside the wall's time stands processor time, of the busiest worker and of this process, which
+    other work on the machine lengthens little. Bodies and recordings are there already, as threads
+    have them, and so are the kernels.
+    """
+    from distributed import Client, LocalCluster
+
+    first = experiment_of(mesh, steps)
+    recordings = []
+    for k in range(experiments):
+        noise_m = 1e-3 * np.random.default_rng(k).normal(size=first.markers.positions_m.shape)
+        made = with_markers(first, first.markers.positions_m + noise_m)
+        recordings.append(replace(made, name=f"swing {k}"))
+
+    collocation = Collocation(recordings, PARAMETERS)
+
+    def solve(workers: OnCluster | None, threads: int) -> tuple[float, float, float]:
+        first.body.threads = threads
+        busy_s = workers.client.run(time.process_time) if workers else {}
+        here_s, began = time.process_time(), time.perf_counter()
+        solution = ReducedSpace()(collocation, workers=workers)
+        wall_s, here_s = time.perf_counter() - began, time.process_time() - here_s
+        busiest_s = 0.0
+        if workers:
+            after_s = workers.client.run(time.process_time)
+            busiest_s = max(after_s[address] - spent_s for address, spent_s in busy_s.items())
+        print(f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s")
+        return wall_s, busiest_s, here_s
+
+    with ExitStack() as stack:
+        clusters: list[OnCluster] = []
+        for count in (1, 2):
+            cluster = LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0")
+            client = stack.enter_context(Client(stack.enter_context(cluster)))
+            clusters.append(OnCluster(client))
+        cases = {
+            "one worker": (clusters[0], 1),
+            "two workers": (clusters[1], 1),
+            "one thread": (None, 1),
+            "two threads": (None, 2),
+        }
+        for case in cases.values():
+            solve(*case)  # compiles
+        times = {name: [] for name in cases}
+        for _ in range(repeats):
+            for name, case in cases.items():
+                times[name].append(solve(*case))
+    print(f"{experiments} experiments, {mesh}, {steps} samples, {os.getloadavg()[0]:.1f} at work")
+    for name, found in times.items():
+        wall_s, busiest_s, here_s = np.median(found, axis=0)
+        print(
+            f"{name:12} {wall_s:6.2f} s; processors {busiest_s:6.2f} s there {here_s:6.2f} s here"
+        )
+
+
 def show(row: Row) -> None:
     print(
         f"{row.method:15s} {row.nodes:5d} nodes {row.steps:5d} steps  {row.status:10s} "
@@ -201,7 +263,11 @@ def main() -> None:
     parser.add_argument("--scaling", action="store_true", help="reduced space over T and meshes")
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--cluster", action="store_true", help="four experiments on 1, 2 workers")
     arguments = parser.parse_args()
+    if arguments.cluster:
+        shared_out(arguments.mesh[0], arguments.steps[0])
+        return
     cases = [(m, t, k) for m in arguments.mesh for t in arguments.steps for k in arguments.methods]
     if arguments.scaling:
         cases = [(PAPER_SIZE[0], steps, "reduced-space") for steps in STEPS]

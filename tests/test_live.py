@@ -79,17 +79,19 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
         live.take(frame)
     collocation = problem.collocation()
     horizon, p = Horizon(collocation, [count], prior=estimator.WEAK), collocation.guess_p
-    x, failure = horizon.extend(p)
+    reached, failure = horizon.extend(p)
     assert failure is None
     point = horizon.evaluate(
-        p, [a + b.step for a, b in zip(x, horizon.evaluate(p, x).tangents, strict=False)]
+        p, [leg.x + leg.tangent.step for leg in horizon.evaluate(p, reached).legs]
     )
     rows = np.column_stack([point.slope, point.residual - point.slope @ p])
     batch = rows.T @ rows
     ours = normal_equations(live.track.information.triangle)
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
-    assert live.track.information.rows == len(rows)
+    priors = len(collocation.prior(p)[0]) + collocation.nq
+    measured = sum(len(leg.residual) for leg in point.legs)
+    assert live.track.information.rows == measured + priors
 
 
 def test_passes_end_where_the_batch_does():

@@ -217,13 +217,13 @@ def test_few_starts_far_away_all_succeed():
 
 
 def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
-    def first_only(self: Horizon, q, x, known=None):
+    def first_only(self: Horizon, q, before, step):
         if not np.array_equal(q, GUESS.guess_q):
             raise SimulationError("it fails", 0.0)
-        return evaluate(self, q, x, known)
+        return tried(self, q, before, step)
 
-    evaluate = Horizon.evaluate
-    monkeypatch.setattr(Horizon, "evaluate", first_only)
+    tried = Horizon.tried
+    monkeypatch.setattr(Horizon, "tried", first_only)
     solution = ReducedSpace()(cube())
     assert solution.status is Status.STALLED
     np.testing.assert_allclose(solution.theta, as_theta(GUESS), rtol=1e-12)
@@ -234,10 +234,10 @@ def test_rows_that_can_be_simulated_are_solved_first(monkeypatch: pytest.MonkeyP
     """As long as the parameters are those of the guess, the last rows cannot be reached."""
 
     def short_at_the_guess(self: Horizon, q, x=None):
-        rows, failure = extend(self, q, x)
-        if np.array_equal(q, GUESS.guess_q) and len(rows[0]) > 12:
-            return [rows[0][:12]], SimulationError("it fails", 0.12)
-        return rows, failure
+        (found,), failure = extend(self, q, x)
+        if np.array_equal(q, GUESS.guess_q) and len(found.x) > 12:
+            return [found.x[:12]], SimulationError("it fails", 0.12)
+        return [found], failure
 
     extend = Horizon.extend
     monkeypatch.setattr(Horizon, "extend", short_at_the_guess)
@@ -249,8 +249,8 @@ def test_rows_that_can_be_simulated_are_solved_first(monkeypatch: pytest.MonkeyP
 
 def test_rows_that_stay_out_of_reach_are_a_status(monkeypatch: pytest.MonkeyPatch):
     def short(self: Horizon, q, x=None):
-        rows, _ = extend(self, q, x)
-        return [rows[0][:12]], SimulationError("it fails", 0.12, 7)
+        (found,), _ = extend(self, q, x)
+        return [found.x[:12]], SimulationError("it fails", 0.12, 7)
 
     extend = Horizon.extend
     monkeypatch.setattr(Horizon, "extend", short)
@@ -310,14 +310,17 @@ def test_a_misfit_far_above_the_noise_is_noted():
 # The curvature that Gauss–Newton leaves out
 
 
-def point_of(q: np.ndarray, rng_seed: int = 0) -> Point:
+def point_of(q: np.ndarray, before: Point | None = None) -> Point:
     """Residuals (q - 1)² of every entry, scaled, and their slopes."""
-    weights = np.random.default_rng(rng_seed).uniform(1, 2, len(q))
-    return Point(q, [], [], weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1)), [])
+    weights = np.random.default_rng(0).uniform(1, 2, len(q))
+    residual = weights * (q - 1) ** 2 + 1
+    crossed = np.zeros(len(q)) if before is None else before.slope.T @ residual
+    return Point(q, [], [], residual, np.diag(2 * weights * (q - 1)), crossed)
 
 
 def test_the_learned_curvature_explains_the_last_step():
-    before, after = point_of(np.array([2.0, 3.0])), point_of(np.array([2.1, 3.2]))
+    before = point_of(np.array([2.0, 3.0]))
+    after = point_of(np.array([2.1, 3.2]), before)
     b = updated(np.zeros((2, 2)), before, after)
     missing = (after.slope - before.slope).T @ after.residual
     np.testing.assert_allclose(b @ (after.p - before.p), missing)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from problem_files import TRUTH
 
+from collocation_sysid import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -69,7 +70,8 @@ def stand_in(tmp_path, monkeypatch):
 
 @pytest.fixture
 def without_distributed(monkeypatch):
-    monkeypatch.setattr(scheduler, "find_spec", lambda name: None)
+    for module in (cluster, scheduler):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
 
 
 def planned_runs(count: int) -> list[PlannedRun]:
@@ -370,8 +372,8 @@ def test_runs_are_done_on_a_scheduler_by_its_address(stand_in, tmp_path):
     stand_in("answers")
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=":0"
-    ) as cluster:
-        assert_all_runs_are_kept(tmp_path / "runs", Limits(scheduler=cluster.scheduler_address))
+    ) as there:
+        assert_all_runs_are_kept(tmp_path / "runs", Limits(scheduler=there.scheduler_address))
 
 
 def test_a_scheduler_without_the_library_names_the_extra(without_distributed, tmp_path):
@@ -381,7 +383,7 @@ def test_a_scheduler_without_the_library_names_the_extra(without_distributed, tm
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(scheduler, "CONNECT_WITHIN_S", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
     with pytest.raises(
         InputError, match=r"found 'tcp://127\.0\.0\.1:1', where no scheduler answers"
     ):

@@ -19,6 +19,7 @@ from .common import (
     Overrides,
     ProblemPath,
     Quiet,
+    Scheduler,
     Verbose,
     errors,
     examples,
@@ -44,6 +45,7 @@ def solve(
         Path | None,
         typer.Option(metavar="RUN", help="Start from the answer in this run folder."),
     ] = None,
+    scheduler: Scheduler = None,
     set_: Overrides = None,
     allow_code: AllowCode = False,
     as_json: AsJson = False,
@@ -57,6 +59,8 @@ def solve(
 
     Parameters need no guess: a scan of the stiffness finds where to start. --start takes an earlier
     answer instead, also of another mesh or timestep.
+
+    --scheduler shares the experiments among the workers of a cluster.
 
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
@@ -77,7 +81,7 @@ def solve(
     require_possible(folder)
     require_replaceable(folder)
     with Progress(errors, loaded, verbose=verbose, quiet=quiet) as progress:
-        finished = run(loaded, method, progress.iteration, progress.say, start)
+        finished = run(loaded, method, progress.iteration, progress.say, start, scheduler=scheduler)
         progress.say("writing the run folder")
         finished.save(folder)
     if as_json:

@@ -19,6 +19,7 @@ from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -173,6 +174,11 @@ class Body(Model):
             f"Body({len(self.nodes_m)} nodes, {len(self.cells)} {self.element.name}, "
             f"{self.mass_kg:.4g} kg, {materials})"
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Kernels are of this process, and what follows from the rest is found anew.
+        found = {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
+        return {n: v for n, v in vars(self).items() if n not in found} | {"_evaluators": {}}
 
     def _lumped(self, part: Part) -> Array:
         """(n,) lumped volume of a part."""

@@ -53,6 +53,13 @@ class Element:
     edges: tuple[tuple[int, int], ...] = ()
     mean_dilatation: bool = False
 
+    def __reduce__(self) -> tuple[Callable[[str], Element], tuple[str]]:
+        return element_named, (self.name,)
+
+
+def _linear_functions(barycentric: Array) -> Array:
+    return np.asarray(barycentric, dtype=float)
+
 
 def _linear_gradients(barycentric: Array) -> Array:
     return np.broadcast_to(np.eye(4), (len(barycentric), 4, 4))
@@ -75,7 +82,7 @@ ELEMENTS: dict[str, Element] = {
     "tet4": Element(
         name="tet4",
         nodes=4,
-        shape_functions=lambda barycentric: np.asarray(barycentric, dtype=float),
+        shape_functions=_linear_functions,
         shape_gradients=_linear_gradients,
         points=np.full((1, 4), 0.25),
         weights=np.ones(1),

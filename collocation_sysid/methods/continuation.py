@@ -156,10 +156,8 @@ class _Climb:
         self.known = part.unpack(found.z)
         self.iterations += found.iterations
         self.evaluations += found.evaluations
-        watch, spent = self.recorder.stopwatch, found.timing
-        watch.build += spent.build
-        watch.evaluations += spent.evaluations
-        watch.linear_algebra += spent.linear_algebra
+        spent = found.timing
+        self.recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
         values = ", ".join(f"{name} = {value:.4g}" for name, value in found.parameters.items())
         self.recorder.notes.append(
             f"{100 * share:.3g} % of the samples by {found.method}: {found.status.value} after "

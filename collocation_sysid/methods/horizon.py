@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Array, Index
+from ..arrays import Array
 from ..errors import SimulationError
-from ..fem.batched import side_by_side
-from ..nlp.collocation import Collocation, Part
+from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
-from ..nlp.marching import march_on
-from ..nlp.newton import NewtonOptions
 from ..nlp.stopwatch import Stopwatch
-from ..nlp.tangent import BlockSolver, Tangent
-from .robust import huberised
-from .start import marched
-
-# Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
-# part of the first sweep.
-MARCHED = NewtonOptions(tolerance=1e-6)
-# Of equilibria near known ones. Those that are not found at once are too far for it.
-SETTLED = NewtonOptions(tolerance=1e-9, halvings=0)
+from ..nlp.tangent import BlockSolver
+from .leg import Leg, Reached, Report, Seen, moved, reached, reread, seen, swept, trajectory, tried
+from .workers import Here, Workers
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +27,19 @@ class Point:
     Attributes
     ----------
     p : (np,) all parameters, see `Collocation.pack`
-    x : list of (rows, 3n), one per experiment
-    tangents : list of Tangent
-    residual : (M,) r + S_p, markers after the feasibility step, and residuals of the priors
-    slope : (M, np) S and the slopes of the priors
-    moving : list of positions in p that move each experiment's body
+    legs : list of Leg, one per experiment, kept where they were found
+    reports : list of Report, of the legs
+    residual : (M,) rotated: of r + S_p, markers after the feasibility step, and the priors'
+    slope : (M, np) rotated alike: S and the slopes of the priors
+    crossed : (np,) S_0ᵀ residual with the slopes S_0 of the point it was tried from
     """
 
     p: Array
-    x: list[Array]
-    tangents: list[Tangent]
+    legs: list[Any]
+    reports: list[Report]
     residual: Array
     slope: Array
-    moving: list[Index]
+    crossed: Array
 
     @cached_property
     def loss(self) -> float:
@@ -57,19 +49,17 @@ class Point:
     @cached_property
     def feasibility_m(self) -> float:
         """Longest coordinate of the feasibility step."""
-        return max(float(np.abs(tangent.step).max()) for tangent in self.tangents)
+        return max(report.feasibility_m for report in self.reports)
+
+    @cached_property
+    def moved_m(self) -> float:
+        """Longest coordinate of the way from the point it was tried from."""
+        return max(report.moved_m for report in self.reports)
 
     @property
     def finite(self) -> bool:
         """Whether loss and feasibility are numbers."""
         return bool(np.isfinite(self.loss) and np.isfinite(self.feasibility_m))
-
-    def moved(self, step: Array) -> list[Array]:
-        """Trajectories after a step of the parameters."""
-        return [
-            x + tangent.step + tangent.by_p @ step[moving]
-            for x, tangent, moving in zip(self.x, self.tangents, self.moving, strict=True)
-        ]
 
     def predicted_loss(self, step: Array) -> float:
         """Loss after a step of the parameters, of the linearised problem."""
@@ -80,6 +70,8 @@ class Point:
 class Horizon:
     """The NLP on the first rows of every experiment.
 
+    Trajectories are kept by the workers: of any kind that `trajectory` takes.
+
     Parameters
     ----------
     collocation : Collocation
@@ -88,7 +80,9 @@ class Horizon:
     prior : float, optional
         Standard deviation of a prior that holds q near the guess.
     stopwatch : Stopwatch, optional
-    factorisation : {"auto", "band", "sparse"}
+    factorisation : {"auto", "band", "sparse", "supernodal"}
+    workers : Workers, optional
+        Threads of this process by default.
     """
 
     def __init__(
@@ -98,19 +92,22 @@ class Horizon:
         prior: float | None = None,
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
+        workers: Workers | None = None,
     ) -> None:
-        self.collocation = collocation
         self.rows = list(rows)
         self.prior = prior
         self.stopwatch = stopwatch or Stopwatch()
+        self.workers = workers or Here(collocation.threads)
+        self.read_in(collocation)
         with self.stopwatch.building():
-            self.solvers = [
-                BlockSolver(segment, count, self.stopwatch, factorisation)
-                for segment, count in zip(collocation.segments, rows, strict=True)
-            ]
+            options = self._all(None), self._all(factorisation)
+            self.solvers = self.workers.each(BlockSolver, self.segments, self.rows, *options)
 
-    @one_blas_thread()
-    def evaluate(self, p: Array, x: list[Array], known: Point | None = None) -> Point:
+    def read_in(self, collocation: Collocation) -> None:
+        """Take the same problem, read elsewhere."""
+        self.collocation, self.segments = collocation, self.workers.hold(collocation)
+
+    def evaluate(self, p: Array, x: Sequence[Any], known: Point | None = None) -> Point:
         """One sweep; a point of the first rows, at the same p and positions, is continued.
 
         Raises
@@ -118,85 +115,101 @@ class Horizon:
         SimulationError
             Where it is singular or not finite.
         """
-        parts = self.collocation.parts_at(p, x)
+        legs = known.legs if known else self._all(None)
+        return self._found(p, swept, x, legs)
 
-        def swept(k: int) -> Tangent:
-            before = known.tangents[k] if known else None
-            return self.solvers[k].forward(parts[k].x, parts[k].setting, before)
+    def tried(self, p: Array, before: Point, step: Array) -> Point:
+        """One sweep after a step from a point, static bodies in equilibrium where that is near.
 
-        threads = self.collocation.threads
-        return self.read(p, x, side_by_side(swept, range(len(parts)), threads))
-
-    def settled(self, p: Array, x: list[Array]) -> list[Array]:
-        """The same trajectories, those of static experiments in equilibrium where one is near.
-
-        A step along the tangent stretches what is slender and turns far: its loss says little.
+        Raises
+        ------
+        SimulationError
+            Where it is singular or not finite.
         """
+        return self._found(p, tried, before.legs, self._own(step))
 
-        def of(part: Part) -> Array:
-            dynamics, near = part.setting.dynamics, part.x
-            if not dynamics.static:
-                return near
-            settled, failure = march_on(
-                part.segment.corrected(part.phi),
-                dynamics.first_rows(len(near)),
-                part.setting.theta,
-                options=SETTLED,
-                stopwatch=self.stopwatch,
-                near=near,
-            )
-            return settled if failure is None else near
+    def reread(self, p: Array, point: Point) -> Point:
+        """The point as the problem is read now, where its parameters are p."""
+        return self._found(p, reread, point.legs)
 
-        return side_by_side(of, self.collocation.parts_at(p, x), self.collocation.threads)
-
-    def read(self, p: Array, x: list[Array], tangents: list[Tangent]) -> Point:
-        """A point whose tangents are known, with its markers as the collocation reads them."""
-        collocation = self.collocation
-        nq = collocation.nq
-        residuals, slopes = [], []
-        for part, tangent in zip(collocation.parts_at(p, x), tangents, strict=True):
-            segment, observation = part.segment, part.segment.observation
-            residual, here = observation.linearised(
-                part.x + tangent.step,
-                part.phi,
-                observation.at_samples(tangent.by_p, part.phi),
-                segment.moving,
-                nq,
-            )
-            sensed = _sensed(part, tangent) if segment.sensors else []
-            for values, by in ((residual, here), *sensed):
-                residuals.append(values.ravel())
-                slopes.append(np.zeros((values.size, len(p))))
-                slopes[-1][:, segment.places] = by.reshape(values.size, by.shape[-1])
-        if collocation.huber is not None:
-            pairs = zip(residuals, slopes, strict=True)
-            reweighted = [huberised(r, s, collocation.huber) for r, s in pairs]
-            residuals, slopes = map(list, zip(*reweighted, strict=True))
+    @one_blas_thread()
+    def _found(self, p: Array, run: Callable[..., Leg], *columns: Sequence[Any]) -> Point:
+        common = self.segments, self._all(self.collocation.huber), self._own(p)
+        legs = self.workers.each(run, self.solvers, *common, *columns)
+        reports: list[Report] = self.workers.fetch(self.workers.each(_report, legs))
+        nq, places = self.collocation.nq, self.collocation.places
+        residuals, slopes, crossed = [], [], np.zeros(len(p))
+        for report, own in zip(reports, places, strict=True):
+            self.stopwatch.add(*report.spent)
+            residuals.append(report.triangle[:, -1])
+            slopes.append(np.zeros((len(report.triangle), len(p))))
+            slopes[-1][:, own] = report.triangle[:, :-1]
+            crossed[own] += report.crossed
+        prior, prior_slopes = self.collocation.prior(p)
+        priors = [(prior, np.diag(prior_slopes))]
         if self.prior is not None:
-            residuals.append((p[:nq] - collocation.parameters.guess_q) / self.prior)
-            slopes.append(np.eye(nq, len(p)) / self.prior)
-        prior, prior_slopes = collocation.prior(p)
-        return Point(
-            p,
-            x,
-            tangents,
-            np.concatenate([*residuals, prior]),
-            np.concatenate([*slopes, np.diag(prior_slopes)]),
-            [segment.places[segment.moving] for segment in collocation.segments],
-        )
+            off = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
+            priors.append((off, np.eye(nq, len(p)) / self.prior))
+        for values, by in priors:
+            residuals.append(values)
+            slopes.append(by)
+            # The slopes of priors are the same everywhere.
+            crossed += by.T @ values
+        return Point(p, legs, reports, np.concatenate(residuals), np.concatenate(slopes), crossed)
 
     def extend(
-        self, p: Array, x: list[Array] | None = None, near: list[Array] | None = None
-    ) -> tuple[list[Array], SimulationError | None]:
+        self, p: Array, x: Sequence[Any] | None = None, near: Point | None = None
+    ) -> tuple[list[Any], SimulationError | None]:
         """Trajectories at p as far as they go, continuing those given; and why they stopped.
 
         Equilibria are looked for first where those of `near` are.
         """
-        return marched(self.collocation, p, x, self.rows, MARCHED, self.stopwatch, near)
+        known, beside = x or self._all(None), near.legs if near else self._all(None)
+        common = self.solvers, self.segments, self._own(p)
+        found = self.workers.each(reached, *common, known, beside)
+        failures = []
+        for failure, spent in self.workers.fetch(self.workers.each(_end, found)):
+            self.stopwatch.add(*spent)
+            failures += [failure] if failure else []
+        return found, failures[0] if failures else None
+
+    def moved(self, point: Point, step: Array) -> list[Any]:
+        """Trajectories after a step of the parameters."""
+        return self.workers.each(moved, self.segments, point.legs, self._own(step))
+
+    def seen(self, p: Array, x: Sequence[Any]) -> list[Seen]:
+        """How trajectories fit that were not swept."""
+        found = self.workers.each(seen, self.segments, self._own(p), x)
+        return self.workers.fetch(found)
+
+    def lengths(self, x: Sequence[Any]) -> list[int]:
+        """Rows of each trajectory."""
+        return self.workers.fetch(self.workers.each(_rows, x))
+
+    def first_rows(self, x: Sequence[Any], counts: Sequence[int]) -> list[Array]:
+        """So many first rows of each trajectory."""
+        return self.workers.fetch(self.workers.each(_first, x, counts))
+
+    def _own(self, p: Array) -> list[Array]:
+        """The share of each experiment in what every parameter has an entry of."""
+        return [p[own] for own in self.collocation.places]
+
+    def _all(self, value: Any) -> list[Any]:
+        """The same for every experiment."""
+        return [value] * len(self.rows)
 
 
-def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:
-    """Residuals of the sensors after the feasibility step, and their slopes by (q, φ)."""
-    dofs = part.segment.sensed_dofs
-    moved = np.concatenate([tangent.step[:, dofs, None], tangent.by_p[:, dofs]], axis=2)
-    return part.sensing.projected(part.x, tangent.held, moved)
+def _report(leg: Leg) -> Report:
+    return leg.report
+
+
+def _rows(found: Leg | Reached | Array) -> int:
+    return len(trajectory(found))
+
+
+def _end(found: Reached) -> tuple[SimulationError | None, tuple[float, float, float]]:
+    return found.failure, found.spent
+
+
+def _first(found: Leg | Reached | Array, count: int) -> Array:
+    return trajectory(found)[:count]

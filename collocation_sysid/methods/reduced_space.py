@@ -27,6 +27,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..checked import Count, Positive
+from ..errors import InputError
 from ..fem.batched import at_once
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
@@ -34,12 +35,14 @@ from ..nlp.lapack import one_blas_thread
 from ..nlp.tangent import BlockSolver
 from .curvature import require_second_derivatives
 from .ladder import SHARES, Shares
+from .leg import trajectory
 from .method import Watch
 from .options import Options
 from .recorder import Recorder
 from .search import Search
 from .solution import Solution, Status
 from .start import completed
+from .workers import Here, Workers
 
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
@@ -85,22 +88,33 @@ class ReducedSpace(Options):
 
     @one_blas_thread()
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
+        workers: Workers | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`.
+        """Solve the NLP, see `Method`; experiments are on the workers given, by default here.
 
         Lines of the history count sweeps, rejected ones included; the first are those of short
         horizons.
         """
         if self.hessian == "exact":
             require_second_derivatives(collocation)
+            if workers is not None:
+                raise InputError(
+                    "hessian = 'exact' needs every trajectory in one place; expected "
+                    "'gauss-newton' with a scheduler"
+                )
+        workers = workers or Here(collocation.threads)
         recorder = Recorder(self.name, collocation, watch)
-        search = Search(self, recorder, start)
+        search = Search(self, recorder, start, workers)
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
-        z = completed(collocation, search.p, search.x)
+        found = search.x and workers.fetch(workers.each(trajectory, search.x))
+        z = completed(collocation, search.p, found)
         rows = [segment.grid_rows for segment in collocation.segments]
-        reached = search.x is not None and [len(x) for x in search.x] == rows
+        reached = found is not None and [len(x) for x in found] == rows
         recorder.notes += _notes(collocation, search.indefinite, z, status)
         multipliers = None if reached else np.zeros(collocation.constraints)
         return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)

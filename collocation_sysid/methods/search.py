@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -12,6 +12,7 @@ from ..errors import SimulationError
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
 from .ladder import FEWEST, part_of
+from .leg import Seen
 from .recorder import Recorder
 from .secant import updated, with_curvature
 from .solution import Iteration, Status
@@ -19,6 +20,7 @@ from .solution import Iteration, Status
 if TYPE_CHECKING:
     from ..nlp.collocation import Collocation
     from .reduced_space import ReducedSpace
+    from .workers import Workers
 
 # A trial's infeasibility may be this share of its step's length, or this share of an edge of
 # the mesh: the strain it causes is then small enough for Newton's next step to remove it.
@@ -45,7 +47,13 @@ REREADINGS = 40
 class Search:
     """The state of a solve: the best point, the trust region, and the budget."""
 
-    def __init__(self, options: ReducedSpace, recorder: Recorder, start: Array | None) -> None:
+    def __init__(
+        self,
+        options: ReducedSpace,
+        recorder: Recorder,
+        start: Array | None,
+        workers: Workers | None = None,
+    ) -> None:
         self.options, self.recorder = options, recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
@@ -54,7 +62,10 @@ class Search:
         self.lower, self.upper = collocation.bounds_p
         self.rereadings = 0
         self.reach = collocation.reach_p
-        self.p, self.x = collocation.guess_p, None
+        self.p: Array = collocation.guess_p
+        # Kept by the workers, see `leg.trajectory`.
+        self.x: list[Any] | None = None
+        self.workers = workers
         if start is not None:
             start = np.clip(start, *collocation.bounds())
             self.p = collocation.parameters_of(start)
@@ -82,7 +93,8 @@ class Search:
         if self.x is None:
             return None
         try:
-            return self._descend(self._horizon([len(x) for x in self.x], last=True), last=True)
+            rows = [segment.grid_rows for segment in self.collocation.segments]
+            return self._descend(self._horizon(rows, last=True), last=True)
         except SimulationError:
             self.x = self.point = None
             return None
@@ -103,7 +115,7 @@ class Search:
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         prior = None if last else self.options.rung_prior
         watch, choice = self.recorder.stopwatch, self.options.factorisation
-        return Horizon(self.collocation, rows, prior, watch, choice)
+        return Horizon(self.collocation, rows, prior, watch, choice, self.workers)
 
     def _reach(self, rung: Horizon) -> None:
         """Extend the trajectories to a rung's length; where that fails, first solve what is."""
@@ -116,13 +128,13 @@ class Search:
                 # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
                 afresh, failure_afresh = rung.extend(self.p)
                 self.sweeps += 1
-                if sum(map(len, afresh)) > sum(map(len, reached)):
+                if sum(rung.lengths(afresh)) > sum(rung.lengths(reached)):
                     reached, failure = afresh, failure_afresh
             if failure is None:
                 self.x = reached
                 self._place(rung, first=known is None)
                 return
-            rows = [len(x) for x in reached]
+            rows = rung.lengths(reached)
             fewest = min(FEWEST, *rung.rows)
             nothing = known is None and min(rows) < fewest
             if nothing or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
@@ -152,9 +164,10 @@ class Search:
                 return Status.CONVERGED
             rate = min(1.0, length / previous)
             if last and whole and length * rate <= SAFETY * tolerance:
-                final = point.moved(step)
-                if self._are_feasible(final, point.p + step):
-                    self._record(point.p + step, final, point.predicted_loss(step))
+                final = rung.moved(point, step)
+                seen = rung.seen(point.p + step, final)
+                if self._are_feasible(seen):
+                    self._record(point.p + step, final, point.predicted_loss(step), seen)
                     return Status.CONVERGED
             promised = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not last and promised < self.options.rung_decrease:
@@ -203,7 +216,7 @@ class Search:
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
-            trial = rung.evaluate(p, rung.settled(p, point.moved(step)))
+            trial = rung.tried(p, point, step)
         except SimulationError:
             return None
         return trial if trial.finite else None
@@ -212,11 +225,7 @@ class Search:
         """Judge a trial, and widen or narrow the trust region after it."""
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
-        moved_m = max(
-            float(np.abs(after - before).max())
-            for before, after in zip(point.x, trial.x, strict=True)
-        )
-        if trial.feasibility_m > max(CONTRACTION * moved_m, SMALL_STRAIN * self.edge_m):
+        if trial.feasibility_m > max(CONTRACTION * trial.moved_m, SMALL_STRAIN * self.edge_m):
             return False
         noise = 1e-12 * point.loss + 1e-20
         if actual < DECREASE * predicted - noise:
@@ -242,7 +251,7 @@ class Search:
     def _restored(self, rung: Horizon, point: Point) -> Point:
         """The point with a simulated trajectory, where that exists."""
         self.sweeps += 1
-        x, failure = rung.extend(point.p, near=point.x)
+        x, failure = rung.extend(point.p, near=point)
         if failure is not None:
             return point
         try:
@@ -251,11 +260,11 @@ class Search:
             return point
         return self._accepted(rung, restored) if restored.finite else point
 
-    def _are_feasible(self, x: list[Array], p: Array) -> bool:
+    def _are_feasible(self, seen: list[Seen]) -> bool:
         """Whether trajectories satisfy the equations of motion well within the tolerance."""
         return all(
-            np.abs(part.residual_n).max() <= FEASIBLE_FORCE * part.segment.force_n
-            for part in self.collocation.parts_at(p, x)
+            each.violation_n <= FEASIBLE_FORCE * segment.force_n
+            for each, segment in zip(seen, self.collocation.segments, strict=True)
         )
 
     # Where recordings are read ----------------------------------------------------------------
@@ -263,10 +272,14 @@ class Search:
     def _place(self, rung: Horizon, first: bool) -> None:
         """Start unknown places where the first samples lie on what was simulated first."""
         if first and self.x is not None:
-            self._read_in(rung, *self.collocation.placed(self.p, self.x))
+            counts = [segment.rows_to_place for segment in self.collocation.segments]
+            if any(counts):
+                rows = rung.first_rows(self.x, counts)
+                self._read_in(rung, *self.collocation.placed(self.p, rows))
 
     def _read_in(self, rung: Horizon, collocation: Collocation, p: Array) -> None:
-        self.collocation = rung.collocation = self.recorder.collocation = collocation
+        self.collocation = self.recorder.collocation = collocation
+        rung.read_in(collocation)
         self.lower, self.upper = collocation.bounds_p
         self.p = p
 
@@ -277,30 +290,24 @@ class Search:
             return point
         self.rereadings += 1
         self._read_in(rung, collocation, p)
-        return rung.read(p, point.x, point.tangents)
+        return rung.reread(p, point)
 
     def _accepted(self, rung: Horizon, point: Point) -> Point:
         self.point = point = self._follow(rung, point)
-        self.indefinite = sum(tangent.indefinite for tangent in point.tangents)
-        self._record(point.p, point.x, point.loss, point)
+        self.indefinite = sum(report.indefinite for report in point.reports)
+        seen = [report.seen for report in point.reports]
+        self._record(point.p, point.legs, point.loss, seen)
         return point
 
-    def _record(self, p: Array, x: list[Array], loss: float, point: Point | None = None) -> None:
-        """Make it the answer so far; markers are those after the feasibility step of a point."""
+    def _record(self, p: Array, x: list[Any], loss: float, seen: list[Seen]) -> None:
+        """Make it the answer so far."""
         self.p, self.x = p, x
-        squares, violation_n = [], 0.0
-        for k, part in enumerate(self.collocation.parts_at(p, x)):
-            if point is not None:
-                tangent = point.tangents[k]
-                projected, here = part.x + tangent.step, tangent.violation_n
-            else:
-                projected, here = part.x, float(np.abs(part.residual_n).max())
-            observation = part.segment.observation
-            squares.append(observation.squared_distances_m2(projected, part.phi))
-            violation_n = max(violation_n, here)
-        distances = np.concatenate(squares)
-        rms_m = float(np.sqrt(distances.mean())) if len(distances) else 0.0
+        squares_m2 = sum(each.squares_m2 for each in seen)
+        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in seen))))
+        violation_n = max(each.violation_n for each in seen)
         values = self.collocation.values(p)
         time_s = self.recorder.elapsed_s
-        share = sum(map(len, x)) / sum(s.grid_rows for s in self.collocation.segments)
+        share = sum(each.rows for each in seen) / sum(
+            s.grid_rows for s in self.collocation.segments
+        )
         self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s, share))

@@ -18,10 +18,10 @@ LARGEST_SHARE = 0.9
 
 
 def updated(b: Array, before: Point, after: Point) -> Array:
-    """B (np, np) after a step between two points."""
+    """B (np, np) after a step from one point to another that was tried from it."""
     step = after.p - before.p
     change = after.slope.T @ after.residual - before.slope.T @ before.residual
-    wanted = (after.slope - before.slope).T @ after.residual  # B · step
+    wanted = after.slope.T @ after.residual - after.crossed  # B · step
     along = float(change @ step)
     if along <= 0:
         return b

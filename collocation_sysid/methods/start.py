@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import SimulationError
 from ..fem.batched import side_by_side
-from ..nlp.collocation import Collocation
+from ..nlp.collocation import Collocation, Part
 from ..nlp.marching import march, march_on
 from ..nlp.newton import NewtonOptions, Solver
 from ..nlp.rest import start_state
@@ -80,21 +80,32 @@ def marched(
     parts = collocation.parts_at(p, known or _nothing(collocation))
 
     def on(k: int) -> tuple[Array, SimulationError | None]:
-        part = parts[k]
-        dynamics = part.setting.dynamics
-        return march_on(
-            part.segment.corrected(part.phi),
-            dynamics if rows is None else dynamics.first_rows(rows[k]),
-            part.setting.theta,
-            part.x if len(part.x) else None,
-            options,
-            stopwatch=stopwatch,
-            near=None if near is None else near[k],
-        )
+        count = parts[k].segment.grid_rows if rows is None else rows[k]
+        beside = None if near is None else near[k]
+        return continued(parts[k], count, options, stopwatch, beside)
 
     reached = side_by_side(on, range(len(parts)), collocation.threads)
     failures = [failure for _, failure in reached if failure is not None]
     return [x for x, _ in reached], failures[0] if failures else None
+
+
+def continued(
+    part: Part,
+    rows: int,
+    options: NewtonOptions | None = None,
+    stopwatch: Stopwatch | None = None,
+    near: Array | None = None,
+) -> tuple[Array, SimulationError | None]:
+    """A part's trajectory up to so many rows, as far as it goes, see `marched`."""
+    return march_on(
+        part.segment.corrected(part.phi),
+        part.setting.dynamics.first_rows(rows),
+        part.setting.theta,
+        part.x if len(part.x) else None,
+        options,
+        stopwatch=stopwatch,
+        near=near,
+    )
 
 
 def completed(collocation: Collocation, p: Array, known: Sequence[Array] | None = None) -> Array:

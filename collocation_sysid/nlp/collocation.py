@@ -238,6 +238,11 @@ class Collocation:
         """Every experiment at z."""
         return self.parts_at(*self.unpack(z))
 
+    @cached_property
+    def places(self) -> list[Index]:
+        """Where the (q, φ) of each experiment are in p."""
+        return [segment.places for segment in self.segments]
+
     @property
     def threads(self) -> int:
         """How many its bodies may use."""

@@ -7,9 +7,9 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,10 @@ class Segment:
     first: First
     chart: Chart
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What follows from the fields is found anew where it is needed.
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     @property
     def body(self) -> Body:
         """What moves."""
@@ -171,6 +175,13 @@ class Segment:
             return self.chart, phi
         chart = self.chart.about(places_m)
         return chart, self._with_places(phi, chart.centre)
+
+    @property
+    def rows_to_place(self) -> int:
+        """First rows of x that `placed` reads; none where all places are known."""
+        unknown = ~self.experiment.markers.located
+        first = self.experiment.markers.present[:, unknown].argmax(axis=0)
+        return 1 + int(self.observation.grid_rows[first].max()) if len(first) else 0
 
     def places_m(self, phi: Array) -> Array:
         """(M, 3) places of the markers on the undeformed body."""

@@ -35,6 +35,19 @@ class Stopwatch:
             with self._adding:
                 setattr(self, kind, getattr(self, kind) + self.clock() - began)
 
+    def add(self, build: float, evaluations: float, linear_algebra: float) -> None:
+        """Add seconds that another has measured."""
+        with self._adding:
+            self.build += build
+            self.evaluations += evaluations
+            self.linear_algebra += linear_algebra
+
+    def taken(self) -> tuple[float, float, float]:
+        """Its seconds as `add` takes them; it begins again from zero."""
+        spent = self.build, self.evaluations, self.linear_algebra
+        self.build = self.evaluations = self.linear_algebra = 0.0
+        return spent
+
     def building(self) -> AbstractContextManager[None]:
         """Time symbolic work and tables."""
         return self._timing("build")

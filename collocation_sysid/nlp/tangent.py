@@ -123,7 +123,7 @@ class BlockSolver:
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
     ) -> None:
-        self.stopwatch = stopwatch or Stopwatch()
+        self.stopwatch, self.factorisation = stopwatch or Stopwatch(), factorisation
         self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
         self.segment = segment
         self.body, self.pattern = segment.body, segment.pattern
@@ -155,6 +155,9 @@ class BlockSolver:
             (np.zeros(kept.sum()), place[full_rows[kept]], indptr),
             shape=(len(self.free), len(self.free)),
         )
+
+    def __reduce__(self) -> tuple[type[BlockSolver], tuple[Segment, int, None, Choice]]:
+        return BlockSolver, (self.segment, self.dynamics.rows, None, self.factorisation)
 
     @one_blas_thread()
     def forward(self, x: Array, setting: Setting, known: Tangent | None = None) -> Tangent:

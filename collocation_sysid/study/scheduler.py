@@ -13,17 +13,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.batched import available_threads
 from .plan import PlannedRun
 from .process import execute
 from .store import CRASHED, STOPPED, Record, RunStore
-
-CONNECT_WITHIN_S = 15
 
 
 @dataclass(frozen=True)
@@ -163,12 +161,12 @@ def _threads(limits: Limits) -> Iterator[Pool]:
 @contextmanager
 def _dask(limits: Limits) -> Iterator[Pool]:
     """An existing scheduler by address, else a cluster on this machine."""
-    distributed = _distributed()
+    dask = distributed()
     cluster = None
     if limits.scheduler is None:
         slots = limits.workers or available_threads()
         # Its workers are threads, for each run is a process anyhow.
-        cluster = distributed.LocalCluster(
+        cluster = dask.LocalCluster(
             n_workers=1,
             threads_per_worker=slots,
             processes=False,
@@ -177,30 +175,19 @@ def _dask(limits: Limits) -> Iterator[Pool]:
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.ERROR,
         )
-    try:
-        client = distributed.Client(
-            cluster or limits.scheduler, timeout=CONNECT_WITHIN_S, set_as_default=False
-        )
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"found {limits.scheduler!r}, where no scheduler answers ({error}); expected an "
-            "address such as tcp://10.0.0.5:8786",
-            None,
-            "--scheduler",
-        ) from error
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
-    stop = distributed.Event(flag, client=client)
     try:
-        with client.get_executor(pure=False) as executor:
-            yield Pool(
-                lambda run: executor.submit(
-                    _execute_on_worker, run.as_dict(), limits.time_limit_s, limits.retries, flag
-                ),
-                max(1, sum(client.nthreads().values())),
-                stop.set,
-            )
+        with connected(cluster or limits.scheduler) as client:
+            stop = dask.Event(flag, client=client)
+            with client.get_executor(pure=False) as executor:
+                yield Pool(
+                    lambda run: executor.submit(
+                        _execute_on_worker, run.as_dict(), limits.time_limit_s, limits.retries, flag
+                    ),
+                    max(1, sum(client.nthreads().values())),
+                    stop.set,
+                )
     finally:
-        client.close()
         if cluster is not None:
             cluster.close()
 
@@ -208,15 +195,4 @@ def _dask(limits: Limits) -> Iterator[Pool]:
 def _execute_on_worker(
     planned: dict[str, Any], time_limit_s: float | None, retries: int, flag: str
 ) -> Record:
-    return execute(planned, time_limit_s, retries, _distributed().Event(flag).is_set)
-
-
-def _distributed() -> Any:
-    if find_spec("distributed") is None:
-        raise InputError(
-            "a scheduler needs dask.distributed: pip install 'collocation-sysid[cluster]', or "
-            "leave it out to run on this machine's cores",
-            None,
-            "--scheduler",
-        )
-    return import_module("distributed")
+    return execute(planned, time_limit_s, retries, distributed().Event(flag).is_set)

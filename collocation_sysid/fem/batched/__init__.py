@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from .batch import Batch, Evaluator, VectorCodeError
 from .choice import EVALUATORS, EvaluatorChoice, choose_evaluator, make_evaluator
 from .combine import Combiner, Plan, combine_natively, combine_with_numpy
-from .threads import COMPILING, at_once, available_threads, in_slices, side_by_side
+from .threads import COMPILING, alone, at_once, available_threads, in_slices, side_by_side
 
 if TYPE_CHECKING:
     from ...arrays import Index
@@ -26,6 +26,7 @@ __all__ = [
     "Evaluator",
     "EvaluatorChoice",
     "VectorCodeError",
+    "alone",
     "at_once",
     "available_threads",
     "choose_evaluator",

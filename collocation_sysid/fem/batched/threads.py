@@ -6,9 +6,9 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -60,12 +60,14 @@ def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> lis
     if count == 1:
         return [run(item) for item in items]
 
-    def whole(item: T) -> R:
-        _alone.whole = True
-        return run(item)
-
     with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(whole, items))
+        return list(pool.map(partial(alone, run), items))
+
+
+def alone(run: Callable[..., R], *arguments: Any) -> R:
+    """``run(*arguments)`` on this thread, which from now on shares nothing with others."""
+    _alone.whole = True
+    return run(*arguments)
 
 
 def at_once(items: int, threads: int) -> int:

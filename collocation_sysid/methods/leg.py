@@ -1,0 +1,248 @@
+"""One experiment's leg of a point of the search: what is done where its recording is.
+
+A leg holds what grows with the timesteps and stays where it was found; a `Report` of it, which
+does not grow, is all that the search needs to know. Parameters p are the experiment's own (q, φ).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import SimulationError
+from ..nlp.collocation import Part
+from ..nlp.marching import march_on
+from ..nlp.newton import NewtonOptions
+from ..nlp.segment import Segment
+from ..nlp.tangent import BlockSolver, Tangent
+from .robust import huberised
+from .start import continued
+
+# Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
+# part of the first sweep.
+MARCHED = NewtonOptions(tolerance=1e-6)
+# Of equilibria near known ones. Those that are not found at once are too far for it.
+SETTLED = NewtonOptions(tolerance=1e-9, halvings=0)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How a trajectory fits.
+
+    Attributes
+    ----------
+    rows : int
+    violation_n : float
+        Largest |c|.
+    squares_m2 : float
+        Sum of the squared distances between markers and their readings.
+    samples : int
+        How many these are.
+    """
+
+    rows: int
+    violation_n: float
+    squares_m2: float
+    samples: int
+
+    @classmethod
+    def of(cls, part: Part, x: Array, violation_n: float) -> Seen:
+        """That of a part, with its markers read at x."""
+        squares = part.segment.observation.squared_distances_m2(x, part.phi)
+        return cls(len(x), violation_n, float(squares.sum()), len(squares))
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What a search needs to know of a leg, of a size that does not grow with the timesteps.
+
+    Attributes
+    ----------
+    triangle : (at most k + 1, k + 1) R of QR = (S, r), residuals behind their k slopes
+    crossed : (k,) S_0ᵀ r with the slopes of the leg before; zeros where there was none
+    feasibility_m : float
+        Longest coordinate of the feasibility step.
+    moved_m : float
+        The same of the way from the leg before.
+    indefinite : int
+        Timesteps whose equations are not positive definite.
+    seen : Seen
+        Markers read after the feasibility step.
+    spent : seconds as `Stopwatch.add` takes them
+    """
+
+    triangle: Array
+    crossed: Array
+    feasibility_m: float
+    moved_m: float
+    indefinite: int
+    seen: Seen
+    spent: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A trajectory with what one sweep found there.
+
+    Attributes
+    ----------
+    x : (rows, 3n)
+    tangent : Tangent
+    residual : (M,) r + S_p, sensors and markers after the feasibility step
+    slope : (M, k) S
+    report : Report
+    """
+
+    x: Array
+    tangent: Tangent
+    residual: Array
+    slope: Array
+    report: Report
+
+    def __sizeof__(self) -> int:
+        # So that a scheduler knows what moving it would take.
+        tangent = self.tangent
+        held = (self.x, tangent.step, tangent.by_p, self.residual, self.slope)
+        return object.__sizeof__(self) + sum(each.nbytes for each in held)
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """A trajectory as far as it goes, why it stopped, and the seconds that it took."""
+
+    x: Array
+    failure: SimulationError | None
+    spent: tuple[float, float, float]
+
+
+def trajectory(found: Leg | Reached | Array) -> Array:
+    """The positions (rows, 3n) of what was found."""
+    return found if isinstance(found, np.ndarray) else found.x
+
+
+def swept(
+    solver: BlockSolver,
+    segment: Segment,
+    huber: float | None,
+    p: Array,
+    start: Leg | Reached | Array,
+    known: Leg | None = None,
+    before: Leg | None = None,
+) -> Leg:
+    """One sweep; a known leg of the first rows, at the same p and positions, is continued.
+
+    Raises
+    ------
+    SimulationError
+        Where it is singular or not finite.
+    """
+    part = _part(segment, p, trajectory(start))
+    tangent = solver.forward(part.x, part.setting, known.tangent if known else None)
+    return _read(part, huber, tangent, before, solver.stopwatch.taken())
+
+
+def tried(
+    solver: BlockSolver,
+    segment: Segment,
+    huber: float | None,
+    p: Array,
+    before: Leg,
+    step: Array,
+) -> Leg:
+    """One sweep after a step of the parameters to p.
+
+    A static body is brought to equilibrium first, where one is near: a step along the tangent
+    stretches what is slender and turns far, and its loss says little.
+
+    Raises
+    ------
+    SimulationError
+        Where it is singular or not finite.
+    """
+    part = _part(segment, p, moved(segment, before, step))
+    dynamics, x = part.setting.dynamics, part.x
+    if dynamics.static:
+        settled, failure = march_on(
+            segment.corrected(part.phi),
+            dynamics.first_rows(len(x)),
+            part.setting.theta,
+            options=SETTLED,
+            stopwatch=solver.stopwatch,
+            near=x,
+        )
+        x = settled if failure is None else x
+    return swept(solver, segment, huber, p, x, before=before)
+
+
+def reread(solver: BlockSolver, segment: Segment, huber: float | None, p: Array, leg: Leg) -> Leg:
+    """A leg whose recording is read elsewhere."""
+    return _read(_part(segment, p, leg.x), huber, leg.tangent, None, solver.stopwatch.taken())
+
+
+def moved(segment: Segment, leg: Leg, step: Array) -> Array:
+    """The trajectory after a step of the parameters."""
+    return leg.x + leg.tangent.step + leg.tangent.by_p @ step[segment.moving]
+
+
+def reached(
+    solver: BlockSolver,
+    segment: Segment,
+    p: Array,
+    known: Leg | Reached | Array | None,
+    near: Leg | None,
+) -> Reached:
+    """The solver's rows at p as far as they go, continuing those known."""
+    part = _part(segment, p, np.zeros((0, segment.dofs)) if known is None else trajectory(known))
+    beside = None if near is None else near.x
+    x, failure = continued(part, solver.dynamics.rows, MARCHED, solver.stopwatch, beside)
+    return Reached(x, failure, solver.stopwatch.taken())
+
+
+def seen(segment: Segment, p: Array, x: Array) -> Seen:
+    """How a trajectory fits that was not swept."""
+    part = _part(segment, p, x)
+    return Seen.of(part, x, float(np.abs(part.residual_n).max()))
+
+
+def _part(segment: Segment, p: Array, x: Array) -> Part:
+    return Part(segment, p[: segment.nq], p[segment.nq :], x)
+
+
+def _read(
+    part: Part,
+    huber: float | None,
+    tangent: Tangent,
+    before: Leg | None,
+    spent: tuple[float, float, float],
+) -> Leg:
+    """Markers and sensors after the feasibility step."""
+    segment, observation = part.segment, part.segment.observation
+    projected = part.x + tangent.step
+    by_p = observation.at_samples(tangent.by_p, part.phi)
+    rows = [observation.linearised(projected, part.phi, by_p, segment.moving, segment.nq)]
+    rows += _sensed(part, tangent) if segment.sensors else []
+    pairs = [(values.ravel(), by.reshape(values.size, by.shape[-1])) for values, by in rows]
+    if huber is not None:
+        pairs = [huberised(values, by, huber) for values, by in pairs]
+    residual, slope = map(np.concatenate, zip(*pairs, strict=True))
+    rotated: Any = np.linalg.qr(np.column_stack([slope, residual]), mode="r")
+    report = Report(
+        triangle=rotated,
+        crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
+        feasibility_m=float(np.abs(tangent.step).max()),
+        moved_m=0.0 if before is None else float(np.abs(part.x - before.x).max()),
+        indefinite=tangent.indefinite,
+        seen=Seen.of(part, projected, tangent.violation_n),
+        spent=spent,
+    )
+    return Leg(part.x, tangent, residual, slope, report)
+
+
+def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:
+    """Residuals of the sensors after the feasibility step, and their slopes by (q, φ)."""
+    dofs = part.segment.sensed_dofs
+    along = np.concatenate([tangent.step[:, dofs, None], tangent.by_p[:, dofs]], axis=2)
+    return part.sensing.projected(part.x, tangent.held, along)

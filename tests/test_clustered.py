@@ -1,0 +1,186 @@
+"""One solve whose experiments are on the workers of a dask cluster."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from problem_files import run_command, write_problem
+from problems_small import (
+    GUESS,
+    bar_with_nuisance,
+    cube_with_gaps,
+    cube_with_nuisance,
+    hung_cube,
+    measured,
+    noisy,
+)
+
+import collocation_sysid as cs
+from collocation_sysid import cluster
+from collocation_sysid.errors import InputError
+from collocation_sysid.methods import workers
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Iteration, Status
+from collocation_sysid.methods.workers import OnCluster, workers_of
+from collocation_sysid.nlp.collocation import Collocation
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture
+def there() -> Iterator[Any]:
+    """Two workers with one thread each, in this process."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0"
+    ) as found:
+        yield found
+
+
+def lose(there: Any, number: int) -> None:
+    """Let a worker vanish without a word."""
+    there.sync(there.workers[number].close, reason="lost", executor_wait=False, nanny=False)
+
+
+def several(steps: int = 8) -> list[cs.Experiment]:
+    """Recordings of two bodies, of one of them three."""
+    cube = replace(noisy(hung_cube(steps), 1e-4), name="first")
+    again = replace(noisy(hung_cube(steps + 3), 1e-4, seed=1), name="again", body=cube.body)
+    nuisance = replace(noisy(cube_with_nuisance(steps), 1e-4), name="with nuisance")
+    return [cube, again, replace(measured(cube_with_gaps(steps + 4)), name="gaps"), nuisance]
+
+
+def assert_alike(clustered: cs.Solution, threads: cs.Solution) -> None:
+    assert clustered.status is threads.status
+    assert len(clustered.history) == len(threads.history)
+    np.testing.assert_allclose(clustered.z, threads.z, rtol=1e-12, atol=1e-12)
+    losses = [[line.loss for line in s.history] for s in (clustered, threads)]
+    np.testing.assert_allclose(*losses, rtol=1e-10)
+    assert clustered.notes == threads.notes
+
+
+def test_a_run_on_workers_is_that_on_threads(there):
+    problem = cs.Problem(several()[:3], GUESS, method=ReducedSpace())
+    found, known = (
+        cs.run(problem, scheduler=address, seek_causes=False)
+        for address in (there.scheduler_address, None)
+    )
+    assert_alike(found.solution, known.solution)
+    assert found.solution.timing.linear_algebra > 0
+    errors = {n: e.std_error for n, e in known.estimates.items() if e.std_error is not None}
+    assert errors.keys() >= {"lambda_pa", "mu_pa", "gamma_r_s"}
+    for name, error in errors.items():
+        assert found.estimates[name].std_error == pytest.approx(error, rel=1e-9)
+
+
+def test_markers_without_places_are_read_in_the_same_elements(there):
+    experiment = noisy(bar_with_nuisance())
+    markers = replace(experiment.markers, located=np.zeros(len(experiment.markers.names), bool))
+    collocation = Collocation([replace(experiment, markers=markers)], GUESS)
+    with workers_of(there.scheduler_address) as found:
+        assert_alike(ReducedSpace()(collocation, workers=found), ReducedSpace()(collocation))
+
+
+def test_what_comes_back_does_not_grow_with_the_recording(there, monkeypatch):
+    sizes: list[int] = []
+
+    def weighed(self: OnCluster, kept: Any) -> list[Any]:
+        found = fetch(self, kept)
+        sizes.append(len(pickle.dumps(found)))
+        return found
+
+    fetch = OnCluster.fetch
+    monkeypatch.setattr(OnCluster, "fetch", weighed)
+    most = []
+    for steps in (12, 36):
+        collocation = Collocation([noisy(hung_cube(steps))], GUESS)
+        with workers_of(there.scheduler_address) as found:
+            ReducedSpace()(collocation, workers=found)
+        *on_the_way, trajectories = sizes
+        assert trajectories > collocation.variables * 8
+        most.append(max(on_the_way))
+        sizes.clear()
+    assert most[1] < 1.02 * most[0] < 2000
+
+
+def test_what_a_lost_worker_had_is_done_again(there):
+    collocation = Collocation(several(), GUESS)
+
+    def watch(line: Iteration) -> None:
+        if line.number == 3:
+            lose(there, 0)
+
+    with workers_of(there.scheduler_address) as found:
+        solution = ReducedSpace()(collocation, watch, workers=found)
+    assert len(there.scheduler.workers) == 1
+    assert_alike(solution, ReducedSpace()(collocation))
+
+
+def test_a_cluster_without_workers_left_is_named(there, monkeypatch):
+    monkeypatch.setattr(workers, "LOOK_EVERY_S", 0.2)
+
+    def watch(line: Iteration) -> None:
+        for number in (0, 1):
+            lose(there, number)
+
+    with (
+        workers_of(there.scheduler_address) as found,
+        pytest.raises(InputError, match=r"--scheduler: the cluster was lost \(no worker is left\)"),
+    ):
+        ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
+
+
+def test_an_interrupted_solve_keeps_its_best(there):
+    lines: list[Iteration] = []
+
+    def watch(line: Iteration) -> None:
+        lines.append(line)
+        if len(lines) == 3:
+            raise KeyboardInterrupt
+
+    with workers_of(there.scheduler_address) as found:
+        solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.parameters == lines[-1].parameters
+    assert np.isfinite(solution.z).all()
+
+
+def test_workers_of_another_version_are_refused():
+    answers = {"tcp://a:1": workers.version("collocation-sysid"), "tcp://b:1": "0.0.1"}
+    client = SimpleNamespace(run=lambda *_, **__: answers)
+    with pytest.raises(InputError, match=r"found '0\.0\.1' on the worker tcp://b:1; expected"):
+        OnCluster(client)
+    answers.clear()
+    with pytest.raises(InputError, match="the scheduler has no workers"):
+        OnCluster(client)
+
+
+def test_costly_experiments_are_shared_out_first():
+    threads = {"a": 1, "b": 1}
+    assert workers._shared_out([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]
+    assert workers._shared_out([1, 1, 1], {"a": 2, "b": 1}) == ["a", "b", "a"]
+
+
+# The command line
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        ("interior-point", "interior-point does not share its experiments"),
+        ("reduced-space", "found 'tcp://127.0.0.1:1', where no scheduler answers"),
+    ],
+)
+def test_a_scheduler_that_is_of_no_use_ends_the_command(tmp_path, monkeypatch, method, said):
+    monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
+    file = write_problem(tmp_path, {"swing": 8})
+    options = "--method", method, "--scheduler", "tcp://127.0.0.1:1", "--out", tmp_path / "run"
+    outcome = run_command("solve", file, *options)
+    assert outcome.code == 2
+    assert said in " ".join(outcome.err.split())
+    assert not (tmp_path / "run").exists()
