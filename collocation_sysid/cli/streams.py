@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -124,7 +125,8 @@ def replay(
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
     watched = errors.is_terminal and not quiet and not as_json
-    with Live(console=errors, auto_refresh=watched, refresh_per_second=10) as shown:
+    shown = Live(console=errors, refresh_per_second=10)
+    with shown if watched else nullcontext():
         for frame in paced(frames, pace) if pace else frames:
             updates.append(estimator.take(frame))
             if as_json:

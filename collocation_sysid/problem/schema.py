@@ -176,14 +176,15 @@ def _parameter_form(value: Any) -> str:
     return "<table>" if isinstance(value, (dict, ParameterSection)) else "<value>"
 
 
-def _flat(given: Any, front: str = "") -> Any:
+def _flat(given: Any, *, front: str = "") -> Any:
     """Regions' parameters, ``core.mu_pa``, also where they are written as tables in a table."""
     if not isinstance(given, dict):
         return given
     flat: dict[str, Any] = {}
     for name, value in given.items():
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
-        inner = _flat(value, f"{front}{name}.") if nested and value else {f"{front}{name}": value}
+        whole = f"{front}{name}"
+        inner = _flat(value, front=f"{whole}.") if nested and value else {whole: value}
         if twice := set(inner) & set(flat):
             raise ValueError(f"{twice.pop()!r} is given twice; expected one value")
         flat |= inner
