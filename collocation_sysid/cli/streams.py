@@ -38,7 +38,10 @@ commands = typer.Typer()
 def live(
     problem: ProblemPath,
     udp: Annotated[
-        int | None, typer.Option(metavar="PORT", help="Read a UDP port of this machine instead.")
+        int | None,
+        typer.Option(
+            metavar="PORT", min=0, max=65535, help="Read a UDP port of this machine instead."
+        ),
     ] = None,
     budget_ms: Annotated[
         float | None, typer.Option(help="Time a frame may take; 80 % of a sample by default.")

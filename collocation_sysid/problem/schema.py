@@ -10,7 +10,7 @@ from ..checked import Finite, Flag, Positive, Text, Whole
 from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
-from ..nlp.schemes import SCHEMES
+from ..nlp.schemes import MOST_STEPS, SCHEMES
 from .recording_schema import ExperimentSection, Nodes
 from .section import Section, Unit, given_keys, require_one
 from .solver_schema import SolverSection
@@ -207,7 +207,9 @@ class TranscriptionSection(Section):
     """How the equations of motion become constraints."""
 
     scheme: SchemeName = "midpoint"
-    substeps: Whole = Field(default=1, ge=1, description="Grid steps between samples.")
+    substeps: Whole = Field(
+        default=1, ge=1, le=MOST_STEPS, description="Grid steps between samples."
+    )
     explicit_grasps: Flag = Field(
         default=False,
         description="Grasped nodes as constraint rows (the paper's c^g) instead of bounds.",
