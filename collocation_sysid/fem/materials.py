@@ -102,8 +102,8 @@ class Material:
             tangent, stress = ca.hessian(psi, F)
         except (Exception, SystemExit) as error:
             raise InputError(
-                f"material {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
-                "of CasADi operations that returns one energy density"
+                f"material {self.name!r} cannot be evaluated ({reason(error)}); expected a "
+                "function of CasADi operations that returns one energy density"
             ) from error
         law = ca.Function("law", [F, values], [psi, stress, tangent])
         some = [float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants]
