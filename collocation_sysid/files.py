@@ -73,9 +73,7 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(
-            f"{file.name} is damaged ({_reason(error)}){AGAIN}", file.parent
-        ) from error
+        raise InputError(f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent) from error
     if not isinstance(content, dict):
         raise InputError(f"{file.name} is damaged: it holds no object{AGAIN}", file.parent)
     return content
@@ -95,10 +93,10 @@ def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(f"{files} is damaged ({_reason(error)}); {remedy}", folder) from error
+        raise InputError(f"{files} is damaged ({reason(error)}); {remedy}", folder) from error
 
 
-def _reason(error: BaseException) -> str:
+def reason(error: BaseException) -> str:
     """The error on one line that is not too long."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return text if len(text) <= LONGEST_REASON else f"{text[: LONGEST_REASON - 1]}…"

@@ -171,6 +171,7 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
     strains = np.frombuffer(b64decode(data["strains"]["fitted"]), "u1").reshape(9, -1)
     assert strains.shape[1] == len(faces)
     assert strains.max() == 255
+    assert strains[data["opening"]].mean() == strains.mean(axis=1).max() > 0
 
 
 def test_turning_is_no_strain_and_stretching_is(run):

@@ -205,6 +205,8 @@ OBJECT = [
         edit=remove("body.vtu"),
     ),
     bad("mesh-is-a-folder", "object.mesh", "is a folder", options=settings("object.mesh=.")),
+    bad("mesh-far-away", "body.vtu", "1e+200 m away",
+        edit=write_mesh(BODY.points_m * 1e200 / 0.09, {"tetra": BODY.tetrahedra})),
     bad("mesh-garbage", "body.vtu", "cannot be read", ".msh", edit=write("body.vtu", "hello")),
     bad(
         "mesh-of-unknown-kind", "body.abc", "cannot be read", ".vtk",
@@ -387,6 +389,10 @@ MARKER_FILES = [
         edit=replace_text("low_y", "low_q", MARKERS),
     ),
     bad(
+        "underscore-in-a-marker", f"{MARKERS}: line 4", "column low_y", "'1_000'",
+        edit=replace_cell(MARKERS, 4, 2, "1_000"),
+    ),
+    bad(
         "word-in-a-marker", f"{MARKERS}: line 4", "column low_y", "'abc'", "blank",
         edit=replace_cell(MARKERS, 4, 2, "abc"),
     ),
@@ -561,6 +567,12 @@ OPTIONS = [
         "folder-of-something-else", "thesis", "not an earlier run", "another folder",
         edit=thesis, options=["--out", "thesis"],
     ),
+    bad("endless-substeps", "transcription.substeps", "10000",
+        options=settings("transcription.substeps=1000000000")),
+    bad("endless-roll-out", "experiment 'swing'", "found steps of 1e-90 s", "at most 10000",
+        options=settings("rollout.timestep_s=1e-90")),
+    bad("name-with-nul", "name", "expected a name that files can have",
+        options=settings('experiment.swing.name="a\\u0000b"')),
     bad("output-is-a-file", POSES, "is a file", "folder", options=["--out", POSES]),
     bad("output-in-a-file", POSES, "is a file", "folder", options=["--out", f"{POSES}/run"]),
 ]  # fmt: skip
@@ -605,6 +617,11 @@ def test_a_slip_is_explained_and_nothing_is_written(tiny, edit, options, words):
             ("simulate problem.toml --out .", "swing_markers.csv", "reads this file"),
             ("simulate problem.toml --out s --integrator rk4", "--integrator", "'rk4'", "newmark"),
             ("simulate problem.toml --out s --timestep-s 0", "--timestep-s", "found 0", "above 0"),
+            (
+                "simulate problem.toml --out s --timestep-s 1e-300",
+                "found steps of",
+                "at most 10000",
+            ),
             ("simulate problem.toml --out s --noise-m=-1", "--noise-m", "found -1", "0 or more"),
             ("simulate problem.toml --out s --seed=-1", "--seed", "found -1", "0 or more"),
             ("plot nowhere", "nowhere", "not a run folder", "result.json"),

@@ -148,6 +148,9 @@ def test_a_material_of_the_users_own_is_identified_when_allowed(tiny):
         (MINE, "stressed", "undeformed"),
         ("import nothing_like_it", "energy", "ModuleNotFoundError"),
         ("def energy(F):\n    return 0", "energy", "no constants"),
+        ("def energy(F, mu_pa, lambda_pa):\n    exit(7)", "energy", "SystemExit: 7"),
+        ("exit(7)", "energy", "SystemExit: 7"),
+        ("def energy(F, mu_pa, lambda_pa):\n    return mu_pa * F", "energy", "only defined for"),
     ],
 )
 def test_a_file_that_gives_no_material_is_refused(tiny, content, function, expected):

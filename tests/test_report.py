@@ -214,5 +214,24 @@ def test_every_remedy_names_a_page_that_is_there():
     howto = Path(__file__).parents[1] / "docs" / "howto"
     for remedy in (*REMEDIES, LAST):
         assert (howto / f"{remedy.page}.md").is_file()
-    assert remedy_for("the residuals are 3 times as large as sigma_m says").page == "verdict"
     assert remedy_for("something new") is LAST
+
+
+@pytest.mark.parametrize(
+    ("warning", "page"),
+    [
+        ("the residuals are 3 times as large as sigma_m says", "verdict"),
+        ("sigma_n seems 4 times too large for these residuals", "verdict"),
+        ("only the ratios of E can be told (E/ρ): …; fix a density", "forces"),
+        ("the body is 120 m large; expected 0.0001 to 10 m", "wrong_description"),
+        ("'swing': gravity seems to point along +y (5 times nearer)", "wrong_description"),
+        ("the grasp of 'swing' cuts through elements", "wrong_description"),
+        ("only about 1.0 tet4 elements lie across the body's 30 mm", "mesh"),
+        ("marker 'tip' of 'swing' is never seen: leave it out of names", "motion_capture"),
+        ("the first mode of 'swing' (3 Hz at the guess) has only 5.0 steps a period", "scheme"),
+        ("the first mode of 'swing' (3 Hz at the guess) has only 3.0 samples a period", "trust"),
+        ("interior-point will take about 40 GB, more than this machine's 24 GB", "large"),
+    ],
+)
+def test_a_warning_leads_to_the_page_that_cures_it(warning: str, page: str):
+    assert remedy_for(warning).page == page

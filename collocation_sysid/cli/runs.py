@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -150,8 +151,9 @@ def animate(
     from ..output.animation import animate as film
 
     require_possible(to.parent if to is not None else run_folder)
-    with Progress(console=errors, transient=True, disable=quiet or not errors.is_terminal) as bar:
-        task = bar.add_task("filming", total=1.0)
+    bar = Progress(console=errors, transient=True)
+    task = bar.add_task("filming", total=1.0)
+    with bar if errors.is_terminal and not quiet else nullcontext():
         file = film(
             run_folder, to, fps, slow, experiment, lambda share: bar.update(task, completed=share)
         )

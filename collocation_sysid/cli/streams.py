@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,7 +38,10 @@ commands = typer.Typer()
 def live(
     problem: ProblemPath,
     udp: Annotated[
-        int | None, typer.Option(metavar="PORT", help="Read a UDP port of this machine instead.")
+        int | None,
+        typer.Option(
+            metavar="PORT", min=0, max=65535, help="Read a UDP port of this machine instead."
+        ),
     ] = None,
     budget_ms: Annotated[
         float | None, typer.Option(help="Time a frame may take; 80 % of a sample by default.")
@@ -124,7 +128,8 @@ def replay(
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
     watched = errors.is_terminal and not quiet and not as_json
-    with Live(console=errors, auto_refresh=watched, refresh_per_second=10) as shown:
+    shown = Live(console=errors, refresh_per_second=10)
+    with shown if watched else nullcontext():
         for frame in paced(frames, pace) if pace else frames:
             updates.append(estimator.take(frame))
             if as_json:

@@ -29,6 +29,8 @@ from .motion import Motion
 TOLERANCE = 1e-5
 # Logged poses between two samples.
 POSES_PER_SAMPLE = 4
+# A motion of more is not meant: each candidate is simulated.
+MOST_SAMPLES = 100_000
 
 
 def shared_information(fit: LinearisedFit) -> Array:
@@ -103,10 +105,10 @@ class Recording:
                 "has a grasp that holds some axes, or for a while; expected one that holds "
                 "throughout"
             )
-        if self.samples < 3:
+        if not 3 <= self.samples <= MOST_SAMPLES:
             raise InputError(
-                f"{self.duration_s:g} s are {self.samples - 1} steps of "
-                f"{template.timestep_s:g} s; expected at least two",
+                f"{self.duration_s:g} s are {self.samples - 1:.6g} steps of "
+                f"{template.timestep_s:g} s; expected 2 to {MOST_SAMPLES}",
                 where="--duration",
             )
 

@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from ..errors import InputError, hint_at
+from ..files import reason
 from .constants import Constant, constant_named
 
 Energy = Callable[..., ca.SX]
@@ -99,10 +100,10 @@ class Material:
         try:
             psi = self.psi(ca.reshape(F, 3, 3), values)
             tangent, stress = ca.hessian(psi, F)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
-                f"material {self.name!r} cannot be evaluated ({error}); expected a function of "
-                "CasADi operations that returns one energy density"
+                f"material {self.name!r} cannot be evaluated ({reason(error)}); expected a "
+                "function of CasADi operations that returns one energy density"
             ) from error
         law = ca.Function("law", [F, values], [psi, stress, tangent])
         some = [float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants]

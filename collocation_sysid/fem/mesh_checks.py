@@ -16,6 +16,9 @@ from ..errors import InputError
 # single-precision file cannot tell the element from a flat one.
 DEGENERATE_RATIO = 1e-6
 
+# Beyond all bodies, but volumes are still numbers.
+LARGEST_M = 1e50
+
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
@@ -27,6 +30,8 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
         raise InputError("points_m must be an (n, 3) array of numbers") from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
+    if (np.abs(points) > LARGEST_M).any():
+        raise InputError(f"a node lies {np.nanmax(np.abs(points)):.3g} m away")
     return points
 
 

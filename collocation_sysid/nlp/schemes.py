@@ -18,6 +18,9 @@ from dataclasses import dataclass, replace
 
 from ..errors import InputError
 
+# Steps from sample to sample; whoever asks for more has slipped.
+MOST_STEPS = 10_000
+
 
 @dataclass(frozen=True)
 class Stencil:

@@ -19,7 +19,7 @@ from .newton import NewtonOptions
 from .nuisance import NuisanceMap
 from .parameters import Parameters, theta_of
 from .reaction import forces_on, reactions
-from .schemes import Scheme
+from .schemes import MOST_STEPS, Scheme
 from .sensor import Forced, Grid, sensed_dofs, sensors_of
 
 
@@ -46,6 +46,19 @@ class Trajectory:
     markers_m: Array
     reactions: tuple[Grid, Forced]
     wrenches: tuple[Array, ...]
+
+
+def require_steps(experiment: Experiment, step_s: float) -> None:
+    """Refuse a step that is far too short for an experiment's samples.
+
+    Raises
+    ------
+    InputError
+    """
+    if not experiment.static and experiment.timestep_s > MOST_STEPS * step_s:
+        raise InputError(
+            f"found steps of {step_s:g} s; expected at most {MOST_STEPS} from sample to sample"
+        )
 
 
 def simulate(
@@ -80,7 +93,7 @@ def simulate(
     Raises
     ------
     InputError
-        For a step or substeps that are not positive, or an unknown scheme.
+        For a step or substeps that are not positive, too many steps, or an unknown scheme.
     SimulationError
         When a step fails even after halvings; names time and element.
     """
@@ -91,6 +104,7 @@ def simulate(
         raise InputError(f"substeps = {substeps}, expected at least 1")
     if integrator == "newmark" and not experiment.static:
         step = timestep_s or experiment.timestep_s / 4
+        require_steps(experiment, step)
         count = max(1, round(experiment.timestep_s / step))
         x, v, forced = newmark(experiment, theta, count, options, progress, sensed)
         rows = (len(x) - 1) * count + 1

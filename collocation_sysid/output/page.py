@@ -55,7 +55,8 @@ def _content(replay: Replay) -> dict[str, Any]:
     stretched = {
         name: surface_strain(replay, x[kept]) for name, x in named.items() if x is not None
     }
-    largest = float(np.nanquantile(np.abs(next(iter(stretched.values()))), STRAINED)) or 1e-6
+    shown = np.abs(next(iter(stretched.values())))
+    largest = float(np.nanquantile(shown, STRAINED)) or 1e-6
     there = first[np.isfinite(first).all(axis=(1, 2))]
     return {
         "t_s": replay.t_s[kept].tolist(),
@@ -65,6 +66,7 @@ def _content(replay: Replay) -> dict[str, Any]:
         "sides": _packed(nodes[:, 3:], "<i4"),
         "strains": {name: _packed(_bytes(x / largest), "u1") for name, x in stretched.items()},
         "largest": largest,
+        "opening": int(np.nansum(shown, axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
         "held": _packed(replay.held[kept][:, outer], "u1"),
         "measured": _packed(replay.measured_m[kept], "<f4"),

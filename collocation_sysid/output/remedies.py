@@ -35,16 +35,23 @@ class Remedy:
 
 REMEDIES = (
     Remedy(
+        "The scale",
+        r"^only the ratios",
+        "Measure a force, tie on a known mass, or fix a density: motion alone tells ratios only.",
+        "forces",
+    ),
+    Remedy(
         "The description",
-        r"^likely:|description looks wrong|dense|density|size of the body|is as .* as|mm across",
+        r"^likely:|times nearer|poses jump|slips (by|at)|density|dense|m large|is as .* as|"
+        r"mm across|cuts through elements",
         "Compare units, frames, labels and clocks of the problem file with the laboratory's notes; "
         "check draws conclusions from the recordings before any solve.",
         "wrong_description",
     ),
     Remedy(
         "The size of the noise",
-        r"sigma_m",
-        "Error bars follow the residuals. State the cameras' noise in sigma_m where it is known; "
+        r"sigma_n?m?\b",
+        "Error bars follow the residuals. State the sensor's noise in sigma where it is known; "
         "where one marker alone is off, look at its track for swaps and reflections.",
         "verdict",
     ),
@@ -58,10 +65,17 @@ REMEDIES = (
     ),
     Remedy(
         "What the data do not tell",
-        r"do not tell|ended at (its|their) bound|no information",
+        r"do not tell|ended at (its|their) bound|no information|"
+        r"samples a period|than the .* recorded",
         "Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion that it matters to.",
         "trust",
+    ),
+    Remedy(
+        "The markers",
+        r"^marker ",
+        "Look at the markers' labels, unit, frame and places, and at when each is seen.",
+        "motion_capture",
     ),
     Remedy(
         "What is not known of a recording",
@@ -79,7 +93,7 @@ REMEDIES = (
     ),
     Remedy(
         "The mesh",
-        r"step and mesh move|lock|elements? across|flat",
+        r"step and mesh move|elements lock|elements lie across|nearly flat",
         'Refine it, and take element = "tet10", or "tet10-p0" from ν = 0.45 on. '
         "refine RUN measures what is left.",
         "mesh",
@@ -90,6 +104,12 @@ REMEDIES = (
         "Where the fit is good and the simulation is not, the step is too long; where a recording "
         "is predicted badly, the model lacks something that this recording shows.",
         "trust",
+    ),
+    Remedy(
+        "The memory",
+        r" GB",
+        "Take reduced-space, fewer timesteps or a coarser mesh.",
+        "large",
     ),
 )
 LAST = Remedy(

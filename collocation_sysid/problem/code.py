@@ -8,6 +8,7 @@ from typing import cast
 
 from ..errors import InputError, hint_at
 from ..fem.materials import Energy, Material
+from ..files import reason
 from .recording import existing_file
 from .schema import CodeSection
 
@@ -31,8 +32,8 @@ def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -
     file = existing_file(folder, section.file, f"{key}.file")
     try:
         names = runpy.run_path(str(file))
-    except Exception as error:
-        raise InputError(f"running it failed: {type(error).__name__}: {error}", file) from error
+    except (Exception, SystemExit) as error:
+        raise InputError(f"running it failed: {reason(error)}", file) from error
     found = names.get(section.function)
     if not callable(found):
         functions = [n for n, v in names.items() if callable(v) and not n.startswith("_")]

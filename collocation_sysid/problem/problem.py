@@ -19,6 +19,7 @@ from ..methods.options import Options
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
+from ..nlp.simulation import require_steps
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
 from ..statistics.uncertainty import ErrorsOption, NoiseOption
@@ -259,6 +260,8 @@ class Problem:
         for experiment in self.experiments:
             try:
                 as_scheme(self.scheme, experiment.start_rule)
+                if self.rollout.timestep_s is not None:
+                    require_steps(experiment, self.rollout.timestep_s)
             except InputError as error:
                 raise error.located(where=f"experiment '{experiment.name}'") from error
         self.solver()

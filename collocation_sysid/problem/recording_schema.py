@@ -287,7 +287,11 @@ class MarkersSection(Section):
 
 
 def _file_name(name: str) -> str:
-    if not name or name.startswith(".") or any(mark in name for mark in '/\\:*?"<>|\n'):
+    if (
+        not name.isprintable()
+        or name[:1] in ("", ".")
+        or any(mark in name for mark in '/\\:*?"<>|')
+    ):
         raise ValueError(
             f"found {name!r}; expected a name that files can have: not empty, no dot in front, "
             'none of / \\ : * ? " < > |'

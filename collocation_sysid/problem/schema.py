@@ -10,7 +10,7 @@ from ..checked import Finite, Flag, Positive, Text, Whole
 from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
-from ..nlp.schemes import SCHEMES
+from ..nlp.schemes import MOST_STEPS, SCHEMES
 from .recording_schema import ExperimentSection, Nodes
 from .section import Section, Unit, given_keys, require_one
 from .solver_schema import SolverSection
@@ -176,14 +176,15 @@ def _parameter_form(value: Any) -> str:
     return "<table>" if isinstance(value, (dict, ParameterSection)) else "<value>"
 
 
-def _flat(given: Any, front: str = "") -> Any:
+def _flat(given: Any, *, front: str = "") -> Any:
     """Regions' parameters, ``core.mu_pa``, also where they are written as tables in a table."""
     if not isinstance(given, dict):
         return given
     flat: dict[str, Any] = {}
     for name, value in given.items():
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
-        inner = _flat(value, f"{front}{name}.") if nested and value else {f"{front}{name}": value}
+        whole = f"{front}{name}"
+        inner = _flat(value, front=f"{whole}.") if nested and value else {whole: value}
         if twice := set(inner) & set(flat):
             raise ValueError(f"{twice.pop()!r} is given twice; expected one value")
         flat |= inner
@@ -206,7 +207,9 @@ class TranscriptionSection(Section):
     """How the equations of motion become constraints."""
 
     scheme: SchemeName = "midpoint"
-    substeps: Whole = Field(default=1, ge=1, description="Grid steps between samples.")
+    substeps: Whole = Field(
+        default=1, ge=1, le=MOST_STEPS, description="Grid steps between samples."
+    )
     explicit_grasps: Flag = Field(
         default=False,
         description="Grasped nodes as constraint rows (the paper's c^g) instead of bounds.",

@@ -138,7 +138,7 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
         for j, column in enumerate(columns):
             cell = row.cells[column]
             try:
-                value = float(cell) if cell else math.nan
+                value = _float(cell) if cell else math.nan
             except ValueError:
                 value = math.inf
             if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
@@ -159,6 +159,11 @@ def tracks(grid: Grid, first_columns: Sequence[int]) -> Array:
     return numbers(grid, columns, blank_allowed=True).reshape(-1, len(first_columns), 3)
 
 
+def _float(text: str) -> float:
+    """A number as files write it: digits joined by underscores are one in Python only."""
+    return math.inf if "_" in text else float(text)
+
+
 def header_number(text: str, key: str, path: str | Path, line: int) -> float | None:
     """The number that a header states; None where it is blank.
 
@@ -170,7 +175,7 @@ def header_number(text: str, key: str, path: str | Path, line: int) -> float | N
     if not text:
         return None
     try:
-        value = float(text)
+        value = _float(text)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:

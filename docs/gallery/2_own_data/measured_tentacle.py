@@ -25,7 +25,7 @@ assert run.solution.rms_m < 0.01
 for experiment, positions_m in zip(problem.experiments[:4], run.solution.positions_m, strict=False):
     (tendon,) = experiment.tendons
     _, y_mm, z_mm = 1e3 * positions_m[0].reshape(-1, 3).T
-    (dots,) = plt.plot(y_mm, z_mm, ".", ms=2, label=f"{tendon.tension_n:.1f} N")
+    (dots,) = plt.plot(y_mm, z_mm, ".", ms=2, label=f"{tendon.tension_n[0]:.1f} N")
     _, y_mm, z_mm = 1e3 * experiment.markers.positions_m[0].T
     plt.plot(y_mm, z_mm, "o", mfc="none", color=dots.get_color())
 for name, rms_m in run.solution.rms_by_experiment_m.items():
