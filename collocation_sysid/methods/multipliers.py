@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation
+from ..fem.batched import side_by_side
+from ..nlp.collocation import Collocation, Part
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver
 
@@ -22,8 +23,8 @@ def constraint_multipliers(
     SimulationError
         Where a timestep's equations are singular.
     """
-    found = []
-    for part in collocation.parts(z):
+
+    def of(part: Part) -> Array:
         segment = part.segment
         gradient = segment.observation.gradient(part.x, part.phi)[0]
         if segment.sensors:
@@ -31,7 +32,9 @@ def constraint_multipliers(
         gradient *= collocation.loss_scale
         solver = BlockSolver(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(part.x, part.setting, gradient)
-        found.append(segment.of_rows(y))
+        return segment.of_rows(y)
+
+    found = side_by_side(of, collocation.parts(z), collocation.threads)
     multipliers = np.concatenate(found)
     if any(segment.grasp_rows.any() for segment in collocation.segments):
         _add_grasps(collocation, z, multipliers)
