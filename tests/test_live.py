@@ -146,7 +146,7 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
     assert track.information is whole
     again = Track(live.model, track.p, track.prior, live._block_rows, track)
     for row in log[left:]:
-        again.again(row)
+        again.again([row])
     before, after = (normal_equations(each.triangle) for each in (whole, again.information))
     scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
     np.testing.assert_allclose(after / scale, before / scale, atol=1e-8)
@@ -166,9 +166,9 @@ def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(mo
         state = live.track.blocks[1]
         part = sweep.Sweep(live.model, p, live.prior, state.start, state.at)
         for number, row in enumerate(live.log):
-            whole.advance(row.poses)
+            whole.advance([row.poses])
             if number >= live._block_rows:
-                kept = part.advance(row.poses)
+                (kept,) = part.advance([row.poses])
         errors.append(np.abs(kept.x - whole.blocks[-1].kept[-1].x).max())
     assert errors[1] < 0.3 * errors[0] < 1e-5  # of second order
 

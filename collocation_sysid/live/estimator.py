@@ -231,7 +231,7 @@ class Estimator:
             if self.track is None:
                 self._begin(row)
             elif not self.track.failed:
-                self.track.advance(row.poses)
+                self.track.advance([row.poses])
         except SimulationError as error:
             if self.track is None:
                 self.log.clear()
@@ -260,7 +260,7 @@ class Estimator:
                         tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
                     )
                     residual[wild] = here[wild] = np.nan
-                track.read(residual, slope)
+                track.read([(residual, slope)])
                 near = np.sum((here * sigma_m) ** 2, axis=1)
                 squares.append(near[np.isfinite(near)])
             self.log[-1].readings.append(reading)
@@ -302,21 +302,21 @@ class Estimator:
         try:
             trial = Track(self.model, self.p, self.prior, self._block_rows)
             for _ in range(self.model.rows + 2):
-                trial.again(LoggedRow(moved, [Reading(0.0, nowhere)]))
+                trial.again([LoggedRow(moved, [Reading(0.0, nowhere)])])
         except SimulationError:
             return None
         self._estimates_at(trial, self.p)
         return poses, trial.blocks[0].kept[0].x
 
     def _begin(self, row: LoggedRow) -> None:
-        model, guess = self.model, None
+        model, guesses = self.model, []
         poses = model.poses_of(row.poses)
         if self._rest is not None and len(poses) == 1:
             (was_turned, was_at), x = self._rest[0][0], self._rest[1]
             (turned, at) = poses[0]
-            guess = ((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()
+            guesses = [((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()]
         track = Track(model, self.p, self.prior, self._block_rows)
-        track.advance(row.poses, guess)
+        track.advance([row.poses], guesses)
         first = row.readings[0].tracks_m if row.readings else np.full((len(self.names), 3), np.nan)
         self.model = model.placed(first, track.blocks[0].kept[0].x)
         if self.model is not model:
@@ -325,7 +325,7 @@ class Estimator:
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
             self.prior = self._of_priors()
             track = Track(self.model, self.p, self.prior, self._block_rows)
-            track.advance(row.poses, guess)
+            track.advance([row.poses], guesses)
         self.track = track
 
     def _begin_anew(self) -> None:
@@ -393,15 +393,15 @@ class Estimator:
         while self.track is not None:
             again = self.again or self._wanted(self.track, notes)
             before = self.clock()
-            if again is None or self._is_spent(done, before - began):
+            if again is None or not (left := self._left(done, before - began, again.left)):
                 break
+            were = again.rows
             try:
-                again.again(self.log[again.rows])
+                again.again(self.log[were : were + left])
             except SimulationError:
                 again.failed = True
-            done += 1
-            took_s = self.clock() - before
-            self._row_s = max(took_s, self._row_s)
+            done += again.rows - were
+            self._row_s = max((self.clock() - before) / left, self._row_s)
             if self.search is not None and not self.search.done:
                 if again.failed or again.rows >= min(self.search.rows, len(self.log)):
                     self.search.compare(again)
@@ -410,10 +410,14 @@ class Estimator:
                 self._judge(self.track, again, notes)
         return done
 
-    def _is_spent(self, done: int, elapsed_s: float) -> bool:
+    def _left(self, done: int, elapsed_s: float, most: int) -> int:
+        """Rows that there is time for."""
         if self.options.rows is not None:
-            return done >= self.options.rows
-        return elapsed_s + self._row_s > self.budget_s
+            return min(self.options.rows - done, most)
+        left_s = self.budget_s - elapsed_s
+        if left_s <= 0 or not self._row_s:
+            return int(left_s > 0)
+        return int(min(left_s / self._row_s, most))
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
         """Begin a pass where one is wanted."""
@@ -431,7 +435,7 @@ class Estimator:
                 self.search = None
                 notes.append("no start was found among stiffnesses")
                 return None
-        elif track.failed or self.moved <= MOVED:
+        elif track.failed or (self.moved <= MOVED and not track.is_rough):
             return None
         self.again = Track(self.model, p, track.prior, self._block_rows, base)
         return self.again

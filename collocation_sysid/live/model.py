@@ -22,6 +22,8 @@ from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..problem import Problem
 
+# Rows that are linearised at a time, at most.
+TOGETHER = 8
 # Young's modulus that a search without a guess begins at.
 MIDDLE_PA = 1e4
 
@@ -93,8 +95,8 @@ class Model:
 
     @cached_property
     def rows(self) -> int:
-        """Rows of the start, and one more."""
-        return 2 * self.segment.dynamics.reach + 3
+        """Rows of the start, and those that are linearised at a time."""
+        return 2 * self.segment.dynamics.reach + 2 + TOGETHER
 
     @property
     def size(self) -> int:
@@ -210,7 +212,7 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
     """A few samples in which nothing moves."""
     reach = collocation.segments[0].dynamics.reach
     # The rows of the start, and room for a reading.
-    count = max(2 * reach + 3, NEIGHBOURS, 3)
+    count = max(2 * reach + 2 + TOGETHER, NEIGHBOURS, 3)
     t_s = experiment.timestep_s * np.arange(count)
     markers = experiment.markers
     first, _ = markers.first_samples

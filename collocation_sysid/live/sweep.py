@@ -1,21 +1,25 @@
 """One pass over a recording at one point p: motion, sensitivities and what the markers say.
 
-A row of the grid takes what the last few rows left (positions, forces, the columns Z by the
-parameters that move the body) and leaves the same for the next. Newton's steps end where they are
-short; the last factor and slopes serve the columns, as in the reduced-space method: as a rule there
-is one linearisation and one factorisation, and where the guess is extrapolated forces alone again.
+A few rows of the grid at a time take what the last ones left (positions, forces, the columns Z by
+the parameters that move the body) and leave the same for the next. They are linearised together at
+their guesses; each row is then solved once, for its correction and its columns: a Gauss–Newton step
+on the collocation equations, whose defect is of second order in the correction, as in the
+reduced-space method. A row whose correction is long is linearised again, alone, where that led.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..errors import SimulationError
+from ..fem.body import Linearisation
 from ..methods.robust import huberised
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, NewtonOptions, Solver, simulation_error
@@ -23,13 +27,12 @@ from ..nlp.rest import start_state
 from ..nlp.row import Row
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
 from .information import Information
-from .model import Model, Poses
+from .model import TOGETHER, Model, Poses
 
-# Newton's last step over the body's size: the next one would be its square. Slopes of a state that
-# many times as far away serve for it too: they are off by as small a share.
-LAST_STEP, SAME_SLOPES = 1e-5, 30
-# Iterations before the way of the grasp is taken in parts, and to what accuracy that is done.
-QUICK = 6
+# A row's correction over the body's size: the next one would be its square. Where rows are solved
+# together it may be so many times as long, and another pass follows.
+LAST_STEP, ROUGH = 3e-4, 10
+# To what accuracy rows are solved where the way of the grasp has to be taken in parts.
 CAREFUL = NewtonOptions(tolerance=1e-6)
 # Readings this near to a row, in rows, are of that row; others lie between four of them.
 NEAR = 1e-3
@@ -69,20 +72,34 @@ class State:
 
     Attributes
     ----------
-    row : int
-        Rows done.
-    x, force : (rows, 3n) of the last rows of the template
-    given : (rows, g, columns) of grasped dofs
+    row, end : int
+        Rows done, and the place of the next one in the template.
+    x, force : (rows, 3n) of the template
+    given : (rows, g, 1 + m) of grasped dofs
     memory : Memory
     read : tuple of (x, Z, Z of the markers), latest last
     """
 
     row: int
+    end: int
     x: Array
     force: Array
     given: Array
     memory: Memory
     read: tuple[Read, ...]
+
+
+class Linear(NamedTuple):
+    """Rows from one on, linearised where they are guessed to be.
+
+    Residuals (rows, 3n) and the motion of grasped dofs are of all rows of the template.
+    """
+
+    first: int
+    at: Linearisation
+    nu: Array
+    residual: Array
+    given: GivenMotion | None
 
 
 class Sweep:
@@ -104,6 +121,11 @@ class Sweep:
     ------
     SimulationError
         Where there is no start.
+
+    Attributes
+    ----------
+    longest : float
+        Of the corrections of its rows, the longest coordinate [m].
     """
 
     def __init__(
@@ -123,10 +145,14 @@ class Sweep:
         self.operator = segment.observation.operator(self.phi)
         self.reading = segment.observation.reading(self.phi)
         self.clock = self._weights_in_time()
-        self.newton = Solver(segment.experiment, CAREFUL)
+        self.newton, self.longest = Solver(segment.experiment, CAREFUL), 0.0
+        self.grasped, self.moving = segment.grasping.dofs, segment.moving
+        self.shape = len(self.solver.free), 1 + len(self.moving)
         self.held = np.setdiff1d(np.arange(segment.dofs), self.solver.free)
+        self.held_places = np.searchsorted(self.grasped, self.held)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
-        self.moving = segment.moving
+        self.room = self.solver.factoriser.room(1 + segment.body.unsymmetric)
+        self.out = np.empty((TOGETHER, self.dynamics.forces.linearisation_width))
         self.information, self.known = known, known
         state = self._begin() if start is None or at is None else self._moved(start, p - at)
         self._resume(state)
@@ -134,167 +160,179 @@ class Sweep:
     # State ------------------------------------------------------------------------------------
 
     def _begin(self) -> State:
-        rows, dofs, count = self.model.rows, self.segment.dofs, len(self.moving)
-        grasped = len(self.segment.grasping.dofs)
-        empty = np.zeros((rows, dofs))
-        memory = Forward(self.solver, self.setting, (len(self.solver.free), count)).memory
-        return State(0, empty, empty.copy(), np.zeros((rows, grasped, count)), memory, ())
+        rows, dofs, shape = self.model.rows, self.segment.dofs, self.shape
+        empty, given = np.zeros((rows, dofs)), np.zeros((rows, len(self.grasped), shape[1]))
+        memory = Forward(self.solver, self.setting, shape).memory
+        return State(0, 0, empty, empty, given, memory, ())
 
     def _moved(self, state: State, step: Array) -> State:
         step = step[self.moving]
         if not step.any():
             return state
         x, force, free = state.x.copy(), state.force.copy(), self.solver.free
-        dofs, last = self.segment.grasping.dofs, min(state.row, self.model.rows) - 1
-        x[:, dofs] += state.given @ step
-        memory = state.memory
+        last, memory = state.end - 1, state.memory
+        x[:, self.grasped] += state.given[..., 1:] @ step
         for k, columns in enumerate(memory.solutions[: last + 1]):
-            x[last - k, free] += columns @ step
+            x[last - k, free] += columns[:, 1:] @ step
         for k, columns in enumerate(memory.increments[: last + 1]):
-            force[last - k, free] += columns @ step
+            force[last - k, free] += columns[:, 1:] @ step
         read = tuple((at + own @ step, own, seen) for at, own, seen in state.read)
-        return State(state.row, x, force, state.given, memory, read)
+        return replace(state, x=x, force=force, read=read)
 
     def _resume(self, state: State) -> None:
-        self.row = state.row
+        self.row, self.end = state.row, state.end
         self.x, self.force, self.given = state.x.copy(), state.force.copy(), state.given.copy()
-        shape = (len(self.solver.free), len(self.moving))
-        self.forward = Forward(self.solver, self.setting, shape, state.memory)
-        most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4
+        self.forward = Forward(self.solver, self.setting, self.shape, state.memory)
+        most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
         self.read: deque[Read] = deque(state.read, maxlen=most)
 
     @property
     def state(self) -> State:
         """What the next row depends on."""
-        return State(
-            self.row,
-            self.x.copy(),
-            self.force.copy(),
-            self.given.copy(),
-            self.forward.memory,
-            tuple(self.read),
-        )
+        arrays = self.x.copy(), self.force.copy(), self.given.copy()
+        return State(self.row, self.end, *arrays, self.forward.memory, tuple(self.read))
 
     # Rows -------------------------------------------------------------------------------------
 
-    def advance(self, poses: Poses, guess: Array | None = None) -> Kept:
-        """Go on by a row, with the grasps there.
+    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[Kept]:
+        """Go on by rows, at most `TOGETHER`, with the grasps there.
+
+        It ends at a row that is far from where it was guessed: what comes after is as well.
 
         Raises
         ------
         SimulationError
-            Where the row cannot be solved.
+            Where a row cannot be solved.
         """
-        t = self._make_room()
-        poses = self.model.poses_of(poses)
-        goal, slopes = self.model.goals(self.carried, poses)
-        self.given[t, :, self.segment.nq :] = slopes
-        dofs = self.segment.grasping.dofs
-        given = None
-        if self.segment.nuisance.moves_grasps:
-            given = GivenMotion.along(self.solver, dofs, self.given)
-        by_p = np.zeros((self.segment.dofs, len(self.moving)))
-        if t < self.dynamics.first_row:
-            self.x[t] = self._start(poses)
-        else:
-            step, self.x[t], self.force[t] = self._solved(t, poses, goal, guess)
-            right = np.zeros((len(self.solver.free), len(self.moving)))
-            if self.setting.mass_moves:
-                right -= self.forward.inertia_slopes(step, self._acceleration(t, step.row))
-            slopes_n = self.forward.force_slopes(step)
-            by_p[self.solver.free] = self.forward.advance(step, right, slopes_n, given)
-        by_p[self.held] = self.given[t, np.searchsorted(dofs, self.held)]
-        kept = Kept(self.x[t].copy(), by_p.astype(np.float32))
-        self.read.append((kept.x, kept.columns, self.operator @ by_p))
-        self.row += 1
-        return kept
+        first = self._make_room(len(poses))
+        for t, each in enumerate(poses, start=first):
+            goal, slopes = self.model.goals(self.carried, self.model.poses_of(each))
+            self.given[t, :, 1 + self.segment.nq :] = slopes
+            self.x[t] = guesses[t - first] if guesses else self._guess(t, each)
+            self.x[t, self.grasped] = goal
+        if first < self.dynamics.first_row:
+            return [self._kept(first, np.zeros(self.shape))]
+        here, found, last, careful = range(first, first + len(poses)), [], np.inf, False
+        while here:
+            limit = LAST_STEP * self.size_m * (1 if len(here) == 1 else ROUGH)
+            linear = self._linearised(here)
+            for t in here:
+                before = self.forward.memory
+                columns = self._columns(t, linear)
+                length = float(np.abs(columns[:, 0]).max(initial=0.0))
+                if not length <= limit:
+                    break
+                self.longest = max(self.longest, length)
+                found.append(self._kept(t, columns))
+            else:
+                break
+            self.forward = Forward(self.solver, self.setting, self.shape, before)
+            if length < last / 2:
+                self.x[t, self.solver.free] += columns[:, 0]
+                last = length
+            elif not careful:
+                self.x[t], careful, last = self._carefully(t, poses[t - first]), True, np.inf
+            else:
+                raise self._failed(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
+            here = range(t, t + 1)
+        return found
 
-    def _make_room(self) -> int:
-        if self.row < self.model.rows:
-            return self.row
-        for each in (self.x, self.force, self.given):
-            each[:-1] = each[1:]
-        return self.model.rows - 1
+    def _make_room(self, count: int) -> int:
+        surplus = self.end + count - self.model.rows
+        if surplus > 0:
+            for each in (self.x, self.force, self.given):
+                each[:-surplus] = each[surplus:]
+            self.end -= surplus
+        return self.end
 
-    def _start(self, poses: Poses) -> Array:
-        experiment = self.model.at_start(poses, self.phi)
-        return start_state(experiment, self.setting.theta, self.newton)[0]
-
-    def _acceleration(self, t: int, row: Row) -> Array:
-        reach = min(t, self.dynamics.reach)
-        return np.tensordot(row.s[: reach + 1], self.x[t - reach : t + 1][::-1], 1)
-
-    def _solved(
-        self, t: int, poses: Poses, goal: Array, guess: Array | None
-    ) -> tuple[Step, Array, Array]:
-        """Row t: its last linearisation, x_t, and F_t."""
-        dofs = self.segment.grasping.dofs
-        equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
-        if guess is None:
-            guess = self._guess(t) if t else self._start(poses)
-        near = guess.copy()
-        near[dofs] = goal
-        try:
-            return self._quick(t, equations, near.copy())
-        except NewtonFailure:
-            pass
-        try:
-            if t == 0:
-                return self._quick(t, equations, self._start(poses))
-            near = solve_row(self.newton, equations, near, self.x[t - 1], goal)
-            return self._quick(t, equations, near)
-        except NewtonFailure as failure:
-            time_s = self.row * self.model.interval_s / self.model.substeps
-            what = f"the step at row {self.row}"
-            raise simulation_error(self.newton, failure, time_s, what) from failure
-
-    def _guess(self, t: int) -> Array:
+    def _guess(self, t: int, poses: Poses) -> Array:
         """x_t on a cubic through the last four rows, as far as there are that many."""
+        if t == 0:
+            return self._start(poses)
         if t < 4:
             return extrapolated(self.x[:t], np.zeros(self.segment.dofs))
         return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
-    def _quick(self, t: int, equations: RowEquations, x: Array) -> tuple[Step, Array, Array]:
-        """Newton's method without safeguards, as long as its steps get shorter."""
-        solver, row, theta = self.solver, equations.row, self.setting.theta
-        pattern, free, last, step = solver.pattern, solver.free, np.inf, None
-        short = LAST_STEP * self.size_m
-        for _ in range(QUICK):
-            if step is None or last > SAME_SLOPES * short:
-                xi, nu = equations.states(x)
-                at = equations.forces.linearise(xi, nu, theta)
-                matrix = row.block(at.by_position[0], at.by_velocity[0], pattern)
-                skew = row.skew_block(at.by_position_skew[0])
-                try:
-                    factor = solver.factoriser.factorise(matrix, skew)
-                except np.linalg.LinAlgError as error:
-                    raise NewtonFailure(x, f"the equations are singular: {error}") from error
-                parts = at.force[0], at.by_position[0], at.by_velocity[0], at.by_theta[0]
-                step = Step(t, row, *parts, factor, at.by_position_skew[0], nu[0])
-                force = at.force[0]
-            else:
-                force = equations.force(x)
-            newton = step.factor.solve(equations.balanced(force, x)[free])
-            length = float(np.abs(newton).max(initial=0.0))
-            if not length < last / 2:
-                raise NewtonFailure(x, "Newton's steps do not get shorter")
-            x[free] += newton
-            if length <= short:
-                # What the row says F_t is, after the last step: w_0 F_t + … = s_0 M x_t.
-                force = force.copy()
-                inertia = row.s[0] * row.mass_kg * x
-                force[free] = ((inertia - equations.known) / row.w[0])[free]
-                return step, x, force
-            last = length
-        raise NewtonFailure(x, f"Newton took more than {QUICK} iterations")
+    def _start(self, poses: Poses) -> Array:
+        experiment = self.model.at_start(self.model.poses_of(poses), self.phi)
+        return start_state(experiment, self.setting.theta, self.newton)[0]
+
+    def _linearised(self, here: range) -> Linear:
+        """Of rows where they are guessed to be, on from the rows before as they are."""
+        for past in (*self.forward.past, *self.forward.past_increments):
+            past[:, 0] = 0.0
+        dynamics, theta, rows = self.dynamics, self.setting.theta, slice(here.start, here.stop)
+        late = slice(here.start - dynamics.first_row, here.stop - dynamics.first_row)
+        xi, nu = (each[late] for each in dynamics.evaluation_states(self.x))
+        at = dynamics.forces.rows(rows).linearise(xi, nu, theta, self.out[: len(here)])
+        self.force[rows] = at.force
+        forces = self.force[dynamics.first_row :]
+        residual = dynamics.assemble_residual(self.x, theta, forces)
+        given = None
+        if self.segment.nuisance.moves_grasps:
+            given = GivenMotion.along(self.solver, self.grasped, self.given)
+        return Linear(here.start, at, nu, residual, given)
+
+    def _columns(self, t: int, linear: Linear) -> Array:
+        """The correction of row t, and its columns, (free, 1 + m); NaN where it is singular."""
+        k, at, row = t - linear.first, linear.at, Row.of(self.dynamics, t, self.setting.theta)
+        matrix = row.block(at.by_position[k], at.by_velocity[k], self.solver.pattern)
+        skew = row.skew_block(at.by_position_skew[k])
+        try:
+            factor = self.solver.factoriser.factorise(matrix, skew, self.room)
+        except np.linalg.LinAlgError:
+            return np.full(self.shape, np.nan)
+        parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
+        step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
+        right, force = np.zeros(self.shape), np.zeros((self.segment.dofs, self.shape[1]))
+        right[:, 0] = linear.residual[t, self.solver.free]
+        if self.setting.mass_moves:
+            acceleration = self.dynamics.acceleration(self.x)[t]
+            right[:, 1:] -= self.forward.inertia_slopes(step, acceleration)
+        force[:, 1:] = self.forward.force_slopes(step)
+        return self.forward.advance(step, right, force, linear.given)
+
+    def _kept(self, t: int, columns: Array) -> Kept:
+        """Correct row t, and be done with it."""
+        free = self.solver.free
+        self.x[t, free] += columns[:, 0]
+        if self.forward.weighs_past:
+            # What the row says F_t is then.
+            self.force[t, free] += self.forward.past_increments[0][:, 0]
+        by_p = np.zeros((self.segment.dofs, len(self.moving)))
+        by_p[self.held] = self.given[t, self.held_places, 1:]
+        by_p[free] = columns[:, 1:]
+        kept = Kept(self.x[t].copy(), by_p.astype(np.float32))
+        self.read.append((kept.x, kept.columns, self.operator @ by_p))
+        self.row, self.end = self.row + 1, t + 1
+        return kept
+
+    def _carefully(self, t: int, poses: Poses) -> Array:
+        """x_t, with the grasp's way taken in parts where that is needed."""
+        if t == 0:
+            return self._start(poses)
+        equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
+        goal = self.x[t, self.grasped]
+        try:
+            return solve_row(self.newton, equations, self.x[t], self.x[t - 1], goal)
+        except NewtonFailure as failure:
+            raise self._failed(failure) from failure
+
+    def _failed(self, failure: NewtonFailure) -> SimulationError:
+        time_s = self.row * self.model.interval_s / self.model.substeps
+        return simulation_error(self.newton, failure, time_s, f"the step at row {self.row}")
 
     # Markers ----------------------------------------------------------------------------------
 
-    def linearised(self, reading: Reading) -> tuple[Array, Array]:
-        """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P)."""
+    def linearised(self, reading: Reading, rows: int = 0) -> tuple[Array, Array]:
+        """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P).
+
+        It was read so many `rows` before the last one.
+        """
         model, around = self.model, self.model.samples_around
         sigma = self.segment.experiment.markers.sigma_m[:, None]
-        backs = [reading.back - k * model.substeps for k in range(-around, around + 1)]
+        back = reading.back + rows
+        backs = [back - k * model.substeps for k in range(-around, around + 1)]
         x, columns = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
         if not model.reads_plainly:
             found = model.observation.linearised(x, self.phi, columns, self.moving, self.segment.nq)
