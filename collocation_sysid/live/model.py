@@ -6,6 +6,7 @@ rows have the stencils of the start, and its last row those of all later ones.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -159,15 +160,36 @@ class Model:
         slopes[..., np.flatnonzero(np.isin(nuisance.moving, nuisance.of_grasps))] = by_own
         return moved[place], slopes[place]
 
-    def goals(self, carried: tuple[Array, Array], poses: Poses) -> tuple[Array, Array]:
-        """Where grasped dofs are at some poses, (g,), and the slopes by the φ that move them."""
+    def goals(self, carried: tuple[Array, Array], poses: Sequence[Poses]) -> tuple[Array, Array]:
+        """Where grasped dofs are at K poses, (K, g), and the slopes by the φ that move them."""
+        turns = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
+        shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
+        goal = np.einsum("kgj,gj->kg", turns, carried[0]) + shifts
+        return goal, np.einsum("kgj,gjm->kgm", turns, carried[1])
+
+    @cached_property
+    def _axes(self) -> tuple[Index, Index]:
+        """The grasp and the axis of each grasped dof."""
         dofs = self.segment.grasping.dofs
-        turns, shifts = np.zeros((len(dofs), 3)), np.zeros(len(dofs))
-        for grasp, (turn, shift) in zip(self.experiment.grasps, poses, strict=True):
-            place, axis = np.searchsorted(dofs, grasp.dofs), grasp.dofs % 3
-            turns[place], shifts[place] = turn[axis], shift[axis]
-        goal = np.einsum("gj,gj->g", turns, carried[0]) + shifts
-        return goal, np.einsum("gj,gjm->gm", turns, carried[1])
+        grasp = np.zeros_like(dofs)
+        for k, each in enumerate(self.experiment.grasps):
+            grasp[np.searchsorted(dofs, each.dofs)] = k
+        return grasp, dofs % 3
+
+    @cached_property
+    def stencils(self) -> tuple[Array, Array, Array, Array]:
+        """Of all rows the coefficients p, q, w and s of `nlp.row`, as (rows, rows) matrices."""
+        dynamics = self.segment.dynamics.first_rows(self.rows)
+        rows, tables, step_s = np.arange(self.rows), dynamics.tables, dynamics.step_s
+
+        def spread(table: Array) -> Array:
+            found = np.zeros((self.rows, self.rows))
+            for lag in range(table.shape[1]):
+                found[rows[lag:], rows[lag:] - lag] = table[lag:, lag]
+            return found
+
+        p, q, w, s = (spread(each) for each in (tables.p, tables.q, tables.w, tables.s))
+        return p, q / step_s, w, s / step_s**2
 
 
 def _only_experiment(problem: Problem) -> Experiment:

@@ -40,7 +40,7 @@ NEAR = 1e-3
 LATEST = 5
 
 
-# x (3n,), its columns Z, and those of the markers.
+# x (3n,), its columns Z, and of the markers both, (3M, 1 + m).
 Read = tuple[Array, NDArray[np.float32], Array]
 
 
@@ -58,8 +58,7 @@ class LoggedRow(NamedTuple):
     readings: list[Reading]
 
 
-@dataclass(frozen=True, eq=False)
-class Kept:
+class Kept(NamedTuple):
     """What a later pass starts a row from: x (3n,) and Z (3n, m)."""
 
     x: Array
@@ -90,14 +89,12 @@ class State:
 
 
 class Linear(NamedTuple):
-    """Rows from one on, linearised where they are guessed to be.
-
-    Residuals (rows, 3n) and the motion of grasped dofs are of all rows of the template.
-    """
+    """Rows from one on, linearised where they are guessed to be; residuals of the free dofs."""
 
     first: int
     at: Linearisation
     nu: Array
+    acceleration: Array
     residual: Array
     given: GivenMotion | None
 
@@ -142,14 +139,11 @@ class Sweep:
         self.setting = segment.setting(p[: collocation.nq], self.phi)
         self.dynamics = self.setting.dynamics.first_rows(model.rows)
         self.carried = model.carried(self.phi)
-        self.operator = segment.observation.operator(self.phi)
         self.reading = segment.observation.reading(self.phi)
         self.clock = self._weights_in_time()
         self.newton, self.longest = Solver(segment.experiment, CAREFUL), 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.shape = len(self.solver.free), 1 + len(self.moving)
-        self.held = np.setdiff1d(np.arange(segment.dofs), self.solver.free)
-        self.held_places = np.searchsorted(self.grasped, self.held)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
         self.room = self.solver.factoriser.room(1 + segment.body.unsymmetric)
         self.out = np.empty((TOGETHER, self.dynamics.forces.linearisation_width))
@@ -176,7 +170,8 @@ class Sweep:
             x[last - k, free] += columns[:, 1:] @ step
         for k, columns in enumerate(memory.increments[: last + 1]):
             force[last - k, free] += columns[:, 1:] @ step
-        read = tuple((at + own @ step, own, seen) for at, own, seen in state.read)
+        moved = ((at + own @ step, own) for at, own, _ in state.read)
+        read = tuple((at, own, self._seen(np.column_stack([at, own]))) for at, own in moved)
         return replace(state, x=x, force=force, read=read)
 
     def _resume(self, state: State) -> None:
@@ -204,15 +199,18 @@ class Sweep:
         SimulationError
             Where a row cannot be solved.
         """
-        first = self._make_room(len(poses))
-        for t, each in enumerate(poses, start=first):
-            goal, slopes = self.model.goals(self.carried, self.model.poses_of(each))
-            self.given[t, :, 1 + self.segment.nq :] = slopes
-            self.x[t] = guesses[t - first] if guesses else self._guess(t, each)
-            self.x[t, self.grasped] = goal
+        poses = [self.model.poses_of(each) for each in poses]
+        first, count = self._make_room(len(poses)), len(poses)
+        goals, slopes = self.model.goals(self.carried, poses)
+        self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
+        for t in range(first, first + count):
+            k = t - first
+            self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
+            self.x[t, self.grasped] = goals[k]
         if first < self.dynamics.first_row:
-            return [self._kept(first, np.zeros(self.shape))]
-        here, found, last, careful = range(first, first + len(poses)), [], np.inf, False
+            self._correct(first, np.zeros(self.shape))
+            return self._kept([np.zeros(self.shape)])
+        here, found, last, careful = range(first, first + count), [], np.inf, False
         while here:
             limit = LAST_STEP * self.size_m * (1 if len(here) == 1 else ROUGH)
             linear = self._linearised(here)
@@ -223,7 +221,8 @@ class Sweep:
                 if not length <= limit:
                     break
                 self.longest = max(self.longest, length)
-                found.append(self._kept(t, columns))
+                self._correct(t, columns)
+                found.append(columns)
             else:
                 break
             self.forward = Forward(self.solver, self.setting, self.shape, before)
@@ -235,7 +234,7 @@ class Sweep:
             else:
                 raise self._failed(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
             here = range(t, t + 1)
-        return found
+        return self._kept(found)
 
     def _make_room(self, count: int) -> int:
         surplus = self.end + count - self.model.rows
@@ -254,24 +253,25 @@ class Sweep:
         return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _start(self, poses: Poses) -> Array:
-        experiment = self.model.at_start(self.model.poses_of(poses), self.phi)
+        experiment = self.model.at_start(poses, self.phi)
         return start_state(experiment, self.setting.theta, self.newton)[0]
 
     def _linearised(self, here: range) -> Linear:
         """Of rows where they are guessed to be, on from the rows before as they are."""
         for past in (*self.forward.past, *self.forward.past_increments):
             past[:, 0] = 0.0
-        dynamics, theta, rows = self.dynamics, self.setting.theta, slice(here.start, here.stop)
-        late = slice(here.start - dynamics.first_row, here.stop - dynamics.first_row)
-        xi, nu = (each[late] for each in dynamics.evaluation_states(self.x))
-        at = dynamics.forces.rows(rows).linearise(xi, nu, theta, self.out[: len(here)])
-        self.force[rows] = at.force
-        forces = self.force[dynamics.first_row :]
-        residual = dynamics.assemble_residual(self.x, theta, forces)
+        theta, rows, known = self.setting.theta, slice(here.start, here.stop), slice(here.stop)
+        p, q, w, s = (table[rows, known] for table in self.model.stencils)
+        x, force = self.x[known], self.force[known]
+        nu, acceleration = q @ x, s @ x
+        forces, mass_kg = self.dynamics.forces.rows(rows), self.dynamics.mass.row(rows, theta)
+        at = forces.linearise(p @ x, nu, theta, self.out[: len(here)])
+        force[rows] = at.force
         given = None
         if self.segment.nuisance.moves_grasps:
             given = GivenMotion.along(self.solver, self.grasped, self.given)
-        return Linear(here.start, at, nu, residual, given)
+        residual = w @ force - mass_kg * acceleration
+        return Linear(here.start, at, nu, acceleration, residual[:, self.solver.free], given)
 
     def _columns(self, t: int, linear: Linear) -> Array:
         """The correction of row t, and its columns, (free, 1 + m); NaN where it is singular."""
@@ -285,27 +285,37 @@ class Sweep:
         parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
         step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
         right, force = np.zeros(self.shape), np.zeros((self.segment.dofs, self.shape[1]))
-        right[:, 0] = linear.residual[t, self.solver.free]
+        right[:, 0] = linear.residual[k]
         if self.setting.mass_moves:
-            acceleration = self.dynamics.acceleration(self.x)[t]
-            right[:, 1:] -= self.forward.inertia_slopes(step, acceleration)
+            right[:, 1:] -= self.forward.inertia_slopes(step, linear.acceleration[k])
         force[:, 1:] = self.forward.force_slopes(step)
         return self.forward.advance(step, right, force, linear.given)
 
-    def _kept(self, t: int, columns: Array) -> Kept:
+    def _correct(self, t: int, columns: Array) -> None:
         """Correct row t, and be done with it."""
-        free = self.solver.free
-        self.x[t, free] += columns[:, 0]
+        self.x[t, self.solver.free] += columns[:, 0]
         if self.forward.weighs_past:
             # What the row says F_t is then.
-            self.force[t, free] += self.forward.past_increments[0][:, 0]
-        by_p = np.zeros((self.segment.dofs, len(self.moving)))
-        by_p[self.held] = self.given[t, self.held_places, 1:]
-        by_p[free] = columns[:, 1:]
-        kept = Kept(self.x[t].copy(), by_p.astype(np.float32))
-        self.read.append((kept.x, kept.columns, self.operator @ by_p))
+            self.force[t, self.solver.free] += self.forward.past_increments[0][:, 0]
         self.row, self.end = self.row + 1, t + 1
-        return kept
+
+    def _kept(self, columns: Sequence[Array]) -> list[Kept]:
+        """The last rows, whose columns (free, 1 + m) these are."""
+        here = slice(self.end - len(columns), self.end)
+        whole = np.zeros((len(columns), self.segment.dofs, self.shape[1]))
+        whole[:, self.grasped] = self.given[here]
+        whole[:, self.solver.free] = columns
+        whole[:, :, 0] = self.x[here]
+        found = [Kept(each[:, 0].copy(), each[:, 1:].astype(np.float32)) for each in whole]
+        seen = self._seen(whole)
+        self.read.extend((*each, y) for each, y in zip(found, seen, strict=True))
+        return found
+
+    def _seen(self, whole: Array) -> Array:
+        """What the markers have of columns (…, 3n, k) of the body, (…, 3M, k)."""
+        (nodes, places), (*rows, dofs, count) = self.reading, whole.shape
+        at = whole.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
+        return np.einsum("ma,...maik->...mik", places.weights, at).reshape(*rows, -1, count)
 
     def _carefully(self, t: int, poses: Poses) -> Array:
         """x_t, with the grasp's way taken in parts where that is needed."""
@@ -333,24 +343,29 @@ class Sweep:
         sigma = self.segment.experiment.markers.sigma_m[:, None]
         back = reading.back + rows
         backs = [back - k * model.substeps for k in range(-around, around + 1)]
-        x, columns = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
+        x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
         if not model.reads_plainly:
-            found = model.observation.linearised(x, self.phi, columns, self.moving, self.segment.nq)
+            parts = x, self.phi, seen[..., 1:], self.moving, self.segment.nq
+            found = model.observation.linearised(*parts)
             return found[0][around] - reading.tracks_m / sigma, found[1][around]
-        (nodes, places), (weights, rates) = self.reading, self.clock
-        at_m = np.tensordot(weights, x, 1).reshape(-1, 3)[nodes]
-        read = np.einsum("ma,mai->mi", places.weights, at_m)
-        slope = np.zeros((*read.shape, model.size))
-        slope[..., self.moving] = np.tensordot(weights, columns, 1).reshape(*read.shape, -1)
+        weights, rates = self.clock
+        read, moves = (
+            np.tensordot(each, seen, 1).reshape(*reading.tracks_m.shape, -1)
+            for each in (weights, rates)
+        )
+        slope = np.zeros((*reading.tracks_m.shape, model.size))
+        slope[..., self.moving] = read[..., 1:]
         if around:
-            moves_m = np.tensordot(rates, x, 1).reshape(-1, 3)[nodes]
             (time,) = self.segment.nq + self.segment.nuisance.places("time")
-            slope[..., time] = np.einsum("ma,mai->mi", places.weights, moves_m)
+            slope[..., time] = moves[..., 0]
         observation = model.observation
-        for m in observation.chart.estimated:
-            own = self.segment.nq + observation.place_places[m]
-            slope[m][:, own] = at_m[m].T @ places.slopes[m]
-        return (read - reading.tracks_m) / sigma, slope / sigma[..., None]
+        if observation.chart.estimated.size:
+            nodes, places = self.reading
+            at_m = np.tensordot(weights, x, 1).reshape(-1, 3)[nodes]
+            for m in observation.chart.estimated:
+                own = self.segment.nq + observation.place_places[m]
+                slope[m][:, own] = at_m[m].T @ places.slopes[m]
+        return (read[..., 0] - reading.tracks_m) / sigma, slope / sigma[..., None]
 
     def _weights_in_time(self) -> tuple[Array, Array]:
         """Weights of the samples around one as the clock is off, and their slopes by its φ."""
@@ -368,17 +383,17 @@ class Sweep:
         return lagrange(at, late), unit * (4 * near - wide) / 3
 
     def _at(self, back: float) -> tuple[Array, Array]:
-        """X and the markers' columns so many rows before the last; the start before the start."""
+        """X, and what the markers have, so many rows before the last; the start before the start."""
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= NEAR or not last:
-            x, _, columns = self.read[min(max(last - nearest, 0), last)]
-            return x, columns
+            x, _, seen = self.read[min(max(last - nearest, 0), last)]
+            return x, seen
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
         weights = lagrange(np.array(rows, dtype=float), back)
-        x, _, columns = zip(*(self.read[last - row] for row in rows), strict=True)
-        return np.tensordot(weights, x, 1), np.tensordot(weights, columns, 1)
+        x, _, seen = zip(*(self.read[last - row] for row in rows), strict=True)
+        return np.tensordot(weights, x, 1), np.tensordot(weights, seen, 1)
 
     def take(self, residual: Array, slope: Array) -> None:
         """Add what markers say, of those that are there."""
