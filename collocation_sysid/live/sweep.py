@@ -350,7 +350,7 @@ class Sweep:
             return found[0][around] - reading.tracks_m / sigma, found[1][around]
         weights, rates = self.clock
         read, moves = (
-            np.tensordot(each, seen, 1).reshape(*reading.tracks_m.shape, -1)
+            (each @ seen.reshape(len(seen), -1)).reshape(*reading.tracks_m.shape, -1)
             for each in (weights, rates)
         )
         slope = np.zeros((*reading.tracks_m.shape, model.size))

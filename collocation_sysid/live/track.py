@@ -93,9 +93,9 @@ class Track:
             self.blocks.append(Block(*new))
         known = self._known(len(poses))
         found = self.sweep.advance(poses, guesses or self._guesses(known))
-        for kept, base in zip(found, known, strict=False):
-            off = kept.x - base.x - base.columns @ self._step
-            self._off = [*self._off[-1:], off]
+        pairs = list(zip(found, known, strict=False))[-2:]
+        off = [kept.x - base.x - base.columns @ self._step for kept, base in pairs]
+        self._off = [*self._off, *off][-2:]
         self.blocks[-1].kept += found
         self.rows += len(found)
         return len(found)
