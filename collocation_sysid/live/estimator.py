@@ -30,7 +30,7 @@ from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .information import Information
 from .intake import LONGEST, Intake
 from .model import Model, Poses
-from .search import Search
+from .search import SEEN, Search
 from .statistics import Scatter, widened
 from .sweep import LoggedRow, Reading
 from .track import Track
@@ -45,9 +45,11 @@ MOVED = 0.1
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than this above what it was, or what was
 # to be expected of it: less than noise makes.
-SLACK = 1.0
+SLACK, WORSE = 1.0, 1.25
 # Share of the time between samples that a frame may take, and blocks that a window has.
 SHARE, BLOCKS = 0.8, 12
+# The same for a pass's point, about the one before.
+STAY = 0.5
 # After so many passes that were rejected in a row another start is sought.
 REJECTED = 3
 # What is left after a frame of the longest time that a row took: rows are not begun that might not
@@ -342,19 +344,29 @@ class Estimator:
     @property
     def moved(self) -> float:
         """How far the estimate is from where all is linearised, in standard errors."""
-        if self.track is None or self.track.failed:
-            return np.inf
+        usable = self.track is not None and not self.track.failed
+        return self._apart(self.track, self.p) if usable else np.inf
+
+    def _apart(self, track: Track, p: Array) -> float:
         nq = self.model.collocation.nq
-        errors = np.sqrt(np.diag(self.track.information.covariance)[:nq])
-        return float(np.max(np.abs((self.p - self.track.p)[:nq]) / errors, initial=0.0))
+        errors = np.sqrt(np.diag(track.information.covariance)[:nq])
+        return float(np.max(np.abs((p - track.p)[:nq]) / errors, initial=0.0))
 
     def _estimate(self) -> None:
-        if self.track is None or self.track.failed:
-            return
+        if self.track is not None and not self.track.failed:
+            self.p = self._best(self.track, self.track.information)
+
+    def _best(self, track: Track, known: Information) -> Array:
         reach = self._trust * self.model.collocation.reach_p
-        low, high = np.maximum(self.lower, self.track.p - reach), self.track.p + reach
-        high = np.minimum(self.upper, high)
-        self.p = self.track.information.best(low, high)
+        low, high = np.maximum(self.lower, track.p - reach), track.p + reach
+        return known.best(low, np.minimum(self.upper, high))
+
+    def _next(self, track: Track) -> Array:
+        """Where to pass again: what is hardly known yet stays near where it was."""
+        size, samples = self.model.size, len(self.log) / self.model.substeps
+        stay = STAY * max(1.0, samples / SEEN)
+        slopes = np.diag(1 / (stay * self.model.collocation.reach_p))
+        return self._best(track, track.information.with_rows(np.zeros(size), slopes, track.p))
 
     def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
         grave: list[Concern] = []
@@ -426,7 +438,7 @@ class Estimator:
         if search is None and track.failed and at_start:
             search = self.search = self._search()
             notes.append("a start is sought among stiffnesses")
-        p, base = self.p, track
+        base, p = track, None
         if search is not None:
             if not search.done and (len(self.log) < search.rows or not at_start):
                 return None
@@ -435,8 +447,12 @@ class Estimator:
                 self.search = None
                 notes.append("no start was found among stiffnesses")
                 return None
-        elif track.failed or (self.moved <= MOVED and not track.is_rough):
+        elif track.failed:
             return None
+        else:
+            p = self._next(track)
+            if self._apart(track, p) <= MOVED and not track.is_rough:
+                return None
         self.again = Track(self.model, p, track.prior, self._block_rows, base)
         return self.again
 
@@ -445,7 +461,7 @@ class Estimator:
         self.again = None
         sought, self.search = self.search is not None, None
         expected = max(track.loss, track.information.loss(again.p))
-        if not again.failed and (track.failed or again.loss <= expected + SLACK):
+        if not again.failed and (track.failed or again.loss <= WORSE * expected + SLACK):
             again.base, self.track = None, again
             self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
             self._rejected = 0
