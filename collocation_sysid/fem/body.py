@@ -18,7 +18,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import accumulate
 
 import numpy as np
 import scipy.sparse as sp
@@ -364,7 +365,7 @@ class Body(Model):
         size, entries = self.pattern.size, self.pattern.entries
         width = len(self.constants) * size
         # Slices: `numpy.split` takes as long as the elements of a small body.
-        ends = np.cumsum([0, size, entries, entries, width]).tolist()
+        ends = list(accumulate([0, size, entries, entries, width]))
         force, by_position, by_velocity, by_theta, skew = (
             rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], None], strict=True)
         )
@@ -484,7 +485,7 @@ class Body(Model):
 
     def _drag(self, theta: Theta, tied_kg: Array | None) -> Array:
         """(3n,) or (T, 3n) of f = −drag v by mass-proportional damping [N·s/m]."""
-        return np.sum([theta[k] * mass for k, mass in self._damped(theta, tied_kg)], axis=0)
+        return reduce(np.add, (theta[k] * mass for k, mass in self._damped(theta, tied_kg)))
 
     def _drag_slopes(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Places in θ, and the slopes of that by them."""

@@ -39,17 +39,17 @@ from .trust import UNSETTLED, data_concerns, estimate_concerns
 # A prior of this standard deviation of the logarithm holds each parameter near its guess: what the
 # first frames do not tell stays finite, and of what a recording tells it changes nothing.
 WEAK = 2.3
+# The same about the last pass for where the next one is, until many samples tell of it.
+STAY = 0.5
 # Estimates this far from where all is linearised, in standard errors, begin another pass.
 MOVED = 0.1
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
-# A pass is accepted where the sum of squares is no more than this above what it was, or what was
-# to be expected of it: less than noise makes.
-SLACK, WORSE = 1.0, 1.25
+# A pass is accepted where the sum of squares is no more than so many times, and this above, what it
+# was or what was to be expected of it: rows that came since then are fitted by the next.
+TIMES, SLACK = 1.25, 1.0
 # Share of the time between samples that a frame may take, and blocks that a window has.
 SHARE, BLOCKS = 0.8, 12
-# The same for a pass's point, about the one before.
-STAY = 0.5
 # After so many passes that were rejected in a row another start is sought.
 REJECTED = 3
 # What is left after a frame of the longest time that a row took: rows are not begun that might not
@@ -68,7 +68,7 @@ class LiveOptions(Options):
     Attributes
     ----------
     budget_s : float, optional
-        Time of a frame; 70 % of the time between samples by default. The frame itself is taken
+        Time of a frame; 80 % of the time between samples by default. The frame itself is taken
         whatever it costs.
     window_s : float
         Frames that are passed again when the estimate moves.
@@ -344,8 +344,9 @@ class Estimator:
     @property
     def moved(self) -> float:
         """How far the estimate is from where all is linearised, in standard errors."""
-        usable = self.track is not None and not self.track.failed
-        return self._apart(self.track, self.p) if usable else np.inf
+        if self.track is None or self.track.failed:
+            return np.inf
+        return self._apart(self.track, self.p)
 
     def _apart(self, track: Track, p: Array) -> float:
         nq = self.model.collocation.nq
@@ -438,7 +439,7 @@ class Estimator:
         if search is None and track.failed and at_start:
             search = self.search = self._search()
             notes.append("a start is sought among stiffnesses")
-        base, p = track, None
+        p, base = self.p, track
         if search is not None:
             if not search.done and (len(self.log) < search.rows or not at_start):
                 return None
@@ -451,7 +452,7 @@ class Estimator:
             return None
         else:
             p = self._next(track)
-            if self._apart(track, p) <= MOVED and not track.is_rough:
+            if self._apart(track, p) <= MOVED and not track.sweep.is_rough:
                 return None
         self.again = Track(self.model, p, track.prior, self._block_rows, base)
         return self.again
@@ -461,7 +462,7 @@ class Estimator:
         self.again = None
         sought, self.search = self.search is not None, None
         expected = max(track.loss, track.information.loss(again.p))
-        if not again.failed and (track.failed or again.loss <= WORSE * expected + SLACK):
+        if not again.failed and (track.failed or again.loss <= TIMES * expected + SLACK):
             again.base, self.track = None, again
             self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
             self._rejected = 0

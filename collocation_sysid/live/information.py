@@ -86,5 +86,5 @@ class Information:
     def covariance(self) -> Array:
         """(P, P) of p, for rows whose errors are independent and of size one."""
         size = len(self.triangle) - 1
-        root = np.linalg.inv(self.triangle[:size, :size])
+        root = np.asarray(np.linalg.inv(self.triangle[:size, :size]), dtype=float)
         return root @ root.T

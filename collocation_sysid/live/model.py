@@ -180,15 +180,11 @@ class Model:
     def stencils(self) -> tuple[Array, Array, Array, Array]:
         """Of all rows the coefficients p, q, w and s of `nlp.row`, as (rows, rows) matrices."""
         dynamics = self.segment.dynamics.first_rows(self.rows)
-        rows, tables, step_s = np.arange(self.rows), dynamics.tables, dynamics.step_s
-
-        def spread(table: Array) -> Array:
-            found = np.zeros((self.rows, self.rows))
-            for lag in range(table.shape[1]):
-                found[rows[lag:], rows[lag:] - lag] = table[lag:, lag]
-            return found
-
-        p, q, w, s = (spread(each) for each in (tables.p, tables.q, tables.w, tables.s))
+        tables, step_s = dynamics.tables, dynamics.step_s
+        p, q, w, s = (
+            np.sum([np.diag(each[lag:, lag], -lag) for lag in range(each.shape[1])], axis=0)
+            for each in (tables.p, tables.q, tables.w, tables.s)
+        )
         return p, q / step_s, w, s / step_s**2
 
 

@@ -9,16 +9,16 @@ reduced-space method. A row whose correction is long is linearised again, alone,
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import SimulationError
 from ..fem.body import Linearisation
 from ..methods.robust import huberised
 from ..nlp.marching import RowEquations, extrapolated, solve_row
@@ -89,13 +89,13 @@ class State:
 
 
 class Linear(NamedTuple):
-    """Rows from one on, linearised where they are guessed to be; residuals of the free dofs."""
+    """Rows from one on at their guesses: the sides of their equations (k, …, 1 + m)."""
 
     first: int
     at: Linearisation
     nu: Array
-    acceleration: Array
-    residual: Array
+    right: Array
+    force: Array
     given: GivenMotion | None
 
 
@@ -118,11 +118,6 @@ class Sweep:
     ------
     SimulationError
         Where there is no start.
-
-    Attributes
-    ----------
-    longest : float
-        Of the corrections of its rows, the longest coordinate [m].
     """
 
     def __init__(
@@ -141,7 +136,7 @@ class Sweep:
         self.carried = model.carried(self.phi)
         self.reading = segment.observation.reading(self.phi)
         self.clock = self._weights_in_time()
-        self.newton, self.longest = Solver(segment.experiment, CAREFUL), 0.0
+        self.newton, self.longest_m = Solver(segment.experiment, CAREFUL), 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.shape = len(self.solver.free), 1 + len(self.moving)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
@@ -171,7 +166,9 @@ class Sweep:
         for k, columns in enumerate(memory.increments[: last + 1]):
             force[last - k, free] += columns[:, 1:] @ step
         moved = ((at + own @ step, own) for at, own, _ in state.read)
-        read = tuple((at, own, self._seen(np.column_stack([at, own]))) for at, own in moved)
+        read = tuple(
+            (at, own, self._seen(np.column_stack([at, own.astype(float)]))) for at, own in moved
+        )
         return replace(state, x=x, force=force, read=read)
 
     def _resume(self, state: State) -> None:
@@ -180,6 +177,11 @@ class Sweep:
         self.forward = Forward(self.solver, self.setting, self.shape, state.memory)
         most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
         self.read: deque[Read] = deque(state.read, maxlen=most)
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether rows are off by more than the square of a short correction."""
+        return self.longest_m > LAST_STEP * self.size_m
 
     @property
     def state(self) -> State:
@@ -203,13 +205,13 @@ class Sweep:
         first, count = self._make_room(len(poses)), len(poses)
         goals, slopes = self.model.goals(self.carried, poses)
         self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
-        for t in range(first, first + count):
-            k = t - first
-            self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
-            self.x[t, self.grasped] = goals[k]
         if first < self.dynamics.first_row:
+            self.x[first] = self._start(poses[0])
             self._correct(first, np.zeros(self.shape))
             return self._kept([np.zeros(self.shape)])
+        for k, t in enumerate(range(first, first + count)):
+            self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
+            self.x[t, self.grasped] = goals[k]
         here, found, last, careful = range(first, first + count), [], np.inf, False
         while here:
             limit = LAST_STEP * self.size_m * (1 if len(here) == 1 else ROUGH)
@@ -220,7 +222,7 @@ class Sweep:
                 length = float(np.abs(columns[:, 0]).max(initial=0.0))
                 if not length <= limit:
                     break
-                self.longest = max(self.longest, length)
+                self.longest_m = max(self.longest_m, length)
                 self._correct(t, columns)
                 found.append(columns)
             else:
@@ -232,7 +234,7 @@ class Sweep:
             elif not careful:
                 self.x[t], careful, last = self._carefully(t, poses[t - first]), True, np.inf
             else:
-                raise self._failed(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
+                self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
             here = range(t, t + 1)
         return self._kept(found)
 
@@ -270,8 +272,12 @@ class Sweep:
         given = None
         if self.segment.nuisance.moves_grasps:
             given = GivenMotion.along(self.solver, self.grasped, self.given)
-        residual = w @ force - mass_kg * acceleration
-        return Linear(here.start, at, nu, acceleration, residual[:, self.solver.free], given)
+        free, (size, count) = self.solver.free, self.shape
+        right, slopes = (np.zeros((len(here), k, count)) for k in (size, self.segment.dofs))
+        right[..., 0] = (w @ force - mass_kg * acceleration)[:, free]
+        right[..., 1:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
+        slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta, nu)
+        return Linear(here.start, at, nu, right, slopes, given)
 
     def _columns(self, t: int, linear: Linear) -> Array:
         """The correction of row t, and its columns, (free, 1 + m); NaN where it is singular."""
@@ -284,12 +290,7 @@ class Sweep:
             return np.full(self.shape, np.nan)
         parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
         step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
-        right, force = np.zeros(self.shape), np.zeros((self.segment.dofs, self.shape[1]))
-        right[:, 0] = linear.residual[k]
-        if self.setting.mass_moves:
-            right[:, 1:] -= self.forward.inertia_slopes(step, linear.acceleration[k])
-        force[:, 1:] = self.forward.force_slopes(step)
-        return self.forward.advance(step, right, force, linear.given)
+        return self.forward.advance(step, linear.right[k], linear.force[k], linear.given)
 
     def _correct(self, t: int, columns: Array) -> None:
         """Correct row t, and be done with it."""
@@ -308,7 +309,7 @@ class Sweep:
         whole[:, :, 0] = self.x[here]
         found = [Kept(each[:, 0].copy(), each[:, 1:].astype(np.float32)) for each in whole]
         seen = self._seen(whole)
-        self.read.extend((*each, y) for each, y in zip(found, seen, strict=True))
+        self.read.extend((each.x, each.columns, y) for each, y in zip(found, seen, strict=True))
         return found
 
     def _seen(self, whole: Array) -> Array:
@@ -326,11 +327,11 @@ class Sweep:
         try:
             return solve_row(self.newton, equations, self.x[t], self.x[t - 1], goal)
         except NewtonFailure as failure:
-            raise self._failed(failure) from failure
+            self._fail(failure)
 
-    def _failed(self, failure: NewtonFailure) -> SimulationError:
-        time_s = self.row * self.model.interval_s / self.model.substeps
-        return simulation_error(self.newton, failure, time_s, f"the step at row {self.row}")
+    def _fail(self, failure: NewtonFailure) -> NoReturn:
+        time_s, what = self.row * self.model.interval_s / self.model.substeps, "the step at row"
+        raise simulation_error(self.newton, failure, time_s, f"{what} {self.row}") from failure
 
     # Markers ----------------------------------------------------------------------------------
 
@@ -358,13 +359,11 @@ class Sweep:
         if around:
             (time,) = self.segment.nq + self.segment.nuisance.places("time")
             slope[..., time] = moves[..., 0]
-        observation = model.observation
-        if observation.chart.estimated.size:
-            nodes, places = self.reading
-            at_m = np.tensordot(weights, x, 1).reshape(-1, 3)[nodes]
-            for m in observation.chart.estimated:
-                own = self.segment.nq + observation.place_places[m]
-                slope[m][:, own] = at_m[m].T @ places.slopes[m]
+        observation, (nodes, places) = model.observation, self.reading
+        for m in observation.chart.estimated:
+            own = self.segment.nq + observation.place_places[m]
+            at_m = np.tensordot(weights, x[:, 3 * nodes[m][:, None] + np.arange(3)], 1)
+            slope[m][:, own] = at_m.T @ places.slopes[m]
         return (read[..., 0] - reading.tracks_m) / sigma, slope / sigma[..., None]
 
     def _weights_in_time(self) -> tuple[Array, Array]:
@@ -383,7 +382,7 @@ class Sweep:
         return lagrange(at, late), unit * (4 * near - wide) / 3
 
     def _at(self, back: float) -> tuple[Array, Array]:
-        """X, and what the markers have, so many rows before the last; the start before the start."""
+        """X and what the markers have so many rows before the last; the start before the start."""
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= NEAR or not last:
@@ -410,8 +409,5 @@ class Sweep:
 
 def lagrange(at: Array, wanted: float) -> Array:
     """Weights of values at points (k,) in the polynomial through them, at another."""
-    weights = np.ones(len(at))
-    for k, point in enumerate(at):
-        for other in (*at[:k], *at[k + 1 :]):
-            weights[k] *= (wanted - other) / (point - other)
-    return weights
+    points = at.tolist()
+    return np.array([math.prod((wanted - b) / (a - b) for b in points if b != a) for a in points])

@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 from .information import Information
 from .model import TOGETHER, Model, Poses
-from .sweep import LAST_STEP, Kept, LoggedRow, State, Sweep
+from .sweep import Kept, LoggedRow, State, Sweep
 
 
 @dataclass(eq=False)
@@ -134,21 +135,15 @@ class Track:
         """Rows of the base, moved along their columns, and by what that missed before."""
         if not known:
             return []
-        off = self._off[-1] if self._off else np.zeros_like(known[0].x)
-        more = off - self._off[0] if len(self._off) == 2 else 0.0 * off
-        return [
-            base.x + base.columns @ self._step + off + k * more for k, base in enumerate(known, 1)
-        ]
+        # Straight on from the last two, where there are two.
+        first, off = ([np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off)[-2:]
+        moved = (base.x + base.columns @ self._step for base in known)
+        return [x + off + k * (off - first) for k, x in enumerate(moved, 1)]
 
     @property
-    def _step(self) -> Array:
+    def _step(self) -> NDArray[np.float32]:
         assert self.base is not None
         return (self.p - self.base.p)[self.sweep.moving].astype(np.float32)
-
-    @property
-    def is_rough(self) -> bool:
-        """Whether rows are off by more than the square of a short correction."""
-        return self.sweep.longest > LAST_STEP * self.sweep.size_m
 
     def drop_oldest(self) -> int:
         """Let the oldest block leave as prior; how many rows it had."""
