@@ -65,7 +65,8 @@ class Information:
         """
         size = len(lower)
         square, right = self.triangle[:size, :size], self.triangle[:size, size]
-        p, held = np.linalg.solve(square, -right), np.zeros(size, dtype=bool)
+        p: Array = np.linalg.solve(square, -right).astype(float)
+        held = np.zeros(size, dtype=bool)
         for _ in range(TURNS * size):
             outside = ~held & ((p < lower) | (p > upper))
             p = np.clip(p, lower, upper)
