@@ -148,7 +148,7 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
     assert track.information is whole
     again = Track(live.model, track.p, track.prior, live._block_rows, track)
     for row in log[left:]:
-        again.again(row)
+        again.again([row])
     before, after = (normal_equations(each.triangle) for each in (whole, again.information))
     scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
     np.testing.assert_allclose(after / scale, before / scale, atol=1e-8)
@@ -168,11 +168,63 @@ def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(mo
         state = live.track.blocks[1]
         part = sweep.Sweep(live.model, p, live.prior, state.start, state.at)
         for number, row in enumerate(live.log):
-            whole.advance(row.poses)
+            whole.advance([row.poses])
             if number >= live._block_rows:
-                kept = part.advance(row.poses)
+                (kept,) = part.advance([row.poses])
         errors.append(np.abs(kept.x - whole.blocks[-1].kept[-1].x).max())
     assert errors[1] < 0.3 * errors[0] < 1e-5  # of second order
+
+
+def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypatch):
+    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    problem = swing(nuisance=Nuisance())
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live):
+        live.take(frame)
+    way, errors = np.full(len(live.p), 1.0), []
+    for size in (1e-3, 5e-4):
+        p = live.track.p + size * way
+        whole, together = (
+            Track(live.model, p, live.prior, live._block_rows, live.track) for _ in "ab"
+        )
+        for row in live.log:
+            whole.again([row])
+        assert not whole.sweep.is_rough
+        monkeypatch.setattr(sweep, "ROUGH", 1e12)
+        calls = 0
+        while together.rows < len(live.log):
+            together.again(live.log[together.rows :])
+            calls += 1
+        assert calls < len(live.log) / 4
+        assert together.sweep.is_rough
+        ends = (t.blocks[-1].kept[-1].x for t in (together, whole))
+        errors.append(np.abs(np.subtract(*ends)).max())
+        assert together.information.rows == whole.information.rows
+        scale = np.sqrt(np.diag(normal_equations(whole.information.triangle)))
+        ours, theirs = (normal_equations(t.information.triangle) for t in (together, whole))
+        np.testing.assert_allclose(
+            ours / np.outer(scale, scale), theirs / np.outer(scale, scale), atol=1e-3
+        )
+    assert 0 < errors[1] < 0.3 * errors[0] < 1e-6  # of second order
+
+
+def test_a_row_far_from_its_guess_is_solved_alone():
+    problem = swing()
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live):
+        live.take(frame)
+    far = live.track.p + np.array([0.7, -0.7, 0.7, -0.7])
+    again, whole = (
+        Track(live.model, far, live.prior, live._block_rows, t) for t in (live.track, None)
+    )
+    while again.rows < len(live.log):
+        again.again(live.log[again.rows :])
+    for row in live.log:
+        whole.again([row])
+    assert (
+        np.abs(again.blocks[-1].kept[-1].x - whole.blocks[-1].kept[-1].x).max()
+        < 1e-4 * again.sweep.size_m
+    )
 
 
 def test_a_stiffness_that_is_wrong_by_ten_is_found():

@@ -19,6 +19,7 @@ from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -370,7 +371,7 @@ class Body(Model):
         size, entries = self.pattern.size, self.pattern.entries
         width = len(self.constants) * size
         # Slices: `numpy.split` takes as long as the elements of a small body.
-        ends = np.cumsum([0, size, entries, entries, width]).tolist()
+        ends = list(accumulate([0, size, entries, entries, width]))
         force, by_position, by_velocity, by_theta, skew = (
             rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], None], strict=True)
         )

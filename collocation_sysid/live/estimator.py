@@ -30,7 +30,7 @@ from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .information import Information
 from .intake import LONGEST, Intake
 from .model import Model, Poses
-from .search import Search
+from .search import SEEN, Search
 from .statistics import Scatter, widened
 from .sweep import LoggedRow, Reading
 from .track import Track
@@ -39,13 +39,15 @@ from .trust import UNSETTLED, data_concerns, estimate_concerns
 # A prior of this standard deviation of the logarithm holds each parameter near its guess: what the
 # first frames do not tell stays finite, and of what a recording tells it changes nothing.
 WEAK = 2.3
+# The same about the last pass for where the next one is, until many samples tell of it.
+STAY = 0.5
 # Estimates this far from where all is linearised, in standard errors, begin another pass.
 MOVED = 0.1
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
-# A pass is accepted where the sum of squares is no more than this above what it was, or what was
-# to be expected of it: less than noise makes.
-SLACK = 1.0
+# A pass is accepted where the sum of squares is no more than so many times, and this above, what it
+# was or what was to be expected of it: rows that came since then are fitted by the next.
+TIMES, SLACK = 1.25, 1.0
 # Share of the time between samples that a frame may take, and blocks that a window has.
 SHARE, BLOCKS = 0.8, 12
 # After so many passes that were rejected in a row another start is sought.
@@ -66,7 +68,7 @@ class LiveOptions(Options):
     Attributes
     ----------
     budget_s : float, optional
-        Time of a frame; 70 % of the time between samples by default. The frame itself is taken
+        Time of a frame; 80 % of the time between samples by default. The frame itself is taken
         whatever it costs.
     window_s : float
         Frames that are passed again when the estimate moves.
@@ -231,7 +233,7 @@ class Estimator:
             if self.track is None:
                 self._begin(row)
             elif not self.track.failed:
-                self.track.advance(row.poses)
+                self.track.advance([row.poses])
         except SimulationError as error:
             if self.track is None:
                 self.log.clear()
@@ -260,7 +262,7 @@ class Estimator:
                         tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
                     )
                     residual[wild] = here[wild] = np.nan
-                track.read(residual, slope)
+                track.read([(residual, slope)])
                 near = np.sum((here * sigma_m) ** 2, axis=1)
                 squares.append(near[np.isfinite(near)])
             self.log[-1].readings.append(reading)
@@ -302,21 +304,21 @@ class Estimator:
         try:
             trial = Track(self.model, self.p, self.prior, self._block_rows)
             for _ in range(self.model.rows + 2):
-                trial.again(LoggedRow(moved, [Reading(0.0, nowhere)]))
+                trial.again([LoggedRow(moved, [Reading(0.0, nowhere)])])
         except SimulationError:
             return None
         self._estimates_at(trial, self.p)
         return poses, trial.blocks[0].kept[0].x
 
     def _begin(self, row: LoggedRow) -> None:
-        model, guess = self.model, None
+        model, guesses = self.model, []
         poses = model.poses_of(row.poses)
         if self._rest is not None and len(poses) == 1:
             (was_turned, was_at), x = self._rest[0][0], self._rest[1]
             (turned, at) = poses[0]
-            guess = ((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()
+            guesses = [((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()]
         track = Track(model, self.p, self.prior, self._block_rows)
-        track.advance(row.poses, guess)
+        track.advance([row.poses], guesses)
         first = row.readings[0].tracks_m if row.readings else np.full((len(self.names), 3), np.nan)
         self.model = model.placed(first, track.blocks[0].kept[0].x)
         if self.model is not model:
@@ -325,7 +327,7 @@ class Estimator:
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
             self.prior = self._of_priors()
             track = Track(self.model, self.p, self.prior, self._block_rows)
-            track.advance(row.poses, guess)
+            track.advance([row.poses], guesses)
         self.track = track
 
     def _begin_anew(self) -> None:
@@ -344,17 +346,28 @@ class Estimator:
         """How far the estimate is from where all is linearised, in standard errors."""
         if self.track is None or self.track.failed:
             return np.inf
+        return self._apart(self.track, self.p)
+
+    def _apart(self, track: Track, p: Array) -> float:
         nq = self.model.collocation.nq
-        errors = np.sqrt(np.diag(self.track.information.covariance)[:nq])
-        return float(np.max(np.abs((self.p - self.track.p)[:nq]) / errors, initial=0.0))
+        errors = np.sqrt(np.diag(track.information.covariance)[:nq])
+        return float(np.max(np.abs((p - track.p)[:nq]) / errors, initial=0.0))
 
     def _estimate(self) -> None:
-        if self.track is None or self.track.failed:
-            return
+        if self.track is not None and not self.track.failed:
+            self.p = self._best(self.track, self.track.information)
+
+    def _best(self, track: Track, known: Information) -> Array:
         reach = self._trust * self.model.collocation.reach_p
-        low, high = np.maximum(self.lower, self.track.p - reach), self.track.p + reach
-        high = np.minimum(self.upper, high)
-        self.p = self.track.information.best(low, high)
+        low, high = np.maximum(self.lower, track.p - reach), track.p + reach
+        return known.best(low, np.minimum(self.upper, high))
+
+    def _next(self, track: Track) -> Array:
+        """Where to pass again: what is hardly known yet stays near where it was."""
+        size, samples = self.model.size, len(self.log) / self.model.substeps
+        stay = STAY * max(1.0, samples / SEEN)
+        slopes = np.diag(1 / (stay * self.model.collocation.reach_p))
+        return self._best(track, track.information.with_rows(np.zeros(size), slopes, track.p))
 
     def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
         grave: list[Concern] = []
@@ -393,15 +406,15 @@ class Estimator:
         while self.track is not None:
             again = self.again or self._wanted(self.track, notes)
             before = self.clock()
-            if again is None or self._is_spent(done, before - began):
+            if again is None or not (left := self._left(done, before - began, again.left)):
                 break
+            were = again.rows
             try:
-                again.again(self.log[again.rows])
+                again.again(self.log[were : were + left])
             except SimulationError:
                 again.failed = True
-            done += 1
-            took_s = self.clock() - before
-            self._row_s = max(took_s, self._row_s)
+            done += again.rows - were
+            self._row_s = max((self.clock() - before) / left, self._row_s)
             if self.search is not None and not self.search.done:
                 if again.failed or again.rows >= min(self.search.rows, len(self.log)):
                     self.search.compare(again)
@@ -410,10 +423,14 @@ class Estimator:
                 self._judge(self.track, again, notes)
         return done
 
-    def _is_spent(self, done: int, elapsed_s: float) -> bool:
+    def _left(self, done: int, elapsed_s: float, most: int) -> int:
+        """Rows that there is time for."""
         if self.options.rows is not None:
-            return done >= self.options.rows
-        return elapsed_s + self._row_s > self.budget_s
+            return min(self.options.rows - done, most)
+        left_s = self.budget_s - elapsed_s
+        if left_s <= 0 or not self._row_s:
+            return int(left_s > 0)
+        return int(min(left_s / self._row_s, most))
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
         """Begin a pass where one is wanted."""
@@ -431,8 +448,12 @@ class Estimator:
                 self.search = None
                 notes.append("no start was found among stiffnesses")
                 return None
-        elif track.failed or self.moved <= MOVED:
+        elif track.failed:
             return None
+        else:
+            p = self._next(track)
+            if self._apart(track, p) <= MOVED and not track.sweep.is_rough:
+                return None
         self.again = Track(self.model, p, track.prior, self._block_rows, base)
         return self.again
 
@@ -441,7 +462,7 @@ class Estimator:
         self.again = None
         sought, self.search = self.search is not None, None
         expected = max(track.loss, track.information.loss(again.p))
-        if not again.failed and (track.failed or again.loss <= expected + SLACK):
+        if not again.failed and (track.failed or again.loss <= TIMES * expected + SLACK):
             again.base, self.track = None, again
             self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
             self._rejected = 0

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ..arrays import Array
 
@@ -66,7 +65,8 @@ class Information:
         """
         size = len(lower)
         square, right = self.triangle[:size, :size], self.triangle[:size, size]
-        p, held = solve_triangular(square, -right), np.zeros(size, dtype=bool)
+        p: Array = np.linalg.solve(square, -right).astype(float)
+        held = np.zeros(size, dtype=bool)
         for _ in range(TURNS * size):
             outside = ~held & ((p < lower) | (p > upper))
             p = np.clip(p, lower, upper)
@@ -80,12 +80,12 @@ class Information:
                 held[back.argmax()] = False
             free = np.flatnonzero(~held)
             q, r = np.linalg.qr(square[:, free])
-            p[free] = solve_triangular(r, -q.T @ (right + square[:, held] @ p[held]))
+            p[free] = np.linalg.solve(r, -q.T @ (right + square[:, held] @ p[held]))
         return np.clip(p, lower, upper)
 
     @cached_property
     def covariance(self) -> Array:
         """(P, P) of p, for rows whose errors are independent and of size one."""
         size = len(self.triangle) - 1
-        root = solve_triangular(self.triangle[:size, :size], np.eye(size))
+        root = np.asarray(np.linalg.inv(self.triangle[:size, :size]), dtype=float)
         return root @ root.T

@@ -6,6 +6,7 @@ rows have the stencils of the start, and its last row those of all later ones.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,6 +23,8 @@ from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..problem import Problem
 
+# Rows that are linearised at a time, at most.
+TOGETHER = 8
 # Young's modulus that a search without a guess begins at.
 MIDDLE_PA = 1e4
 
@@ -93,8 +96,8 @@ class Model:
 
     @cached_property
     def rows(self) -> int:
-        """Rows of the start, and one more."""
-        return 2 * self.segment.dynamics.reach + 3
+        """Rows of the start, and those that are linearised at a time."""
+        return 2 * self.segment.dynamics.reach + 2 + TOGETHER
 
     @property
     def size(self) -> int:
@@ -157,15 +160,32 @@ class Model:
         slopes[..., np.flatnonzero(np.isin(nuisance.moving, nuisance.of_grasps))] = by_own
         return moved[place], slopes[place]
 
-    def goals(self, carried: tuple[Array, Array], poses: Poses) -> tuple[Array, Array]:
-        """Where grasped dofs are at some poses, (g,), and the slopes by the φ that move them."""
+    def goals(self, carried: tuple[Array, Array], poses: Sequence[Poses]) -> tuple[Array, Array]:
+        """Where grasped dofs are at K poses, (K, g), and the slopes by the φ that move them."""
+        turns = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
+        shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
+        goal = np.einsum("kgj,gj->kg", turns, carried[0]) + shifts
+        return goal, np.einsum("kgj,gjm->kgm", turns, carried[1])
+
+    @cached_property
+    def _axes(self) -> tuple[Index, Index]:
+        """The grasp and the axis of each grasped dof."""
         dofs = self.segment.grasping.dofs
-        turns, shifts = np.zeros((len(dofs), 3)), np.zeros(len(dofs))
-        for grasp, (turn, shift) in zip(self.experiment.grasps, poses, strict=True):
-            place, axis = np.searchsorted(dofs, grasp.dofs), grasp.dofs % 3
-            turns[place], shifts[place] = turn[axis], shift[axis]
-        goal = np.einsum("gj,gj->g", turns, carried[0]) + shifts
-        return goal, np.einsum("gj,gjm->gm", turns, carried[1])
+        grasp = np.zeros_like(dofs)
+        for k, each in enumerate(self.experiment.grasps):
+            grasp[np.searchsorted(dofs, each.dofs)] = k
+        return grasp, dofs % 3
+
+    @cached_property
+    def stencils(self) -> tuple[Array, Array, Array, Array]:
+        """Of all rows the coefficients p, q, w and s of `nlp.row`, as (rows, rows) matrices."""
+        dynamics = self.segment.dynamics.first_rows(self.rows)
+        tables, step_s = dynamics.tables, dynamics.step_s
+        p, q, w, s = (
+            np.sum([np.diag(each[lag:, lag], -lag) for lag in range(each.shape[1])], axis=0)
+            for each in (tables.p, tables.q, tables.w, tables.s)
+        )
+        return p, q / step_s, w, s / step_s**2
 
 
 def _only_experiment(problem: Problem) -> Experiment:
@@ -210,7 +230,7 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
     """A few samples in which nothing moves."""
     reach = collocation.segments[0].dynamics.reach
     # The rows of the start, and room for a reading.
-    count = max(2 * reach + 3, NEIGHBOURS, 3)
+    count = max(2 * reach + 2 + TOGETHER, NEIGHBOURS, 3)
     t_s = experiment.timestep_s * np.arange(count)
     markers = experiment.markers
     first, _ = markers.first_samples

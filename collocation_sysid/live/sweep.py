@@ -1,21 +1,25 @@
 """One pass over a recording at one point p: motion, sensitivities and what the markers say.
 
-A row of the grid takes what the last few rows left (positions, forces, the columns Z by the
-parameters that move the body) and leaves the same for the next. Newton's steps end where they are
-short; the last factor and slopes serve the columns, as in the reduced-space method: as a rule there
-is one linearisation and one factorisation, and where the guess is extrapolated forces alone again.
+A few rows of the grid at a time take what the last ones left (positions, forces, the columns Z by
+the parameters that move the body) and leave the same for the next. They are linearised together at
+their guesses; each row is then solved once, for its correction and its columns: a Gauss–Newton step
+on the collocation equations, whose defect is of second order in the correction, as in the
+reduced-space method. A row whose correction is long is linearised again, alone, where that led.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..fem.body import Linearisation
 from ..methods.robust import huberised
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, NewtonOptions, Solver, simulation_error
@@ -23,13 +27,12 @@ from ..nlp.rest import start_state
 from ..nlp.row import Row
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
 from .information import Information
-from .model import Model, Poses
+from .model import TOGETHER, Model, Poses
 
-# Newton's last step over the body's size: the next one would be its square. Slopes of a state that
-# many times as far away serve for it too: they are off by as small a share.
-LAST_STEP, SAME_SLOPES = 1e-5, 30
-# Iterations before the way of the grasp is taken in parts, and to what accuracy that is done.
-QUICK = 6
+# A row's correction over the body's size: the next one would be its square. Where rows are solved
+# together it may be so many times as long, and another pass follows.
+LAST_STEP, ROUGH = 3e-4, 10
+# To what accuracy rows are solved where the way of the grasp has to be taken in parts.
 CAREFUL = NewtonOptions(tolerance=1e-6)
 # Readings this near to a row, in rows, are of that row; others lie between four of them.
 NEAR = 1e-3
@@ -37,7 +40,7 @@ NEAR = 1e-3
 LATEST = 5
 
 
-# x (3n,), its columns Z, and those of the markers.
+# x (3n,), its columns Z, and of the markers both, (3M, 1 + m).
 Read = tuple[Array, NDArray[np.float32], Array]
 
 
@@ -55,8 +58,7 @@ class LoggedRow(NamedTuple):
     readings: list[Reading]
 
 
-@dataclass(frozen=True, eq=False)
-class Kept:
+class Kept(NamedTuple):
     """What a later pass starts a row from: x (3n,) and Z (3n, m)."""
 
     x: Array
@@ -69,20 +71,32 @@ class State:
 
     Attributes
     ----------
-    row : int
-        Rows done.
-    x, force : (rows, 3n) of the last rows of the template
-    given : (rows, g, columns) of grasped dofs
+    row, end : int
+        Rows done, and the place of the next one in the template.
+    x, force : (rows, 3n) of the template
+    given : (rows, g, 1 + m) of grasped dofs
     memory : Memory
     read : tuple of (x, Z, Z of the markers), latest last
     """
 
     row: int
+    end: int
     x: Array
     force: Array
     given: Array
     memory: Memory
     read: tuple[Read, ...]
+
+
+class Linear(NamedTuple):
+    """Rows from one on at their guesses: the sides of their equations (k, …, 1 + m)."""
+
+    first: int
+    at: Linearisation
+    nu: Array
+    right: Array
+    force: Array
+    given: GivenMotion | None
 
 
 class Sweep:
@@ -120,13 +134,14 @@ class Sweep:
         self.setting = segment.setting(p[: collocation.nq], self.phi)
         self.dynamics = self.setting.dynamics.first_rows(model.rows)
         self.carried = model.carried(self.phi)
-        self.operator = segment.observation.operator(self.phi)
         self.reading = segment.observation.reading(self.phi)
         self.clock = self._weights_in_time()
-        self.newton = Solver(segment.experiment, CAREFUL)
-        self.held = np.setdiff1d(np.arange(segment.dofs), self.solver.free)
+        self.newton, self.longest_m = Solver(segment.experiment, CAREFUL), 0.0
+        self.grasped, self.moving = segment.grasping.dofs, segment.moving
+        self.shape = len(self.solver.free), 1 + len(self.moving)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
-        self.moving = segment.moving
+        self.room = self.solver.factoriser.room(1 + segment.body.unsymmetric)
+        self.out = np.empty((TOGETHER, self.dynamics.forces.linearisation_width))
         self.information, self.known = known, known
         state = self._begin() if start is None or at is None else self._moved(start, p - at)
         self._resume(state)
@@ -134,185 +149,222 @@ class Sweep:
     # State ------------------------------------------------------------------------------------
 
     def _begin(self) -> State:
-        rows, dofs, count = self.model.rows, self.segment.dofs, len(self.moving)
-        grasped = len(self.segment.grasping.dofs)
-        empty = np.zeros((rows, dofs))
-        memory = Forward(self.solver, self.setting, (len(self.solver.free), count)).memory
-        return State(0, empty, empty.copy(), np.zeros((rows, grasped, count)), memory, ())
+        rows, dofs, shape = self.model.rows, self.segment.dofs, self.shape
+        empty, given = np.zeros((rows, dofs)), np.zeros((rows, len(self.grasped), shape[1]))
+        memory = Forward(self.solver, self.setting, shape).memory
+        return State(0, 0, empty, empty, given, memory, ())
 
     def _moved(self, state: State, step: Array) -> State:
         step = step[self.moving]
         if not step.any():
             return state
         x, force, free = state.x.copy(), state.force.copy(), self.solver.free
-        dofs, last = self.segment.grasping.dofs, min(state.row, self.model.rows) - 1
-        x[:, dofs] += state.given @ step
-        memory = state.memory
+        last, memory = state.end - 1, state.memory
+        x[:, self.grasped] += state.given[..., 1:] @ step
         for k, columns in enumerate(memory.solutions[: last + 1]):
-            x[last - k, free] += columns @ step
+            x[last - k, free] += columns[:, 1:] @ step
         for k, columns in enumerate(memory.increments[: last + 1]):
-            force[last - k, free] += columns @ step
-        read = tuple((at + own @ step, own, seen) for at, own, seen in state.read)
-        return State(state.row, x, force, state.given, memory, read)
+            force[last - k, free] += columns[:, 1:] @ step
+        moved = ((at + own @ step, own) for at, own, _ in state.read)
+        read = tuple(
+            (at, own, self._seen(np.column_stack([at, own.astype(float)]))) for at, own in moved
+        )
+        return replace(state, x=x, force=force, read=read)
 
     def _resume(self, state: State) -> None:
-        self.row = state.row
+        self.row, self.end = state.row, state.end
         self.x, self.force, self.given = state.x.copy(), state.force.copy(), state.given.copy()
-        shape = (len(self.solver.free), len(self.moving))
-        self.forward = Forward(self.solver, self.setting, shape, state.memory)
-        most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4
+        self.forward = Forward(self.solver, self.setting, self.shape, state.memory)
+        most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
         self.read: deque[Read] = deque(state.read, maxlen=most)
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether rows are off by more than the square of a short correction."""
+        return self.longest_m > LAST_STEP * self.size_m
 
     @property
     def state(self) -> State:
         """What the next row depends on."""
-        return State(
-            self.row,
-            self.x.copy(),
-            self.force.copy(),
-            self.given.copy(),
-            self.forward.memory,
-            tuple(self.read),
-        )
+        arrays = self.x.copy(), self.force.copy(), self.given.copy()
+        return State(self.row, self.end, *arrays, self.forward.memory, tuple(self.read))
 
     # Rows -------------------------------------------------------------------------------------
 
-    def advance(self, poses: Poses, guess: Array | None = None) -> Kept:
-        """Go on by a row, with the grasps there.
+    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[Kept]:
+        """Go on by rows, at most `TOGETHER`, with the grasps there.
+
+        It ends at a row that is far from where it was guessed: what comes after is as well.
 
         Raises
         ------
         SimulationError
-            Where the row cannot be solved.
+            Where a row cannot be solved.
         """
-        t = self._make_room()
-        poses = self.model.poses_of(poses)
-        goal, slopes = self.model.goals(self.carried, poses)
-        self.given[t, :, self.segment.nq :] = slopes
-        dofs = self.segment.grasping.dofs
-        given = None
-        if self.segment.nuisance.moves_grasps:
-            given = GivenMotion.along(self.solver, dofs, self.given)
-        by_p = np.zeros((self.segment.dofs, len(self.moving)))
-        if t < self.dynamics.first_row:
-            self.x[t] = self._start(poses)
-        else:
-            step, self.x[t], self.force[t] = self._solved(t, poses, goal, guess)
-            right = np.zeros((len(self.solver.free), len(self.moving)))
-            if self.setting.mass_moves:
-                right -= self.forward.inertia_slopes(step, self._acceleration(t, step.row))
-            slopes_n = self.forward.force_slopes(step)
-            by_p[self.solver.free] = self.forward.advance(step, right, slopes_n, given)
-        by_p[self.held] = self.given[t, np.searchsorted(dofs, self.held)]
-        kept = Kept(self.x[t].copy(), by_p.astype(np.float32))
-        self.read.append((kept.x, kept.columns, self.operator @ by_p))
-        self.row += 1
-        return kept
+        poses = [self.model.poses_of(each) for each in poses]
+        first, count = self._make_room(len(poses)), len(poses)
+        goals, slopes = self.model.goals(self.carried, poses)
+        self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
+        if first < self.dynamics.first_row:
+            self.x[first] = self._start(poses[0])
+            self._correct(first, np.zeros(self.shape))
+            return self._kept([np.zeros(self.shape)])
+        for k, t in enumerate(range(first, first + count)):
+            self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
+            self.x[t, self.grasped] = goals[k]
+        here, found, last, careful = range(first, first + count), [], np.inf, False
+        while here:
+            limit = LAST_STEP * self.size_m * (1 if len(here) == 1 else ROUGH)
+            linear = self._linearised(here)
+            for t in here:
+                before = self.forward.memory
+                columns = self._columns(t, linear)
+                length = float(np.abs(columns[:, 0]).max(initial=0.0))
+                if not length <= limit:
+                    break
+                self.longest_m = max(self.longest_m, length)
+                self._correct(t, columns)
+                found.append(columns)
+            else:
+                break
+            self.forward = Forward(self.solver, self.setting, self.shape, before)
+            if length < last / 2:
+                self.x[t, self.solver.free] += columns[:, 0]
+                last = length
+            elif not careful:
+                self.x[t], careful, last = self._carefully(t, poses[t - first]), True, np.inf
+            else:
+                self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
+            here = range(t, t + 1)
+        return self._kept(found)
 
-    def _make_room(self) -> int:
-        if self.row < self.model.rows:
-            return self.row
-        for each in (self.x, self.force, self.given):
-            each[:-1] = each[1:]
-        return self.model.rows - 1
+    def _make_room(self, count: int) -> int:
+        surplus = self.end + count - self.model.rows
+        if surplus > 0:
+            for each in (self.x, self.force, self.given):
+                each[:-surplus] = each[surplus:]
+            self.end -= surplus
+        return self.end
+
+    def _guess(self, t: int, poses: Poses) -> Array:
+        """x_t on a cubic through the last four rows, as far as there are that many."""
+        if t == 0:
+            return self._start(poses)
+        if t < 4:
+            return extrapolated(self.x[:t], np.zeros(self.segment.dofs))
+        return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _start(self, poses: Poses) -> Array:
         experiment = self.model.at_start(poses, self.phi)
         return start_state(experiment, self.setting.theta, self.newton)[0]
 
-    def _acceleration(self, t: int, row: Row) -> Array:
-        reach = min(t, self.dynamics.reach)
-        return np.tensordot(row.s[: reach + 1], self.x[t - reach : t + 1][::-1], 1)
+    def _linearised(self, here: range) -> Linear:
+        """Of rows where they are guessed to be, on from the rows before as they are."""
+        for past in (*self.forward.past, *self.forward.past_increments):
+            past[:, 0] = 0.0
+        theta, rows, known = self.setting.theta, slice(here.start, here.stop), slice(here.stop)
+        p, q, w, s = (table[rows, known] for table in self.model.stencils)
+        x, force = self.x[known], self.force[known]
+        nu, acceleration = q @ x, s @ x
+        forces, mass_kg = self.dynamics.forces.rows(rows), self.dynamics.mass.row(rows, theta)
+        at = forces.linearise(p @ x, nu, theta, self.out[: len(here)])
+        force[rows] = at.force
+        given = None
+        if self.segment.nuisance.moves_grasps:
+            given = GivenMotion.along(self.solver, self.grasped, self.given)
+        free, (size, count) = self.solver.free, self.shape
+        right, slopes = (np.zeros((len(here), k, count)) for k in (size, self.segment.dofs))
+        right[..., 0] = (w @ force - mass_kg * acceleration)[:, free]
+        right[..., 1:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
+        slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta, nu)
+        return Linear(here.start, at, nu, right, slopes, given)
 
-    def _solved(
-        self, t: int, poses: Poses, goal: Array, guess: Array | None
-    ) -> tuple[Step, Array, Array]:
-        """Row t: its last linearisation, x_t, and F_t."""
-        dofs = self.segment.grasping.dofs
+    def _columns(self, t: int, linear: Linear) -> Array:
+        """The correction of row t, and its columns, (free, 1 + m); NaN where it is singular."""
+        k, at, row = t - linear.first, linear.at, Row.of(self.dynamics, t, self.setting.theta)
+        matrix = row.block(at.by_position[k], at.by_velocity[k], self.solver.pattern)
+        skew = row.skew_block(at.by_position_skew[k])
+        try:
+            factor = self.solver.factoriser.factorise(matrix, skew, self.room)
+        except np.linalg.LinAlgError:
+            return np.full(self.shape, np.nan)
+        parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
+        step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
+        return self.forward.advance(step, linear.right[k], linear.force[k], linear.given)
+
+    def _correct(self, t: int, columns: Array) -> None:
+        """Correct row t, and be done with it."""
+        self.x[t, self.solver.free] += columns[:, 0]
+        if self.forward.weighs_past:
+            # What the row says F_t is then.
+            self.force[t, self.solver.free] += self.forward.past_increments[0][:, 0]
+        self.row, self.end = self.row + 1, t + 1
+
+    def _kept(self, columns: Sequence[Array]) -> list[Kept]:
+        """The last rows, whose columns (free, 1 + m) these are."""
+        here = slice(self.end - len(columns), self.end)
+        whole = np.zeros((len(columns), self.segment.dofs, self.shape[1]))
+        whole[:, self.grasped] = self.given[here]
+        whole[:, self.solver.free] = columns
+        whole[:, :, 0] = self.x[here]
+        found = [Kept(each[:, 0].copy(), each[:, 1:].astype(np.float32)) for each in whole]
+        seen = self._seen(whole)
+        self.read.extend((each.x, each.columns, y) for each, y in zip(found, seen, strict=True))
+        return found
+
+    def _seen(self, whole: Array) -> Array:
+        """What the markers have of columns (…, 3n, k) of the body, (…, 3M, k)."""
+        (nodes, places), (*rows, dofs, count) = self.reading, whole.shape
+        at = whole.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
+        return np.einsum("ma,...maik->...mik", places.weights, at).reshape(*rows, -1, count)
+
+    def _carefully(self, t: int, poses: Poses) -> Array:
+        """x_t, with the grasp's way taken in parts where that is needed."""
+        if t == 0:
+            return self._start(poses)
         equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
-        if guess is None:
-            guess = self._guess(t) if t else self._start(poses)
-        near = guess.copy()
-        near[dofs] = goal
+        goal = self.x[t, self.grasped]
         try:
-            return self._quick(t, equations, near.copy())
-        except NewtonFailure:
-            pass
-        try:
-            if t == 0:
-                return self._quick(t, equations, self._start(poses))
-            near = solve_row(self.newton, equations, near, self.x[t - 1], goal)
-            return self._quick(t, equations, near)
+            return solve_row(self.newton, equations, self.x[t], self.x[t - 1], goal)
         except NewtonFailure as failure:
-            time_s = self.row * self.model.interval_s / self.model.substeps
-            what = f"the step at row {self.row}"
-            raise simulation_error(self.newton, failure, time_s, what) from failure
+            self._fail(failure)
 
-    def _guess(self, t: int) -> Array:
-        """x_t on a cubic through the last four rows, as far as there are that many."""
-        if t < 4:
-            return extrapolated(self.x[:t], np.zeros(self.segment.dofs))
-        return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
-
-    def _quick(self, t: int, equations: RowEquations, x: Array) -> tuple[Step, Array, Array]:
-        """Newton's method without safeguards, as long as its steps get shorter."""
-        solver, row, theta = self.solver, equations.row, self.setting.theta
-        pattern, free, last, step = solver.pattern, solver.free, np.inf, None
-        short = LAST_STEP * self.size_m
-        for _ in range(QUICK):
-            if step is None or last > SAME_SLOPES * short:
-                xi, nu = equations.states(x)
-                at = equations.forces.linearise(xi, nu, theta)
-                matrix = row.block(at.by_position[0], at.by_velocity[0], pattern)
-                skew = row.skew_block(at.by_position_skew[0])
-                try:
-                    factor = solver.factoriser.factorise(matrix, skew)
-                except np.linalg.LinAlgError as error:
-                    raise NewtonFailure(x, f"the equations are singular: {error}") from error
-                parts = at.force[0], at.by_position[0], at.by_velocity[0], at.by_theta[0]
-                step = Step(t, row, *parts, factor, at.by_position_skew[0], nu[0])
-                force = at.force[0]
-            else:
-                force = equations.force(x)
-            newton = step.factor.solve(equations.balanced(force, x)[free])
-            length = float(np.abs(newton).max(initial=0.0))
-            if not length < last / 2:
-                raise NewtonFailure(x, "Newton's steps do not get shorter")
-            x[free] += newton
-            if length <= short:
-                # What the row says F_t is, after the last step: w_0 F_t + … = s_0 M x_t.
-                force = force.copy()
-                inertia = row.s[0] * row.mass_kg * x
-                force[free] = ((inertia - equations.known) / row.w[0])[free]
-                return step, x, force
-            last = length
-        raise NewtonFailure(x, f"Newton took more than {QUICK} iterations")
+    def _fail(self, failure: NewtonFailure) -> NoReturn:
+        time_s, what = self.row * self.model.interval_s / self.model.substeps, "the step at row"
+        raise simulation_error(self.newton, failure, time_s, f"{what} {self.row}") from failure
 
     # Markers ----------------------------------------------------------------------------------
 
-    def linearised(self, reading: Reading) -> tuple[Array, Array]:
-        """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P)."""
+    def linearised(self, reading: Reading, rows: int = 0) -> tuple[Array, Array]:
+        """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P).
+
+        It was read so many `rows` before the last one.
+        """
         model, around = self.model, self.model.samples_around
         sigma = self.segment.experiment.markers.sigma_m[:, None]
-        backs = [reading.back - k * model.substeps for k in range(-around, around + 1)]
-        x, columns = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
+        back = reading.back + rows
+        backs = [back - k * model.substeps for k in range(-around, around + 1)]
+        x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
         if not model.reads_plainly:
-            found = model.observation.linearised(x, self.phi, columns, self.moving, self.segment.nq)
+            parts = x, self.phi, seen[..., 1:], self.moving, self.segment.nq
+            found = model.observation.linearised(*parts)
             return found[0][around] - reading.tracks_m / sigma, found[1][around]
-        (nodes, places), (weights, rates) = self.reading, self.clock
-        at_m = np.tensordot(weights, x, 1).reshape(-1, 3)[nodes]
-        read = np.einsum("ma,mai->mi", places.weights, at_m)
-        slope = np.zeros((*read.shape, model.size))
-        slope[..., self.moving] = np.tensordot(weights, columns, 1).reshape(*read.shape, -1)
+        weights, rates = self.clock
+        read, moves = (
+            (each @ seen.reshape(len(seen), -1)).reshape(*reading.tracks_m.shape, -1)
+            for each in (weights, rates)
+        )
+        slope = np.zeros((*reading.tracks_m.shape, model.size))
+        slope[..., self.moving] = read[..., 1:]
         if around:
-            moves_m = np.tensordot(rates, x, 1).reshape(-1, 3)[nodes]
             (time,) = self.segment.nq + self.segment.nuisance.places("time")
-            slope[..., time] = np.einsum("ma,mai->mi", places.weights, moves_m)
-        observation = model.observation
+            slope[..., time] = moves[..., 0]
+        observation, (nodes, places) = model.observation, self.reading
         for m in observation.chart.estimated:
             own = self.segment.nq + observation.place_places[m]
-            slope[m][:, own] = at_m[m].T @ places.slopes[m]
-        return (read - reading.tracks_m) / sigma, slope / sigma[..., None]
+            at_m = np.tensordot(weights, x[:, 3 * nodes[m][:, None] + np.arange(3)], 1)
+            slope[m][:, own] = at_m.T @ places.slopes[m]
+        return (read[..., 0] - reading.tracks_m) / sigma, slope / sigma[..., None]
 
     def _weights_in_time(self) -> tuple[Array, Array]:
         """Weights of the samples around one as the clock is off, and their slopes by its φ."""
@@ -330,17 +382,17 @@ class Sweep:
         return lagrange(at, late), unit * (4 * near - wide) / 3
 
     def _at(self, back: float) -> tuple[Array, Array]:
-        """X and the markers' columns so many rows before the last; the start before the start."""
+        """X and what the markers have so many rows before the last; the start before the start."""
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= NEAR or not last:
-            x, _, columns = self.read[min(max(last - nearest, 0), last)]
-            return x, columns
+            x, _, seen = self.read[min(max(last - nearest, 0), last)]
+            return x, seen
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
         weights = lagrange(np.array(rows, dtype=float), back)
-        x, _, columns = zip(*(self.read[last - row] for row in rows), strict=True)
-        return np.tensordot(weights, x, 1), np.tensordot(weights, columns, 1)
+        x, _, seen = zip(*(self.read[last - row] for row in rows), strict=True)
+        return np.tensordot(weights, x, 1), np.tensordot(weights, seen, 1)
 
     def take(self, residual: Array, slope: Array) -> None:
         """Add what markers say, of those that are there."""
@@ -357,8 +409,5 @@ class Sweep:
 
 def lagrange(at: Array, wanted: float) -> Array:
     """Weights of values at points (k,) in the polynomial through them, at another."""
-    weights = np.ones(len(at))
-    for k, point in enumerate(at):
-        for other in (*at[:k], *at[k + 1 :]):
-            weights[k] *= (wanted - other) / (point - other)
-    return weights
+    points = at.tolist()
+    return np.array([math.prod((wanted - b) / (a - b) for b in points if b != a) for a in points])

@@ -10,11 +10,15 @@ keep them, so that no direction seems better known for having been linearised tw
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 from .information import Information
-from .model import Model, Poses
+from .model import TOGETHER, Model, Poses
 from .sweep import Kept, LoggedRow, State, Sweep
 
 
@@ -77,70 +81,76 @@ class Track:
         """Of what was measured and of the prior, at its own p."""
         return self.information.loss(self.p)
 
-    def advance(self, poses: Poses, guess: Array | None = None) -> None:
-        """Go on by a row; its readings are taken by `read`.
+    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> int:
+        """Go on by rows of one block; how many it did. Their readings are taken by `read`.
 
         Raises
         ------
         SimulationError
-            Where the row cannot be solved.
+            Where a row cannot be solved.
         """
         if self.rows % self.block_rows == 0:
             new = self.start if not self.blocks else (self.sweep.state, self.p)
             self.blocks.append(Block(*new))
-        kept = self.sweep.advance(poses, self._guess() if guess is None else guess)
-        self._note(kept)
-        self.blocks[-1].kept.append(kept)
-        self.rows += 1
+        known = self._known(len(poses))
+        found = self.sweep.advance(poses, guesses or self._guesses(known))
+        pairs = list(zip(found, known, strict=False))[-2:]
+        off = [kept.x - base.x - base.columns @ self._step for kept, base in pairs]
+        self._off = [*self._off, *off][-2:]
+        self.blocks[-1].kept += found
+        self.rows += len(found)
+        return len(found)
 
-    def read(self, residual: Array, slope: Array) -> None:
-        """Take what was read after the last row."""
-        self.blocks[-1].said.append((residual, slope))
-        self.sweep.take(residual, slope)
+    def read(self, said: Sequence[tuple[Array, Array]]) -> None:
+        """Take residuals and slopes of what was read after the last rows."""
+        if said:
+            self.blocks[-1].said += said
+            residual, slope = (np.concatenate(part) for part in zip(*said, strict=True))
+            self.sweep.take(residual, slope)
 
     def residuals(self, p: Array) -> list[Array]:
         """(M, 3) of what was read within the window, linearised to p, NaN where missing."""
         step = p - self.p
         return [residual + slope @ step for block in self.blocks for residual, slope in block.said]
 
-    def again(self, row: LoggedRow) -> None:
-        """Go on by a row and all that was read after it."""
-        self.advance(row.poses)
-        for reading in row.readings:
-            self.read(*self.sweep.linearised(reading))
-
-    def _known(self, row: int) -> Kept | None:
-        if self.base is None or row >= self.base.rows:
-            return None
-        block, place = divmod(row, self.block_rows)
-        return self.base.blocks[block].kept[place]
-
-    def _guess(self) -> Array | None:
-        """Row of the base, moved along its columns, and by what that missed before."""
-        known = self._known(self.rows)
-        if known is None:
-            return None
-        moved = known.x + known.columns @ self._step
-        if len(self._off) == 2:
-            return moved + 2 * self._off[1] - self._off[0]
-        return moved + self._off[-1] if self._off else moved
-
-    def _note(self, kept: Kept) -> None:
-        known = self._known(self.rows)
-        if known is not None:
-            off = kept.x - known.x - known.columns @ self._step
-            self._off = [*self._off[-1:], off]
+    def again(self, rows: Sequence[LoggedRow]) -> None:
+        """Go on by rows and all that was read after them, as far as is possible at once."""
+        done = self.advance([row.poses for row in rows[: self.left]])
+        pairs = [(k, each) for k, row in enumerate(rows[:done], 1) for each in row.readings]
+        self.read([self.sweep.linearised(reading, done - k) for k, reading in pairs])
 
     @property
-    def _step(self) -> Array:
+    def left(self) -> int:
+        """Rows that can be done at once: those left of a block, one without a guess."""
+        ahead = 0 if self.base is None else self.base.rows - self.rows
+        return max(1, min(TOGETHER, ahead, self.block_rows - self.rows % self.block_rows))
+
+    def _known(self, count: int) -> list[Kept]:
+        if self.base is None or self.rows + count > self.base.rows:
+            return []
+        places = (divmod(self.rows + k, self.block_rows) for k in range(count))
+        return [self.base.blocks[block].kept[place] for block, place in places]
+
+    def _guesses(self, known: Sequence[Kept]) -> list[Array]:
+        """Rows of the base, moved along their columns, and by what that missed before."""
+        if not known:
+            return []
+        # Straight on from the last two, where there are two.
+        first, off = ([np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off)[-2:]
+        moved = (base.x + base.columns @ self._step for base in known)
+        return [x + off + k * (off - first) for k, x in enumerate(moved, 1)]
+
+    @property
+    def _step(self) -> NDArray[np.float32]:
         assert self.base is not None
-        return (self.p - self.base.p)[self.sweep.moving]
+        return (self.p - self.base.p)[self.sweep.moving].astype(np.float32)
 
     def drop_oldest(self) -> int:
         """Let the oldest block leave as prior; how many rows it had."""
         block = self.blocks.pop(0)
         self.rows -= len(block.kept)
-        for residual, slope in block.said:
-            self.prior = self.prior.with_rows(*self.sweep.rows_of(residual, slope), self.p)
+        if block.said:
+            said = (np.concatenate(part) for part in zip(*block.said, strict=True))
+            self.prior = self.prior.with_rows(*self.sweep.rows_of(*said), self.p)
         self.start = (self.blocks[0].start, self.blocks[0].at)
         return len(block.kept)

@@ -65,8 +65,9 @@ class Row:
 
 def weighted(coefficients: Array, past: Iterable[Array], shape: tuple[int, ...]) -> Array:
     """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""
-    total = np.zeros(shape)
-    for coefficient, item in zip(coefficients[1:], past, strict=False):
-        if coefficient:
-            total += coefficient * item
-    return total
+    terms = [c * item for c, item in zip(coefficients[1:], past, strict=False) if c]
+    if not terms:
+        return np.zeros(shape)
+    for term in terms[1:]:
+        terms[0] += term
+    return terms[0]

@@ -125,6 +125,7 @@ class BlockSolver:
     ) -> None:
         self.stopwatch, self.factorisation = stopwatch or Stopwatch(), factorisation
         self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
+        self._takes = bool(self.dynamics.taken.any())
         self.segment = segment
         self.body, self.pattern = segment.body, segment.pattern
         self.free = segment.free_dofs
@@ -306,7 +307,8 @@ class BlockSolver:
 
     def without_taken(self, t: int, rows: Array) -> Array:
         """Rows (free, …) with zeros at what a passing grasp holds at t, in place."""
-        rows[self.dynamics.taken[t, self.free]] = 0
+        if self._takes:
+            rows[self.dynamics.taken[t, self.free]] = 0
         return rows
 
     @property
@@ -613,8 +615,8 @@ class Forward:
     def _of_past(self, step: Step, row: Row) -> Array:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
         p, q = row.p[1:], row.q[1:]
-        lags = np.flatnonzero((p != 0) | (q != 0))
-        if len(lags) == 0:
+        lags = [i for i, weights in enumerate(zip(p, q, strict=True)) if any(weights)]
+        if not lags:
             return np.zeros(self.shape)
         if len(lags) == 1:
             i = lags[0]
