@@ -10,15 +10,13 @@ import numpy as np
 
 from .arrays import Array
 from .errors import InputError
-from .files import damage_refused, read_json
+from .files import RESULT_FILE, damage_refused, read_json
 from .methods.solution import Solution
 from .methods.start import marched
 from .nlp.collocation import Collocation
 from .nlp.segment import Segment
 from .problem import Problem
 from .statistics.linearised import Derived
-
-RESULT_FILE = "result.json"
 
 
 @dataclass(frozen=True)

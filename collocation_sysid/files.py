@@ -31,6 +31,9 @@ DAMAGE = (
     zlib.error,
 )
 LONGEST_REASON = 200
+RESULT_FILE = "result.json"
+# The form of result.json and summary.json.
+SCHEMA = 2
 AGAIN = "; run what wrote it again"
 
 
@@ -65,7 +68,7 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If it is not there, or is damaged.
+        If it is not there, is damaged, or was written by another version.
     """
     require_regular(file)
     try:
@@ -76,6 +79,9 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
         raise InputError(f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent) from error
     if not isinstance(content, dict):
         raise InputError(f"{file.name} is damaged: it holds no object{AGAIN}", file.parent)
+    if (found := content.get("schema")) != SCHEMA:
+        said = f"{file.name} has schema {str(found)[:20]}; expected {SCHEMA}, this version's{AGAIN}"
+        raise InputError(said, file.parent)
     return content
 
 

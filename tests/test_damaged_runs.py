@@ -176,8 +176,19 @@ def test_damaged_frames_are_refused(run: Path, content: str):
 
 @pytest.mark.parametrize(
     "content",
-    ["", "[]", '{"runs": []}', '{"runs": [], "tables": [{"heads": ["a"], "rows": [[]]}]}'],
+    [
+        "",
+        "[]",
+        '{"schema": 2, "runs": []}',
+        '{"schema": 2, "runs": [], "tables": [{"heads": ["a"], "rows": [[]]}]}',
+    ],
 )
 def test_a_damaged_study_is_refused(tmp_path: Path, content: str):
     (tmp_path / "summary.json").write_text(content)
     assert "summary.json is damaged" in refused("report", tmp_path)
+
+
+@pytest.mark.parametrize("command", ["report", "plot", "animate", "refine"])
+def test_a_run_of_another_version_is_refused(run: Path, command: str):
+    entry(1, "schema")(run)
+    assert "result.json has schema 1; expected 2, this version's" in refused(command, run)

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..earlier import RESULT_FILE, Earlier
+from ..earlier import Earlier
 from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
 from ..fem.moduli import engineering
-from ..files import read_json
+from ..files import RESULT_FILE, read_json
 from ..output.replay import Replay, read_arrays, reading_run
 from ..problem import Problem
 

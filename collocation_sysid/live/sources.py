@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..experiment.experiment import Experiment
-from ..files import read_json
+from ..files import RESULT_FILE, read_json
 from ..output.replay import reading_run
 from ..problem import Problem
 from .estimator import Update
@@ -57,7 +57,7 @@ def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> P
     """
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code)
-    result = read_json(recording / "result.json", "a run folder")
+    result = read_json(recording / RESULT_FILE, "a run folder")
     with reading_run(recording):
         origin = result["provenance"]["problem_file"]
     if origin is None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
+from ..files import SCHEMA
 from ..methods.scan import Scan
 from ..methods.solution import Solution, pooled_wrench_rms
 from ..nlp.schemes import as_scheme
@@ -28,7 +29,6 @@ from .fields import ElementFields
 from .replay import Replay
 from .writers import run_folder, write_frames
 
-SCHEMA_VERSION = 2
 REFINEMENT_FILE = "refinement.json"
 
 
@@ -158,7 +158,7 @@ def result(finished: Run) -> dict[str, Any]:
     fitted = {segment.experiment.name for segment in collocation.segments}
     rolled = {n: r for n, r in finished.rollouts.items() if isinstance(r, Rollout) and n in fitted}
     return {
-        "schema": SCHEMA_VERSION,
+        "schema": SCHEMA,
         "status": solution.status.value,
         "converged": solution.status.converged,
         "message": solution.message,

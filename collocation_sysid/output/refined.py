@@ -7,9 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
-from ..earlier import RESULT_FILE, Earlier
+from ..earlier import Earlier
 from ..errors import InputError
-from ..files import read_json
+from ..files import RESULT_FILE, read_json
 from ..problem import Problem
 from ..refine import refinement_of
 from ..statistics.estimates import Estimate

@@ -20,9 +20,8 @@ from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..fem.quadratic import EDGES
-from ..files import damage_refused, read_json
+from ..files import RESULT_FILE, damage_refused, read_json
 
-RESULT_FILE = "result.json"
 ARRAYS_FILE = "trajectory.npz"
 # Of the body, and so the same for all experiments of a run.
 SHARED = ("undeformed_m", "tetrahedra", "surface", "surface_parts")

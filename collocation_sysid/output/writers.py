@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..fem.elements import Element
+from ..files import RESULT_FILE
 from .fields import ElementFields
-from .replay import RESULT_FILE
 
 # Cell types of the VTK file format by meshio's names, which order nodes alike.
 VTK_CELL_TYPES = {"tetra": 10, "tetra10": 24}

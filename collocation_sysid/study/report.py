@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..fem.constants import symbol_of, unit_of
+from ..files import SCHEMA
 from ..output.record import as_json
 from .choice import advice, model_notes, model_rows, shown_in
 from .plan import PlannedRun, short_keys
@@ -18,7 +19,6 @@ from .plots import comparison_plots, sweep_plots
 from .store import Record, RunStore, write_whole
 from .table import Row, Yardstick, method_rows, run_row
 
-SCHEMA_VERSION = 2
 RESOLUTION_DPI = 150
 SHOWN_FAILURES = 8
 # Heads of the tables where there is room, on pages.
@@ -168,7 +168,7 @@ def report_json(report: Report) -> dict[str, Any]:
     rows = report.rows
     first = report.planned[0]
     content: dict[str, Any] = {
-        "schema": SCHEMA_VERSION,
+        "schema": SCHEMA,
         "kind": report.kind,
         "title": report.title,
         "problem": first.problem,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from ...fem.constants import symbol_of, unit_of
-from ...files import read_json
+from ...files import RESULT_FILE, read_json
 from ..remedies import remedies_for, remedy_for
-from ..replay import LARGEST, RESULT_FILE, read_arrays, reading_run
+from ..replay import LARGEST, read_arrays, reading_run
 from .page import millimetres, number, picture, rendered
 
 SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
