@@ -5,7 +5,7 @@ processor's, of this process, which other work on the machine does not lengthen 
 beside them is the time that one row takes in a sweep of the whole recording at once.
 
     python scripts/benchmark_live.py
-    python scripts/benchmark_live.py --frames 360000 --problem foam_cylinder   # an hour
+    python scripts/benchmark_live.py --frames 360000 --problem block --rows 1   # an hour
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
+from twins import SOFT, twin
 
 from collocation_sysid.live import Estimator, Frame, LiveOptions
 from collocation_sysid.live.sources import recorded
@@ -34,6 +35,7 @@ NOISE_M = {"table1": 1e-3, "foam_cylinder": 0.0}
 TRUTH = {
     "table1": {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0},
     "foam_cylinder": {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5},
+    "block": SOFT,
 }
 EARLY_S = 0.3
 SWEEPS = 5
@@ -49,7 +51,7 @@ def main() -> None:
     arguments = parser.parse_args()
     budget_s = None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
     options = LiveOptions(budget_s=budget_s, rows=arguments.rows)
-    for name in arguments.problem or TRUTH:
+    for name in arguments.problem or NOISE_M:
         problem = _noisy(name)
         live = Estimator(problem, options, time.thread_time)
         frames = list(recorded(problem.experiments[0], live.model))
@@ -60,6 +62,8 @@ def main() -> None:
 
 
 def _noisy(name: str) -> Problem:
+    if name == "block":
+        return twin(name, SOFT, seed=0, samples=101, integrator="midpoint")
     problem = Problem.read(PROBLEMS / name / "problem.toml")
     (experiment,) = problem.experiments
     tracks = experiment.markers.positions_m
