@@ -7,10 +7,13 @@ Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 
 from __future__ import annotations
 
 import sys
-from typing import Annotated, NoReturn
+from collections.abc import Callable
+from functools import cache
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.text import Text
+from typer.main import get_command
 
 from ..errors import InputError, SimulationError
 from ..starting import heed_interrupts
@@ -52,11 +55,17 @@ def _root(
     pass
 
 
+@cache
+def _commands() -> Callable[..., Any]:
+    """The commands; to read their options takes longer than a refusal."""
+    return get_command(app)
+
+
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
     restore = heed_interrupts()
     try:
-        app(prog_name="collocation-sysid")
+        _commands()(prog_name="collocation-sysid")
     except InputError as error:
         _refuse("error", error, EXIT_BAD_INPUT)
     except OSError as error:
