@@ -156,6 +156,7 @@ def test_the_problem_as_run_is_kept(solved):
     assert (solved.run / "problem.toml").read_text() == solved.file.read_text()
 
 
+@pytest.mark.long
 def test_plots_are_drawn_again_from_the_files(solved, tmp_path):
     outcome = run_command("plot", solved.run, "--out", tmp_path / "again")
     assert outcome.code == 0

@@ -93,6 +93,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
 
 
+@pytest.mark.long
 def test_every_method_runs_from_every_start(compared):
     assert compared.first.code == 0, compared.first.err
     rows = table(compared.out / "runs.csv")
@@ -107,6 +108,7 @@ def test_every_method_runs_from_every_start(compared):
             assert float(row[f"error_{name}"]) < 1e-4
 
 
+@pytest.mark.long
 def test_the_summary_has_a_row_for_each_method(compared):
     rows = table(compared.out / "summary.csv")
     assert [row["method"] for row in rows] == list(METHODS)
@@ -119,6 +121,7 @@ def test_the_summary_has_a_row_for_each_method(compared):
         assert all(float(row[f"error_{name}"]) < 1e-4 for name in TRUTH)
 
 
+@pytest.mark.long
 def test_the_tables_fit_a_terminal_and_the_plots_are_drawn(compared):
     lines = compared.first.out.splitlines()
     assert [line for line in lines if line in ("Success", "Quality", "Cost")]
@@ -130,6 +133,7 @@ def test_the_tables_fit_a_terminal_and_the_plots_are_drawn(compared):
     assert "within 1 % of the truth" in text
 
 
+@pytest.mark.long
 def test_progress_tells_the_time_left(compared):
     lines = compared.first.err.splitlines()
     assert len(lines) == 4
@@ -138,6 +142,7 @@ def test_progress_tells_the_time_left(compared):
     assert "; about" not in lines[-1]
 
 
+@pytest.mark.long
 def test_finished_runs_are_not_done_again(compared):
     assert compared.again.err == "4 of 4 runs are finished already\n"
     runs = compared.out / "runs"

@@ -157,7 +157,11 @@ def test_linearise_gives_the_slopes_of_the_force(material, element, evaluator, r
 
 
 @pytest.mark.parametrize(
-    ("element", "evaluator"), [("tet4", "casadi"), *((element, "simd") for element in ELEMENTS)]
+    ("element", "evaluator"),
+    [
+        ("tet4", "casadi"),
+        *(pytest.param(e, "simd", marks=[pytest.mark.long] * (e == "tet10-p0")) for e in ELEMENTS),
+    ],
 )
 def test_curvature_gives_the_slopes_of_the_weighted_slopes(element, evaluator, rng):
     body = small_body("neo-hookean", element, evaluator)

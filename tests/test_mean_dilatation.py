@@ -104,6 +104,7 @@ def test_second_derivatives_are_slopes_of_the_first(material, rng):
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("material", ["neo-hookean", of_a_user])
 def test_evaluators_agree(material, rng):
     simd, casadi = (small_body(material, name) for name in ("simd", "casadi"))

@@ -483,8 +483,7 @@ def test_validation_is_drawn_by_its_simulation():
     assert len(pictures["error_hung cube"].axes[0].lines) == 1
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-@pytest.mark.parametrize("first", [0, 6])
+@pytest.mark.parametrize(("first", "wrong"), [(0, np.inf), (6, np.nan)])
 def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
     seen = replay()
     positions, markers = seen.positions_m.copy(), seen.markers_m.copy()

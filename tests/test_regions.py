@@ -155,6 +155,7 @@ def test_regions_with_the_same_constants_are_one_body(evaluator, element, rng):
     assert relative_error(blocks.sum(axis=(1, 3)), expected.theta_theta) < 1e-12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("material", ["mooney-rivlin", None])
 def test_evaluators_agree(make_two, material, rng):
     simd, casadi = (make_two(material, evaluator) for evaluator in EVALUATORS)
@@ -193,7 +194,9 @@ def test_linearise_gives_the_slopes_of_the_force(make_two, material, evaluator, 
 
 
 @pytest.mark.parametrize("evaluator", EVALUATORS)
-@pytest.mark.parametrize("material", ["mooney-rivlin", "gent"])
+@pytest.mark.parametrize(
+    "material", ["mooney-rivlin", pytest.param("gent", marks=pytest.mark.long)]
+)
 def test_curvature_gives_the_slopes_of_the_weighted_slopes(make_two, material, evaluator, rng):
     body = make_two(material, evaluator)
     x, v, w = states(body, rng)

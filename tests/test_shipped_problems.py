@@ -246,7 +246,7 @@ def test_huber_and_offsets_together_recover_the_truth_from_the_noisy_cylinder(as
     ("huber", "offsets"),
     [
         pytest.param(False, False, id="plain-least-squares", marks=pytest.mark.slow),
-        pytest.param(True, False, id="huber-alone"),
+        pytest.param(True, False, id="huber-alone", marks=pytest.mark.long),
         pytest.param(False, True, id="offsets-alone"),
     ],
 )

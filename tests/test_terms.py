@@ -85,6 +85,7 @@ def collocation_of(name: str) -> Collocation:
     return Collocation([experiment], parameters(truth, guesses))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MODELS)
 def test_both_methods_recover_the_truth(name):
     truth, guesses = MODELS[name][1:]
