@@ -54,6 +54,7 @@ def about(findings: Findings, *words: str) -> str:
 # The motion and the time grid -------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_cure_it(tiny: Path):
     euler = (*SILICONE, "transcription.scheme=backward-euler")
     findings = checked(tiny, *euler)
@@ -137,6 +138,7 @@ def test_a_recording_shorter_than_a_period_is_warned_of(tiny: Path):
 # The elements -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_nearly_incompressible_linear_elements_are_warned_of(tiny: Path):
     nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
     warning = about(checked(tiny, *nearly), "Poisson's ratio is 0.49")

@@ -162,6 +162,7 @@ def compare(*more: object) -> Outcome:
     )
 
 
+@pytest.mark.long
 def test_a_late_run_is_a_row(tiny, stand_in):
     outcome = compare("--starts", 3, "--time-limit", 3, "--workers", 3, *KNOWN)
     assert outcome.code == 0

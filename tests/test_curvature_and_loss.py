@@ -55,6 +55,7 @@ def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rn
     assert np.abs(gauss_newton - differences).max() > 1e-3 * np.abs(differences).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("experiment", "huber"), [(bar_let_go(), 2.0), (cube_with_nuisance(), None)]
 )

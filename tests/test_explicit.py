@@ -151,6 +151,7 @@ def assert_same(found: Solution, expected: Solution, tolerance: float) -> None:
         assert found.parameters[name] == pytest.approx(value, rel=tolerance), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("branches", "noise_m"), [(2, 0.0), (1, 1e-4)])
 def test_interior_point_finds_the_optimum_of_reduced_space(branches: int, noise_m: float):
     collocation = fitted(branches, 16, noise_m)

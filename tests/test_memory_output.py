@@ -114,6 +114,7 @@ def test_a_slip_in_the_memory_is_one_message(tiny, old: str, new: str, expected:
         Problem.read(tiny / "problem.toml")
 
 
+@pytest.mark.long
 def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     MEMORY(tiny)
     problem = Problem.read(tiny / "problem.toml", [GUESSED])

@@ -84,6 +84,7 @@ def read(run: PlannedRun) -> Problem:
 # Twins ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "steps",
     [

@@ -125,6 +125,7 @@ def test_small_strain_moduli_are_told_for_each_part(make_two):
 # Equal to one region --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 @pytest.mark.parametrize("evaluator", EVALUATORS)
 def test_regions_with_the_same_constants_are_one_body(evaluator, element, rng):

@@ -242,11 +242,12 @@ def test_huber_and_offsets_together_recover_the_truth_from_the_noisy_cylinder(as
     assert standard_errors_off(solution).max() < 3.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("huber", "offsets"),
     [
         pytest.param(False, False, id="plain-least-squares", marks=pytest.mark.slow),
-        pytest.param(True, False, id="huber-alone", marks=pytest.mark.long),
+        pytest.param(True, False, id="huber-alone"),
         pytest.param(False, True, id="offsets-alone"),
     ],
 )

@@ -100,6 +100,7 @@ def test_both_methods_recover_the_truth(name):
     assert reduced.kkt_residual < 1e-8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MODELS)
 def test_derivatives_of_the_program_by_any_number_of_parameters(name, rng):
     collocation = collocation_of(name)
