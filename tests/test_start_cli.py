@@ -161,7 +161,10 @@ def test_nuisance_parameters_are_taken_over(folder):
     [
         (None, "is not the folder of an earlier run: it has no result.json"),
         ("{", "is damaged"),
-        ('{"parameters": {"x_pa": {"value": 1}}, "derived": {}, "nuisance": {}}', "found x_pa;"),
+        (
+            '{"schema": 2, "parameters": {"x_pa": {"value": 1}}, "derived": {}, "nuisance": {}}',
+            "found x_pa;",
+        ),
     ],
     ids=["no-run", "damaged", "other-parameters"],
 )
