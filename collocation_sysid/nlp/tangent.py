@@ -123,7 +123,8 @@ class BlockSolver:
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
     ) -> None:
-        self.stopwatch, self.factorisation = stopwatch or Stopwatch(), factorisation
+        self.stopwatch = stopwatch or Stopwatch()
+        self.factorisation: Choice = factorisation
         self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
         self._takes = bool(self.dynamics.taken.any())
         self.segment = segment
