@@ -58,6 +58,14 @@ def frames_of(problem: cs.Problem, live: Estimator) -> list[Frame]:
     return list(recorded(problem.experiments[0], live.model))
 
 
+def streamed(problem: cs.Problem, count: int | None = None) -> Estimator:
+    """An estimator that has taken so many frames, by default all, and passed none again."""
+    live = Estimator(problem, NO_TIME)
+    for frame in frames_of(problem, live)[:count]:
+        live.take(frame)
+    return live
+
+
 def with_time_every(count: int, live: Estimator, frames: list[Frame]) -> Update:
     """Take frames, and at every so manieth all the passes that are wanted."""
     for number, frame in enumerate(frames, start=1):
@@ -74,9 +82,7 @@ def normal_equations(triangle: np.ndarray) -> np.ndarray:
 def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
     problem, count = swing(nuisance=nuisance), 30
-    live = Estimator(problem, NO_TIME)
-    for frame in frames_of(problem, live)[:count]:
-        live.take(frame)
+    live = streamed(problem, count)
     collocation = problem.collocation()
     horizon, p = Horizon(collocation, [count], prior=estimator.WEAK), collocation.guess_p
     reached, failure = horizon.extend(p)
@@ -90,7 +96,7 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
     priors = len(collocation.prior(p)[0]) + collocation.nq
-    measured = sum(len(leg.residual) for leg in point.legs)
+    measured = sum(len(leg.slope) for leg in point.legs)
     assert live.track.information.rows == measured + priors
 
 
@@ -139,9 +145,7 @@ def test_the_best_between_bounds_is_that_of_bounded_least_squares(rng):
 def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
     problem = swing(nuisance=Nuisance())
-    live = Estimator(problem, NO_TIME)
-    for frame in frames_of(problem, live):
-        live.take(frame)
+    live = streamed(problem)
     track, log, whole = live.track, list(live.log), live.track.information
     left = track.drop_oldest()
     assert 0 < left < len(log)
@@ -157,9 +161,7 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
 def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
     problem = swing(nuisance=Nuisance())
-    live = Estimator(problem, NO_TIME)
-    for frame in frames_of(problem, live):
-        live.take(frame)
+    live = streamed(problem)
     way = np.full(len(live.p), 1.0)
     errors = []
     for size in (1e-3, 5e-4):
@@ -178,9 +180,7 @@ def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(mo
 def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
     problem = swing(nuisance=Nuisance())
-    live = Estimator(problem, NO_TIME)
-    for frame in frames_of(problem, live):
-        live.take(frame)
+    live = streamed(problem)
     way, errors = np.full(len(live.p), 1.0), []
     for size in (1e-3, 5e-4):
         p = live.track.p + size * way
@@ -210,9 +210,7 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypa
 
 def test_a_row_far_from_its_guess_is_solved_alone():
     problem = swing()
-    live = Estimator(problem, NO_TIME)
-    for frame in frames_of(problem, live):
-        live.take(frame)
+    live = streamed(problem)
     far = live.track.p + np.array([0.7, -0.7, 0.7, -0.7])
     again, whole = (
         Track(live.model, far, live.prior, live._block_rows, t) for t in (live.track, None)
@@ -487,6 +485,14 @@ def test_bad_lines_are_named(line, said):
     reader.read("")
     with pytest.raises(InputError, match=said):
         reader.read(line)
+
+
+@pytest.mark.parametrize("cell", ["one", "1_000"])
+def test_cells_of_a_row_that_are_no_numbers_are_named(cell):
+    reader = FrameReader([1], ["a"], "input")
+    reader.read("t_s,x_m,y_m,z_m,qx,qy,qz,qw,a_x,a_y,a_z")
+    with pytest.raises(InputError, match=f"line 2: found '{cell}'; expected a number"):
+        reader.read(f"1,1,2,3,0,0,0,1,{cell},,")
 
 
 def test_datagrams_are_read_until_an_empty_one():

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Index
 from ..errors import InputError
+from ..experiment.formats.text import written_number
 from ..experiment.poses import first_matrix_fault, first_pose_fault
 
 Pose = Any
@@ -226,6 +227,6 @@ def _cell(text: str) -> float:
     if text == "" or text.lower() == "nan":
         return float("nan")
     try:
-        return float(text)
+        return written_number(text)
     except ValueError:
         raise InputError(f"found {text!r}; expected a number") from None

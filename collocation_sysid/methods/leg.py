@@ -91,21 +91,18 @@ class Leg:
     ----------
     x : (rows, 3n)
     tangent : Tangent
-    residual : (M,) r + S_p, sensors and markers after the feasibility step
-    slope : (M, k) S
+    slope : (M, k) S, of sensors and markers after the feasibility step
     report : Report
     """
 
     x: Array
     tangent: Tangent
-    residual: Array
     slope: Array
     report: Report
 
     def __sizeof__(self) -> int:
         # So that a scheduler knows what moving it would take.
-        tangent = self.tangent
-        held = (self.x, tangent.step, tangent.by_p, self.residual, self.slope)
+        held = (self.x, self.tangent.step, self.tangent.by_p, self.slope)
         return object.__sizeof__(self) + sum(each.nbytes for each in held)
 
 
@@ -238,7 +235,7 @@ def _read(
         seen=Seen.of(part, projected, tangent.violation_n),
         spent=spent,
     )
-    return Leg(part.x, tangent, residual, slope, report)
+    return Leg(part.x, tangent, slope, report)
 
 
 def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:

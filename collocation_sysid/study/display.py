@@ -14,7 +14,7 @@ from .plan import PlannedRun
 from .report import SHOWN_FAILURES, Report, View
 from .store import Record
 
-# Columns from which on long heads are parted.
+# With more columns than these long heads are parted.
 MANY = 5
 
 

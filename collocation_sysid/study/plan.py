@@ -163,7 +163,7 @@ def plan_models(
     Raises
     ------
     InputError
-        For a model that the problem file cannot have, and a problem without a file.
+        For a model that its problem file cannot have.
     """
     planned = []
     for held_out in ("", *recordings(problem)):

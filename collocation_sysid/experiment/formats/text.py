@@ -138,7 +138,7 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
         for j, column in enumerate(columns):
             cell = row.cells[column]
             try:
-                value = _float(cell) if cell else math.nan
+                value = written_number(cell) if cell else math.nan
             except ValueError:
                 value = math.inf
             if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
@@ -159,9 +159,11 @@ def tracks(grid: Grid, first_columns: Sequence[int]) -> Array:
     return numbers(grid, columns, blank_allowed=True).reshape(-1, len(first_columns), 3)
 
 
-def _float(text: str) -> float:
-    """A number as files write it: digits joined by underscores are one in Python only."""
-    return math.inf if "_" in text else float(text)
+def written_number(text: str) -> float:
+    """A number as files write it; a `ValueError` for 1_000, which is one in Python only."""
+    if "_" in text:
+        raise ValueError(f"found {text!r}")
+    return float(text)
 
 
 def header_number(text: str, key: str, path: str | Path, line: int) -> float | None:
@@ -175,7 +177,7 @@ def header_number(text: str, key: str, path: str | Path, line: int) -> float | N
     if not text:
         return None
     try:
-        value = _float(text)
+        value = written_number(text)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
