@@ -36,10 +36,8 @@ from .sweep import LoggedRow, Reading
 from .track import Track
 from .trust import UNSETTLED, data_concerns, estimate_concerns
 
-# A prior of this standard deviation of the logarithm holds each parameter near its guess: what the
-# first frames do not tell stays finite, and of what a recording tells it changes nothing.
-WEAK = 2.3
-# The same about the last pass for where the next one is, until many samples tell of it.
+# Standard deviation of a prior about the last pass for where the next one is, until many samples
+# tell of it.
 STAY = 0.5
 # Estimates this far from where all is linearised, in standard errors, begin another pass.
 MOVED = 0.1
@@ -152,7 +150,7 @@ class Estimator:
         self._blocks = max(2, round(options.window_s / model.interval_s / samples))
         self._bounds()
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
-        self.prior = self._of_priors()
+        self.prior = Information.none(model.size)
         self.track: Track | None = None
         self.again: Track | None = None
         self.log: list[LoggedRow] = []
@@ -207,8 +205,9 @@ class Estimator:
         rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m)
         notes += said
         squares: list[Array] = []
-        for row in rows:
-            notes += self._go_on(row, squares)
+        while rows:
+            done, said = self._go_on(rows, squares)
+            notes, rows = notes + said, rows[done:]
         notes += self._read(readings, squares)
         self._estimate()
         done = self._pass_again(began, notes)
@@ -226,25 +225,27 @@ class Estimator:
         once = self.counts["with a wrench"] == 1
         return ["wrenches are not read: live takes poses and markers"] if once else []
 
-    def _go_on(self, row: LoggedRow, squares: list[Array]) -> list[str]:
-        """Log a row, and take it."""
-        self.log.append(LoggedRow(row.poses, []))
+    def _go_on(self, rows: Sequence[LoggedRow], squares: list[Array]) -> tuple[int, list[str]]:
+        """Take rows and log them, as many as it does at once; how many, and what is said."""
+        done, said, track = 1, [], self.track
         try:
-            if self.track is None:
-                self._begin(row)
-            elif not self.track.failed:
-                self.track.advance([row.poses])
+            if track is None:
+                self._begin(rows[0])
+            elif not track.failed:
+                done = track.advance([row.poses for row in rows[: track.together]])
         except SimulationError as error:
-            if self.track is None:
-                self.log.clear()
+            if track is None:
                 self.intake.begin_anew()
-                return [f"there is no start: {error}"]
-            self.track.failed = True
-            return [f"the body cannot be simulated with these parameters: {error}"]
-        return self._read(row.readings, squares)
+                return 1, [f"there is no start: {error}"]
+            track.failed = True
+            said = [f"the body cannot be simulated with these parameters: {error}"]
+        for k, row in enumerate(rows[:done], 1):
+            self.log.append(LoggedRow(row.poses, []))
+            said += self._read(row.readings, squares, done - k)
+        return done, said
 
-    def _read(self, readings: Sequence[Reading], squares: list[Array]) -> list[str]:
-        """Take what is read after the last row, without samples that jump."""
+    def _read(self, readings: Sequence[Reading], squares: list[Array], rows: int = 0) -> list[str]:
+        """Take what is read so many rows before the last one, without samples that jump."""
         track = self.track
         if track is None:
             return []
@@ -252,8 +253,8 @@ class Estimator:
         for reading in readings:
             self.samples += int(np.isfinite(reading.tracks_m[:, 0]).sum())
             if not track.failed:
-                residual, slope = track.sweep.linearised(reading)
-                here = residual + slope @ (self.p - track.p)
+                said = track.sweep.linearised(reading, rows)
+                here = said.at(self.model.flat(self.p))
                 wild = self._wild(here)
                 if wild.any():
                     names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
@@ -261,8 +262,8 @@ class Estimator:
                     reading = reading._replace(
                         tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
                     )
-                    residual[wild] = here[wild] = np.nan
-                track.read([(residual, slope)])
+                    said.at_zero[wild] = here[wild] = np.nan
+                track.read([said])
                 near = np.sum((here * sigma_m) ** 2, axis=1)
                 squares.append(near[np.isfinite(near)])
             self.log[-1].readings.append(reading)
@@ -286,14 +287,6 @@ class Estimator:
 
     def _search(self) -> Search:
         return Search(self.model, self.p[self.model.collocation.nq :])
-
-    def _of_priors(self) -> Information:
-        """What is known before the first frame."""
-        collocation, size, nq = self.model.collocation, self.model.size, self.model.collocation.nq
-        residual, slopes = collocation.prior(self.p)
-        found = Information.none(size).with_rows(residual, np.diag(slopes), self.p)
-        away = (self.p[:nq] - collocation.parameters.guess_q) / WEAK
-        return found.with_rows(away, np.eye(nq, size) / WEAK, self.p)
 
     def _warmed_up(self) -> tuple[Poses, Array] | None:
         """Have the kernels compiled before frames come; the body at rest, and where it is held."""
@@ -325,7 +318,7 @@ class Estimator:
             self._bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
-            self.prior = self._of_priors()
+            self.prior = Information.none(self.model.size)
             track = Track(self.model, self.p, self.prior, self._block_rows)
             track.advance([row.poses], guesses)
         self.track = track
@@ -333,7 +326,7 @@ class Estimator:
     def _begin_anew(self) -> None:
         """Keep what is known, and wait for a start."""
         if self.track is not None:
-            self.prior = self.track.information
+            self.prior = self.track.measured
         self.track = self.again = None
         self.log.clear()
         self.intake.begin_anew()
@@ -351,7 +344,8 @@ class Estimator:
     def _apart(self, track: Track, p: Array) -> float:
         nq = self.model.collocation.nq
         errors = np.sqrt(np.diag(track.information.covariance)[:nq])
-        return float(np.max(np.abs((p - track.p)[:nq]) / errors, initial=0.0))
+        apart = np.abs(self.model.flat(p) - self.model.flat(track.p))[:nq]
+        return float(np.max(apart / errors, initial=0.0))
 
     def _estimate(self) -> None:
         if self.track is not None and not self.track.failed:
@@ -359,15 +353,17 @@ class Estimator:
 
     def _best(self, track: Track, known: Information) -> Array:
         reach = self._trust * self.model.collocation.reach_p
-        low, high = np.maximum(self.lower, track.p - reach), track.p + reach
-        return known.best(low, np.minimum(self.upper, high))
+        low, high = np.maximum(self.lower, track.p - reach), np.minimum(self.upper, track.p + reach)
+        best = known.best(self.model.flat(low), self.model.flat(high))
+        return np.clip(self.model.curved(best), low, high)
 
     def _next(self, track: Track) -> Array:
         """Where to pass again: what is hardly known yet stays near where it was."""
         size, samples = self.model.size, len(self.log) / self.model.substeps
         stay = STAY * max(1.0, samples / SEEN)
-        slopes = np.diag(1 / (stay * self.model.collocation.reach_p))
-        return self._best(track, track.information.with_rows(np.zeros(size), slopes, track.p))
+        slopes = np.diag(1 / (stay * self.model.collocation.reach_p * self.model.rates(track.p)))
+        at = self.model.flat(track.p)
+        return self._best(track, track.information.with_rows(np.zeros(size), slopes, at))
 
     def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
         grave: list[Concern] = []
@@ -392,8 +388,10 @@ class Estimator:
 
     def _estimates_at(self, track: Track, p: Array) -> dict[str, Estimate]:
         collocation, nq = self.model.collocation, self.model.collocation.nq
-        factor, quantile = widened(track.information, p, self.model.size, self.scatter)
-        of_q = factor * track.information.covariance[:nq, :nq]
+        known, fitted = track.information, self.model.size
+        factor, quantile = widened(known, self.model.flat(p), fitted, self.scatter)
+        rates = self.model.rates(p)[:nq]
+        of_q = factor * known.covariance[:nq, :nq] / np.outer(rates, rates)
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
         return user_estimates(collocation.parameters, p[:nq], of_q, bounded, quantiles)
@@ -461,7 +459,7 @@ class Estimator:
         """Take a pass that has caught up in place of the first, or not."""
         self.again = None
         sought, self.search = self.search is not None, None
-        expected = max(track.loss, track.information.loss(again.p))
+        expected = max(track.loss, track.loss_at(again.p))
         if not again.failed and (track.failed or again.loss <= TIMES * expected + SLACK):
             again.base, self.track = None, again
             self._trust = TRUST if sought else min(2 * self._trust, WIDEST)

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..experiment.clock import TIME_TOLERANCE_S
-from .model import Poses
 from .sweep import LATEST, LoggedRow, Reading, lagrange
 
 # Frames this near in time, in samples, are of one time.
@@ -142,32 +142,35 @@ class Intake:
 
     def _due(self) -> list[LoggedRow]:
         """The rows that there are poses for."""
-        found: list[LoggedRow] = []
+        found: list[tuple[Array, Array, list[Reading]]] = []
         if self.start_s is None:
-            return found
+            return []
         until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
         while self._time_s(self.rows) <= until_s:
-            poses = self._poses_at(self._time_s(self.rows))
+            pose = self._pose_at(self._time_s(self.rows))
             self.rows += 1
-            found.append(LoggedRow(poses, self._ready()))
-        return found
+            found.append((*pose, self._ready()))
+        if not found:
+            return []
+        places, quaternions, readings = zip(*found, strict=True)
+        flat = Rotation.from_quat(np.concatenate(quaternions)).as_matrix()
+        turns = flat.reshape(len(found), -1, 3, 3)
+        poses = (tuple(zip(*each, strict=True)) for each in zip(turns, places, strict=True))
+        return [LoggedRow(*each) for each in zip(poses, readings, strict=True)]
 
-    def _poses_at(self, t_s: float) -> Poses:
+    def _pose_at(self, t_s: float) -> tuple[Array, Array]:
+        """Positions (G, 3) and quaternions (G, 4), not of unit length, between those there are."""
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
-                turns = Rotation.from_quat(quaternions).as_matrix()
-                return tuple(zip(turns, positions_m, strict=True))
-        times = np.array([each[0] for each in self._poses])
-        gaps = np.diff(times)
-        used = len(times)
-        if len(gaps) and gaps.max() > (FEW + TOLERANCE) * self.interval_s:
-            used = 2
-        weights = lagrange(times[-used:], t_s)
-        known = list(self._poses)[-used:]
-        positions = np.tensordot(weights, [p for _, p, _ in known], 1)
-        quaternions = np.tensordot(weights, [q for _, _, q in known], 1)
-        turns = Rotation.from_quat(quaternions).as_matrix()
-        return tuple(zip(turns, positions, strict=True))
+                return positions_m, quaternions
+        times, places, quaternions = (list(each) for each in zip(*self._poses, strict=True))
+        far = any(b - a > (FEW + TOLERANCE) * self.interval_s for a, b in pairwise(times))
+        used = slice(-2, None) if far else slice(None)
+        weights = lagrange(times[used], t_s)
+        position_m, quaternion = (
+            np.einsum("k,kgi->gi", weights, each[used]) for each in (places, quaternions)
+        )
+        return position_m, quaternion
 
     def _ready(self) -> list[Reading]:
         """What can be read after the rows there are."""

@@ -16,15 +16,23 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..experiment.poses import PoseSequence
+from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
 from ..nlp.collocation import Collocation
+from ..nlp.newton import NewtonOptions, Solver
 from ..nlp.observation import NEIGHBOURS, Observation
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..problem import Problem
+from .information import Information
 
 # Rows that are linearised at a time, at most.
 TOGETHER = 8
+# A prior of this standard deviation of the logarithm holds each parameter near its guess: what the
+# first frames do not tell stays finite, and of what a recording tells it changes nothing.
+WEAK = 2.3
+# To what accuracy rows are solved where the way of the grasp has to be taken in parts.
+CAREFUL = NewtonOptions(tolerance=1e-6)
 # Young's modulus that a search without a guess begins at.
 MIDDLE_PA = 1e4
 
@@ -95,6 +103,11 @@ class Model:
         return BlockSolver(self.segment, self.rows)
 
     @cached_property
+    def newton(self) -> Solver:
+        """Of the start, and of rows where the way of the grasp has to be taken in parts."""
+        return Solver(self.segment.experiment, CAREFUL)
+
+    @cached_property
     def rows(self) -> int:
         """Rows of the start, and those that are linearised at a time."""
         return 2 * self.segment.dynamics.reach + 2 + TOGETHER
@@ -113,6 +126,39 @@ class Model:
     def interval_s(self) -> float:
         """Time between samples."""
         return self.experiment.timestep_s
+
+    @cached_property
+    def _drags(self) -> Index:
+        """Where p has the logarithms of damping by mass."""
+        free = self.collocation.parameters.free
+        return np.flatnonzero([bare(item.name) == GAMMA_M.name for item in free])
+
+    def flat(self, p: Array) -> Array:
+        """What residuals are nearly linear in: of γ_m its value over the guess, else p."""
+        flat = p.copy()
+        flat[self._drags] = np.exp((p - self.collocation.guess_p)[self._drags])
+        return flat
+
+    def curved(self, flat: Array) -> Array:
+        """The p of what is flat."""
+        p = flat.copy()
+        p[self._drags] = self.collocation.guess_p[self._drags] + np.log(flat[self._drags])
+        return p
+
+    def rates(self, p: Array) -> Array:
+        """(P,) of what is flat by p, each by its own."""
+        rates = np.ones(len(p))
+        rates[self._drags] = self.flat(p)[self._drags]
+        return rates
+
+    def stated(self, p: Array) -> Information:
+        """What is known before the first frame, to first order about p."""
+        residual, slopes = self.collocation.prior(p)
+        nq = self.collocation.nq
+        away = (p[:nq] - self.collocation.parameters.guess_q) / WEAK
+        rows = np.vstack([np.diag(slopes), np.eye(nq, self.size) / WEAK]) / self.rates(p)
+        none = Information.none(self.size)
+        return none.with_rows(np.concatenate([residual, away]), rows, self.flat(p))
 
     @cached_property
     def samples_around(self) -> int:

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..methods.robust import huberised
+from ..nlp.forces import Forces
 from ..nlp.marching import RowEquations, extrapolated, solve_row
-from ..nlp.newton import NewtonFailure, NewtonOptions, Solver, simulation_error
+from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.rest import start_state
 from ..nlp.row import Row
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
@@ -32,16 +33,10 @@ from .model import TOGETHER, Model, Poses
 # A row's correction over the body's size: the next one would be its square. Where rows are solved
 # together it may be so many times as long, and another pass follows.
 LAST_STEP, ROUGH = 3e-4, 10
-# To what accuracy rows are solved where the way of the grasp has to be taken in parts.
-CAREFUL = NewtonOptions(tolerance=1e-6)
 # Readings this near to a row, in rows, are of that row; others lie between four of them.
 NEAR = 1e-3
 # Readings may come this many samples late.
 LATEST = 5
-
-
-# x (3n,), its columns Z, and of the markers both, (3M, 1 + m).
-Read = tuple[Array, NDArray[np.float32], Array]
 
 
 class Reading(NamedTuple):
@@ -59,10 +54,26 @@ class LoggedRow(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What a later pass starts a row from: x (3n,) and Z (3n, m)."""
+    """What a later pass starts a row from: x (3n,) at `flat` (P,), and its slopes by that, Z."""
 
+    flat: Array
     x: Array
     columns: NDArray[np.float32]
+
+
+class Said(NamedTuple):
+    """Residuals (M, 3) of a reading, NaN where missing, as if flat were 0; slopes by flat."""
+
+    at_zero: Array
+    slope: Array
+
+    def at(self, flat: Array) -> Array:
+        """(M, 3) the residuals, to first order."""
+        return self.at_zero + self.slope @ flat
+
+
+# A row, and x and the columns of the markers, (3M, 1 + m).
+Read = tuple[Kept, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +87,7 @@ class State:
     x, force : (rows, 3n) of the template
     given : (rows, g, 1 + m) of grasped dofs
     memory : Memory
-    read : tuple of (x, Z, Z of the markers), latest last
+    read : tuple of rows with their markers, latest last
     """
 
     row: int
@@ -111,8 +122,7 @@ class Sweep:
     start : State, optional
         Where it begins; where the recording does by default.
     at : (P,), optional
-        The p of that state, which is moved along its columns: what the state depends on by way of
-        what is no longer kept, it depends on as it did there.
+        The p of that state, which is moved along its columns: by what is flat it keeps them.
 
     Raises
     ------
@@ -129,6 +139,7 @@ class Sweep:
         at: Array | None = None,
     ) -> None:
         self.model, self.p, self.solver = model, p, model.solver
+        self.flat, self.rates = model.flat(p), model.rates(p)
         collocation, segment = model.collocation, model.segment
         self.segment, self.phi = segment, p[collocation.nq :]
         self.setting = segment.setting(p[: collocation.nq], self.phi)
@@ -136,14 +147,17 @@ class Sweep:
         self.carried = model.carried(self.phi)
         self.reading = segment.observation.reading(self.phi)
         self.clock = self._weights_in_time()
-        self.newton, self.longest_m = Solver(segment.experiment, CAREFUL), 0.0
+        self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.shape = len(self.solver.free), 1 + len(self.moving)
         self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
         self.room = self.solver.factoriser.room(1 + segment.body.unsymmetric)
         self.out = np.empty((TOGETHER, self.dynamics.forces.linearisation_width))
-        self.information, self.known = known, known
-        state = self._begin() if start is None or at is None else self._moved(start, p - at)
+        self.mass_kg = self.dynamics.mass.row(0, self.setting.theta)
+        self._forces: dict[int, Forces] = {}
+        self._rows: dict[int, Row] = {}
+        self.information = known
+        state = self._begin() if start is None or at is None else self._moved(start, at)
         self._resume(state)
 
     # State ------------------------------------------------------------------------------------
@@ -154,10 +168,12 @@ class Sweep:
         memory = Forward(self.solver, self.setting, shape).memory
         return State(0, 0, empty, empty, given, memory, ())
 
-    def _moved(self, state: State, step: Array) -> State:
-        step = step[self.moving]
-        if not step.any():
+    def _moved(self, state: State, at: Array) -> State:
+        if (at == self.p).all():
             return state
+        was, moving = self.model.rates(at), self.moving
+        step = ((self.flat - self.model.flat(at)) / was)[moving]
+        grown = np.concatenate([[1.0], (self.rates / was)[moving]])
         x, force, free = state.x.copy(), state.force.copy(), self.solver.free
         last, memory = state.end - 1, state.memory
         x[:, self.grasped] += state.given[..., 1:] @ step
@@ -165,11 +181,18 @@ class Sweep:
             x[last - k, free] += columns[:, 1:] @ step
         for k, columns in enumerate(memory.increments[: last + 1]):
             force[last - k, free] += columns[:, 1:] @ step
-        moved = ((at + own @ step, own) for at, own, _ in state.read)
-        read = tuple(
-            (at, own, self._seen(np.column_stack([at, own.astype(float)]))) for at, own in moved
+        solutions, increments = (
+            tuple(columns * grown for columns in each)
+            for each in (memory.solutions, memory.increments)
         )
-        return replace(state, x=x, force=force, read=read)
+        memory = replace(memory, solutions=solutions, increments=increments)
+        read = []
+        for kept, _ in state.read:
+            by_p = kept.columns * self.rates[moving]
+            here = kept.x + kept.columns @ (self.flat - kept.flat)[moving]
+            moved = Kept(self.flat, here, kept.columns)
+            read.append((moved, self._seen(np.column_stack([here, by_p]))))
+        return replace(state, x=x, force=force, memory=memory, read=tuple(read))
 
     def _resume(self, state: State) -> None:
         self.row, self.end = state.row, state.end
@@ -256,7 +279,7 @@ class Sweep:
 
     def _start(self, poses: Poses) -> Array:
         experiment = self.model.at_start(poses, self.phi)
-        return start_state(experiment, self.setting.theta, self.newton)[0]
+        return start_state(experiment, self.setting.theta, self.model.newton)[0]
 
     def _linearised(self, here: range) -> Linear:
         """Of rows where they are guessed to be, on from the rows before as they are."""
@@ -266,22 +289,33 @@ class Sweep:
         p, q, w, s = (table[rows, known] for table in self.model.stencils)
         x, force = self.x[known], self.force[known]
         nu, acceleration = q @ x, s @ x
-        forces, mass_kg = self.dynamics.forces.rows(rows), self.dynamics.mass.row(rows, theta)
-        at = forces.linearise(p @ x, nu, theta, self.out[: len(here)])
+        at = self._forces_on(len(here)).linearise(p @ x, nu, theta, self.out[: len(here)])
         force[rows] = at.force
         given = None
         if self.segment.nuisance.moves_grasps:
             given = GivenMotion.along(self.solver, self.grasped, self.given)
         free, (size, count) = self.solver.free, self.shape
         right, slopes = (np.zeros((len(here), k, count)) for k in (size, self.segment.dofs))
-        right[..., 0] = (w @ force - mass_kg * acceleration)[:, free]
+        right[..., 0] = (w @ force - self.mass_kg * acceleration)[:, free]
         right[..., 1:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
         slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta, nu)
         return Linear(here.start, at, nu, right, slopes, given)
 
+    # Loads are always there: what acts on some rows is what acts on as many others.
+
+    def _forces_on(self, count: int) -> Forces:
+        if count not in self._forces:
+            self._forces[count] = self.dynamics.forces.rows(slice(count))
+        return self._forces[count]
+
+    def _row(self, t: int) -> Row:
+        if t not in self._rows:
+            self._rows[t] = Row.of(self.dynamics, t, self.setting.theta)
+        return self._rows[t]
+
     def _columns(self, t: int, linear: Linear) -> Array:
         """The correction of row t, and its columns, (free, 1 + m); NaN where it is singular."""
-        k, at, row = t - linear.first, linear.at, Row.of(self.dynamics, t, self.setting.theta)
+        k, at, row = t - linear.first, linear.at, self._row(t)
         matrix = row.block(at.by_position[k], at.by_velocity[k], self.solver.pattern)
         skew = row.skew_block(at.by_position_skew[k])
         try:
@@ -307,9 +341,10 @@ class Sweep:
         whole[:, self.grasped] = self.given[here]
         whole[:, self.solver.free] = columns
         whole[:, :, 0] = self.x[here]
-        found = [Kept(each[:, 0].copy(), each[:, 1:].astype(np.float32)) for each in whole]
-        seen = self._seen(whole)
-        self.read.extend((each.x, each.columns, y) for each, y in zip(found, seen, strict=True))
+        columns = (whole[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
+        pairs = zip(self.x[here].copy(), columns, strict=True)
+        found = [Kept(self.flat, *pair) for pair in pairs]
+        self.read.extend(zip(found, self._seen(whole), strict=True))
         return found
 
     def _seen(self, whole: Array) -> Array:
@@ -325,21 +360,26 @@ class Sweep:
         equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
         goal = self.x[t, self.grasped]
         try:
-            return solve_row(self.newton, equations, self.x[t], self.x[t - 1], goal)
+            return solve_row(self.model.newton, equations, self.x[t], self.x[t - 1], goal)
         except NewtonFailure as failure:
             self._fail(failure)
 
     def _fail(self, failure: NewtonFailure) -> NoReturn:
         time_s, what = self.row * self.model.interval_s / self.model.substeps, "the step at row"
-        raise simulation_error(self.newton, failure, time_s, f"{what} {self.row}") from failure
+        raise simulation_error(
+            self.model.newton, failure, time_s, f"{what} {self.row}"
+        ) from failure
 
     # Markers ----------------------------------------------------------------------------------
 
-    def linearised(self, reading: Reading, rows: int = 0) -> tuple[Array, Array]:
-        """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P).
+    def linearised(self, reading: Reading, rows: int = 0) -> Said:
+        """What was read so many `rows` before the last one."""
+        residual, slope = self._by_p(reading, rows)
+        slope /= self.rates
+        return Said(residual - slope @ self.flat, slope)
 
-        It was read so many `rows` before the last one.
-        """
+    def _by_p(self, reading: Reading, rows: int) -> tuple[Array, Array]:
+        """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P) by p."""
         model, around = self.model, self.model.samples_around
         sigma = self.segment.experiment.markers.sigma_m[:, None]
         back = reading.back + rows
@@ -371,7 +411,7 @@ class Sweep:
         around, places = self.model.samples_around, self.segment.nuisance.places("time")
         if not around:
             return np.ones(1), np.zeros(1)
-        at = np.arange(-around, around + 1.0)
+        at = range(-around, around + 1)
         unit = float(self.segment.nuisance.scales[places[0]]) / self.model.interval_s
         late = unit * float(self.phi[places[0]])
         # Of a polynomial of fourth order central differences with a step of one, and half of
@@ -386,28 +426,31 @@ class Sweep:
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= NEAR or not last:
-            x, _, seen = self.read[min(max(last - nearest, 0), last)]
-            return x, seen
+            kept, seen = self.read[min(max(last - nearest, 0), last)]
+            return kept.x, seen
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
-        weights = lagrange(np.array(rows, dtype=float), back)
-        x, _, seen = zip(*(self.read[last - row] for row in rows), strict=True)
-        return np.tensordot(weights, x, 1), np.tensordot(weights, seen, 1)
+        weights = lagrange(rows, back)
+        kept, seen = zip(*(self.read[last - row] for row in rows), strict=True)
+        return np.tensordot(weights, [k.x for k in kept], 1), np.tensordot(weights, seen, 1)
 
-    def take(self, residual: Array, slope: Array) -> None:
+    def take(self, said: Sequence[Said]) -> None:
         """Add what markers say, of those that are there."""
-        self.information = self.information.with_rows(*self.rows_of(residual, slope), self.p)
+        self.information = self.added(self.information, said)
 
-    def rows_of(self, residual: Array, slope: Array) -> tuple[Array, Array]:
-        """Residuals (k,) of the markers (M, 3) that are there, with the loss's weights."""
-        here = np.isfinite(residual[:, 0])
-        rows, slopes = residual[here].ravel(), slope[here].reshape(-1, slope.shape[2])
-        if self.model.collocation.huber is None:
-            return rows, slopes
-        return huberised(rows, slopes, self.model.collocation.huber)
+    def added(self, known: Information, said: Sequence[Said]) -> Information:
+        """What is known, and what markers say besides, with the loss's weights."""
+        if not said:
+            return known
+        at_zero, slope = (np.concatenate(part) for part in zip(*said, strict=True))
+        here = np.isfinite(at_zero[:, 0])
+        slopes = slope[here].reshape(-1, slope.shape[2])
+        rows, huber = at_zero[here].ravel() + slopes @ self.flat, self.model.collocation.huber
+        if huber is not None:
+            rows, slopes = huberised(rows, slopes, huber)
+        return known.with_rows(rows, slopes, self.flat)
 
 
-def lagrange(at: Array, wanted: float) -> Array:
+def lagrange(points: Sequence[float], wanted: float) -> Array:
     """Weights of values at points (k,) in the polynomial through them, at another."""
-    points = at.tolist()
     return np.array([math.prod((wanted - b) / (a - b) for b in points if b != a) for a in points])

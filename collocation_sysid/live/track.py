@@ -14,12 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Array
 from .information import Information
 from .model import TOGETHER, Model, Poses
-from .sweep import Kept, LoggedRow, State, Sweep
+from .sweep import Kept, LoggedRow, Said, State, Sweep
 
 
 @dataclass(eq=False)
@@ -31,13 +30,13 @@ class Block:
     start : State or None, where the recording begins
     at : (P,) p of that state
     kept : list of Kept, one a row
-    said : list of residual (M, 3), NaN where missing, and slopes (M, 3, P) of what was read
+    said : list of Said, one a reading
     """
 
     start: State | None
     at: Array
     kept: list[Kept] = field(default_factory=list)
-    said: list[tuple[Array, Array]] = field(default_factory=list)
+    said: list[Said] = field(default_factory=list)
 
 
 class Track:
@@ -48,7 +47,7 @@ class Track:
     model : Model
     p : (P,)
     prior : Information
-        What was known before the window.
+        Of what was read before the window.
     block_rows : int
     base : Track, optional
         The one that is done again; it guesses the rows' positions.
@@ -60,7 +59,8 @@ class Track:
         first = base.blocks[0] if base is not None and base.blocks else None
         self.prior, self.base, self.block_rows = prior, base, block_rows
         self.start = (None, p) if first is None else (first.start, first.at)
-        self.sweep = Sweep(model, p, prior, *self.start)
+        self.model = model
+        self.sweep = Sweep(model, p, prior.joined(model.stated(p)), *self.start)
         self.blocks: list[Block] = []
         self.failed = False
         self.rows = 0
@@ -73,13 +73,17 @@ class Track:
 
     @property
     def information(self) -> Information:
-        """All that is known at it, the prior included."""
+        """All that is known at it of what is flat, see `Model.flat`, the prior included."""
         return self.sweep.information
 
     @property
     def loss(self) -> float:
         """Of what was measured and of the prior, at its own p."""
-        return self.information.loss(self.p)
+        return self.loss_at(self.p)
+
+    def loss_at(self, p: Array) -> float:
+        """The same to first order at another p."""
+        return self.information.loss(self.model.flat(p))
 
     def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> int:
         """Go on by rows of one block; how many it did. Their readings are taken by `read`.
@@ -95,23 +99,21 @@ class Track:
         known = self._known(len(poses))
         found = self.sweep.advance(poses, guesses or self._guesses(known))
         pairs = list(zip(found, known, strict=False))[-2:]
-        off = [kept.x - base.x - base.columns @ self._step for kept, base in pairs]
+        off = [kept.x - self._expected(base) for kept, base in pairs]
         self._off = [*self._off, *off][-2:]
         self.blocks[-1].kept += found
         self.rows += len(found)
         return len(found)
 
-    def read(self, said: Sequence[tuple[Array, Array]]) -> None:
-        """Take residuals and slopes of what was read after the last rows."""
-        if said:
-            self.blocks[-1].said += said
-            residual, slope = (np.concatenate(part) for part in zip(*said, strict=True))
-            self.sweep.take(residual, slope)
+    def read(self, said: Sequence[Said]) -> None:
+        """Take what was read after the last rows."""
+        self.blocks[-1].said += said
+        self.sweep.take(said)
 
     def residuals(self, p: Array) -> list[Array]:
         """(M, 3) of what was read within the window, linearised to p, NaN where missing."""
-        step = p - self.p
-        return [residual + slope @ step for block in self.blocks for residual, slope in block.said]
+        flat = self.model.flat(p)
+        return [said.at(flat) for block in self.blocks for said in block.said]
 
     def again(self, rows: Sequence[LoggedRow]) -> None:
         """Go on by rows and all that was read after them, as far as is possible at once."""
@@ -120,10 +122,15 @@ class Track:
         self.read([self.sweep.linearised(reading, done - k) for k, reading in pairs])
 
     @property
+    def together(self) -> int:
+        """Rows that can be done at once: those left of a block."""
+        return min(TOGETHER, self.block_rows - self.rows % self.block_rows)
+
+    @property
     def left(self) -> int:
-        """Rows that can be done at once: those left of a block, one without a guess."""
+        """The same of rows that are done again: one without a guess."""
         ahead = 0 if self.base is None else self.base.rows - self.rows
-        return max(1, min(TOGETHER, ahead, self.block_rows - self.rows % self.block_rows))
+        return max(1, min(ahead, self.together))
 
     def _known(self, count: int) -> list[Kept]:
         if self.base is None or self.rows + count > self.base.rows:
@@ -137,20 +144,25 @@ class Track:
             return []
         # Straight on from the last two, where there are two.
         first, off = ([np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off)[-2:]
-        moved = (base.x + base.columns @ self._step for base in known)
+        moved = map(self._expected, known)
         return [x + off + k * (off - first) for k, x in enumerate(moved, 1)]
 
-    @property
-    def _step(self) -> NDArray[np.float32]:
-        assert self.base is not None
-        return (self.p - self.base.p)[self.sweep.moving].astype(np.float32)
+    def _expected(self, base: Kept) -> Array:
+        step = (self.sweep.flat - base.flat)[self.sweep.moving]
+        return base.x + base.columns @ step.astype(np.float32)
 
     def drop_oldest(self) -> int:
         """Let the oldest block leave as prior; how many rows it had."""
         block = self.blocks.pop(0)
         self.rows -= len(block.kept)
-        if block.said:
-            said = (np.concatenate(part) for part in zip(*block.said, strict=True))
-            self.prior = self.prior.with_rows(*self.sweep.rows_of(*said), self.p)
+        self.prior = self.sweep.added(self.prior, block.said)
         self.start = (self.blocks[0].start, self.blocks[0].at)
         return len(block.kept)
+
+    @property
+    def measured(self) -> Information:
+        """All that was read, within the window and before it."""
+        known = self.prior
+        for block in self.blocks:
+            known = self.sweep.added(known, block.said)
+        return known

@@ -513,7 +513,6 @@ class Forward:
         self.solver = solver
         self.held = held if len(solver.sensed) else None
         self.setting = setting
-        self.dynamics = solver.dynamics_at(setting)
         self.shape = shape
         reach = solver.dynamics.reach
         nothing = (np.zeros(shape),) * reach

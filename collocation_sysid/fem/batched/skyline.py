@@ -99,10 +99,12 @@ class Skyline:
         results = np.zeros((2, size + width))
         ends = _addresses(sides[0], sides[-1])
         fill(len(self._source), *self._fixed, *_addresses(*parts), *ends)
-        diagonal = symmetric[self._diagonal]
         factorise(size, width, self._reached, *ends, *_addresses(*results))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return results[0, :size], results[1, :size] / diagonal
+        pivots, growth = results[:, :size]
+        if len(sides) == 2:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                growth /= symmetric[self._diagonal]
+        return pivots, growth
 
     def solve(self, first: Array, pivots: Array, second: Array, right: Array) -> Array:
         """Solve L D Uᵀ x = b for rows b of `right` (columns, n), with L `first` and U `second`."""
