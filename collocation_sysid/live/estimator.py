@@ -41,6 +41,8 @@ from .trust import UNSETTLED, data_concerns, estimate_concerns
 STAY = 0.5
 # Estimates this far from where all is linearised, in standard errors, begin another pass.
 MOVED = 0.1
+# And this far from where a pass is, its later rows are done there.
+TURN = 1.0
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than so many times, and this above, what it
@@ -339,13 +341,13 @@ class Estimator:
         """How far the estimate is from where all is linearised, in standard errors."""
         if self.track is None or self.track.failed:
             return np.inf
-        return self._apart(self.track, self.p)
+        return self._apart(self.track, self.p, self.track.points)
 
-    def _apart(self, track: Track, p: Array) -> float:
+    def _apart(self, track: Track, p: Array, points: Sequence[Array]) -> float:
+        """How far p is at most from points, in the standard errors of a pass."""
         nq = self.model.collocation.nq
-        errors = np.sqrt(np.diag(track.information.covariance)[:nq])
-        apart = np.abs(self.model.flat(p) - self.model.flat(track.p))[:nq]
-        return float(np.max(apart / errors, initial=0.0))
+        apart = np.abs(np.array(points) - self.model.flat(p))[:, :nq]
+        return float(np.max(apart / track.information.errors[:nq], initial=0.0))
 
     def _estimate(self) -> None:
         if self.track is not None and not self.track.failed:
@@ -361,9 +363,9 @@ class Estimator:
         """Where to pass again: what is hardly known yet stays near where it was."""
         size, samples = self.model.size, len(self.log) / self.model.substeps
         stay = STAY * max(1.0, samples / SEEN)
-        slopes = np.diag(1 / (stay * self.model.collocation.reach_p * self.model.rates(track.p)))
-        at = self.model.flat(track.p)
-        return self._best(track, track.information.with_rows(np.zeros(size), slopes, at))
+        slopes = np.diag(1 / (stay * self.model.collocation.reach_p * track.sweep.rates))
+        known = track.information.with_rows(np.zeros(size), slopes, track.sweep.flat)
+        return self._best(track, known)
 
     def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
         grave: list[Concern] = []
@@ -389,8 +391,9 @@ class Estimator:
     def _estimates_at(self, track: Track, p: Array) -> dict[str, Estimate]:
         collocation, nq = self.model.collocation, self.model.collocation.nq
         known, fitted = track.information, self.model.size
-        factor, quantile = widened(known, self.model.flat(p), fitted, self.scatter)
-        rates = self.model.rates(p)[:nq]
+        flat = self.model.flat(p)
+        factor, quantile = widened(known, flat, fitted, self.scatter)
+        rates = self.model.rates(flat)[:nq]
         of_q = factor * known.covariance[:nq, :nq] / np.outer(rates, rates)
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
@@ -403,8 +406,13 @@ class Estimator:
         done, self._row_s = 0, FADING * self._row_s
         while self.track is not None:
             again = self.again or self._wanted(self.track, notes)
+            if again is None or not self._left(done, self.clock() - began, again.left):
+                break
+            if again.rows and again.base is not None and not done:
+                self._turn(self.track, again)
             before = self.clock()
-            if again is None or not (left := self._left(done, before - began, again.left)):
+            left = self._left(done, before - began, again.left)
+            if not left:
                 break
             were = again.rows
             try:
@@ -450,10 +458,18 @@ class Estimator:
             return None
         else:
             p = self._next(track)
-            if self._apart(track, p) <= MOVED and not track.sweep.is_rough:
+            if self._apart(track, p, track.points) <= MOVED and not track.sweep.is_rough:
                 return None
         self.again = Track(self.model, p, track.prior, self._block_rows, base)
         return self.again
+
+    def _turn(self, track: Track, again: Track) -> None:
+        """Go on with a pass where the estimate is now, if that is far from where it was."""
+        here = [again.sweep.flat]
+        if self._apart(track, self.p, here) > TURN:
+            p = self._next(track)
+            if self._apart(track, p, here) > TURN:
+                again.turn(p)
 
     def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
         """Take a pass that has caught up in place of the first, or not."""

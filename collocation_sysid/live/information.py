@@ -89,3 +89,8 @@ class Information:
         size = len(self.triangle) - 1
         root = np.asarray(np.linalg.inv(self.triangle[:size, :size]), dtype=float)
         return root @ root.T
+
+    @cached_property
+    def errors(self) -> Array:
+        """(P,) standard deviations of p then."""
+        return np.sqrt(np.diag(self.covariance))

@@ -128,37 +128,38 @@ class Model:
         return self.experiment.timestep_s
 
     @cached_property
-    def _drags(self) -> Index:
-        """Where p has the logarithms of damping by mass."""
+    def _drags(self) -> tuple[Index, Array]:
+        """Where p has the logarithms of damping by mass, and those of its guesses."""
         free = self.collocation.parameters.free
-        return np.flatnonzero([bare(item.name) == GAMMA_M.name for item in free])
+        places = np.flatnonzero([bare(item.name) == GAMMA_M.name for item in free])
+        return places, self.collocation.guess_p[places]
 
     def flat(self, p: Array) -> Array:
         """What residuals are nearly linear in: of γ_m its value over the guess, else p."""
-        flat = p.copy()
-        flat[self._drags] = np.exp((p - self.collocation.guess_p)[self._drags])
+        (places, guesses), flat = self._drags, p.copy()
+        flat[places] = np.exp(p[places] - guesses)
         return flat
 
     def curved(self, flat: Array) -> Array:
         """The p of what is flat."""
-        p = flat.copy()
-        p[self._drags] = self.collocation.guess_p[self._drags] + np.log(flat[self._drags])
+        (places, guesses), p = self._drags, flat.copy()
+        p[places] = guesses + np.log(flat[places])
         return p
 
-    def rates(self, p: Array) -> Array:
+    def rates(self, flat: Array) -> Array:
         """(P,) of what is flat by p, each by its own."""
-        rates = np.ones(len(p))
-        rates[self._drags] = self.flat(p)[self._drags]
+        (places, _), rates = self._drags, np.ones(len(flat))
+        rates[places] = flat[places]
         return rates
 
     def stated(self, p: Array) -> Information:
         """What is known before the first frame, to first order about p."""
         residual, slopes = self.collocation.prior(p)
-        nq = self.collocation.nq
+        nq, flat = self.collocation.nq, self.flat(p)
         away = (p[:nq] - self.collocation.parameters.guess_q) / WEAK
-        rows = np.vstack([np.diag(slopes), np.eye(nq, self.size) / WEAK]) / self.rates(p)
+        rows = np.vstack([np.diag(slopes), np.eye(nq, self.size) / WEAK]) / self.rates(flat)
         none = Information.none(self.size)
-        return none.with_rows(np.concatenate([residual, away]), rows, self.flat(p))
+        return none.with_rows(np.concatenate([residual, away]), rows, flat)
 
     @cached_property
     def samples_around(self) -> int:

@@ -139,7 +139,8 @@ class Sweep:
         at: Array | None = None,
     ) -> None:
         self.model, self.p, self.solver = model, p, model.solver
-        self.flat, self.rates = model.flat(p), model.rates(p)
+        self.flat = model.flat(p)
+        self.rates = model.rates(self.flat)
         collocation, segment = model.collocation, model.segment
         self.segment, self.phi = segment, p[collocation.nq :]
         self.setting = segment.setting(p[: collocation.nq], self.phi)
@@ -171,9 +172,10 @@ class Sweep:
     def _moved(self, state: State, at: Array) -> State:
         if (at == self.p).all():
             return state
-        was, moving = self.model.rates(at), self.moving
-        step = ((self.flat - self.model.flat(at)) / was)[moving]
-        grown = np.concatenate([[1.0], (self.rates / was)[moving]])
+        moving, flat = self.moving, self.model.flat(at)
+        was, way = self.model.rates(flat), (self.flat - flat)[moving]
+        step, grown = way / was[moving], np.ones(self.shape[1])
+        grown[1:] = (self.rates / was)[moving]
         x, force, free = state.x.copy(), state.force.copy(), self.solver.free
         last, memory = state.end - 1, state.memory
         x[:, self.grasped] += state.given[..., 1:] @ step
@@ -186,13 +188,14 @@ class Sweep:
             for each in (memory.solutions, memory.increments)
         )
         memory = replace(memory, solutions=solutions, increments=increments)
-        read = []
-        for kept, _ in state.read:
-            by_p = kept.columns * self.rates[moving]
-            here = kept.x + kept.columns @ (self.flat - kept.flat)[moving]
-            moved = Kept(self.flat, here, kept.columns)
-            read.append((moved, self._seen(np.column_stack([here, by_p]))))
-        return replace(state, x=x, force=force, memory=memory, read=tuple(read))
+        kept = [each for each, _ in state.read]
+        whole = np.empty((len(kept), self.segment.dofs, self.shape[1]))
+        whole[..., 1:] = [each.columns for each in kept]
+        whole[..., 0] = whole[..., 1:] @ way + [each.x for each in kept]
+        whole[..., 1:] *= self.rates[moving]
+        moved = [Kept(self.flat, w[:, 0], k.columns) for w, k in zip(whole, kept, strict=True)]
+        read = tuple(zip(moved, self._seen(whole), strict=True))
+        return replace(state, x=x, force=force, memory=memory, read=read)
 
     def _resume(self, state: State) -> None:
         self.row, self.end = state.row, state.end

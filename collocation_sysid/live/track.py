@@ -62,6 +62,7 @@ class Track:
         self.model = model
         self.sweep = Sweep(model, p, prior.joined(model.stated(p)), *self.start)
         self.blocks: list[Block] = []
+        self.points = [self.sweep.flat]
         self.failed = False
         self.rows = 0
         self._off: list[Array] = []
@@ -104,6 +105,11 @@ class Track:
         self.blocks[-1].kept += found
         self.rows += len(found)
         return len(found)
+
+    def turn(self, p: Array) -> None:
+        """Go on from here at another p; what is done stays linearised where it was."""
+        self.sweep = Sweep(self.model, p, self.information, self.sweep.state, self.p)
+        self.points.append(self.sweep.flat)
 
     def read(self, said: Sequence[Said]) -> None:
         """Take what was read after the last rows."""
