@@ -238,7 +238,7 @@ def test_a_row_far_from_its_guess_is_solved_alone():
         whole.again([row])
     assert (
         np.abs(again.blocks[-1].kept[-1].x - whole.blocks[-1].kept[-1].x).max()
-        < 1e-4 * again.sweep.size_m
+        < 1e-4 * live.model.size_m
     )
 
 

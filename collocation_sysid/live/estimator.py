@@ -29,7 +29,8 @@ from ..statistics.trust import GROSS_MISFIT, Concern, Trust
 from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .information import Information
 from .intake import LONGEST, Intake
-from .model import Model, Poses
+from .model import TOGETHER, Model, Poses
+from .pace import Pace
 from .search import SEEN, Search
 from .statistics import Scatter, widened
 from .sweep import LoggedRow, Reading
@@ -52,9 +53,8 @@ TIMES, SLACK = 1.25, 1.0
 SHARE, BLOCKS = 0.8, 12
 # After so many passes that were rejected in a row another start is sought.
 REJECTED = 3
-# What is left after a frame of the longest time that a row took: rows are not begun that might not
-# end within the budget, and one that took long by chance is forgotten.
-FADING = 0.9
+# Times that rows are timed before frames come.
+TIMED = 3
 # Residuals this many times the usual are no noise.
 JUMP = 6.0
 # Frames between two looks at all residuals.
@@ -158,7 +158,7 @@ class Estimator:
         self.log: list[LoggedRow] = []
         self.search = self._search() if problem.parameters.unguessed else None
         self.scatter = Scatter()
-        self._trust, self._rejected, self._row_s = TRUST, 0, 0.0
+        self._trust, self._rejected, self.pace = TRUST, 0, Pace()
         self._away = np.zeros(len(self.names), dtype=np.int64)
         self._rest = self._warmed_up()
 
@@ -298,12 +298,26 @@ class Estimator:
         nowhere[0] = 0.0
         try:
             trial = Track(self.model, self.p, self.prior, self._block_rows)
+            row = LoggedRow(moved, [Reading(0.0, nowhere)])
             for _ in range(self.model.rows + 2):
-                trial.again([LoggedRow(moved, [Reading(0.0, nowhere)])])
+                trial.again([row])
         except SimulationError:
             return None
         self._estimates_at(trial, self.p)
+        self.pace = self._timed(trial, row)
         return poses, trial.blocks[0].kept[0].x
+
+    def _timed(self, trial: Track, row: LoggedRow) -> Pace:
+        """How long rows take that are passed again, the shortest times."""
+        took_s: dict[int, float] = {}
+        most = min(trial.rows - 1, TOGETHER, self._block_rows - 1)
+        for count in (1, most) * TIMED:
+            again = Track(self.model, self.p, self.prior, self._block_rows, trial)
+            again.again([row])
+            began = self.clock()
+            again.again([row] * count)
+            took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
+        return Pace.of(took_s[1], took_s[most], most)
 
     def _begin(self, row: LoggedRow) -> None:
         model, guesses = self.model, []
@@ -403,7 +417,8 @@ class Estimator:
 
     def _pass_again(self, began: float, notes: list[str]) -> int:
         """Go on with a pass in what is left of the budget; how many rows that were."""
-        done, self._row_s = 0, FADING * self._row_s
+        done = 0
+        self.pace.forget()
         while self.track is not None:
             again = self.again or self._wanted(self.track, notes)
             if again is None or not self._left(done, self.clock() - began, again.left):
@@ -420,7 +435,7 @@ class Estimator:
             except SimulationError:
                 again.failed = True
             done += again.rows - were
-            self._row_s = max((self.clock() - before) / left, self._row_s)
+            self.pace.took(left, self.clock() - before)
             if self.search is not None and not self.search.done:
                 if again.failed or again.rows >= min(self.search.rows, len(self.log)):
                     self.search.compare(again)
@@ -433,10 +448,7 @@ class Estimator:
         """Rows that there is time for."""
         if self.options.rows is not None:
             return min(self.options.rows - done, most)
-        left_s = self.budget_s - elapsed_s
-        if left_s <= 0 or not self._row_s:
-            return int(left_s > 0)
-        return int(min(left_s / self._row_s, most))
+        return min(self.pace.rows(self.budget_s - elapsed_s), most)
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
         """Begin a pass where one is wanted."""

@@ -12,9 +12,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from ..arrays import Array
 
+# Triangles are so small that NumPy's checks would take longer than the work.
+_geqrf, _trtrs, _trtri = get_lapack_funcs(("geqrf", "trtrs", "trtri"), dtype=np.float64)
 # Changes of what is held at bounds, for each parameter, before the search for the best ends.
 TURNS = 3
 
@@ -49,8 +52,9 @@ class Information:
     def _with(self, rows: Array, count: int) -> Information:
         if not count:
             return self
-        triangle = np.linalg.qr(np.vstack([self.triangle, rows]), mode="r")
-        return Information(np.asarray(triangle), self.rows + count)
+        size = len(self.triangle)
+        factors, *_ = _geqrf(np.vstack([self.triangle, rows]), lwork=64 * size)
+        return Information(np.triu(factors[:size]), self.rows + count)
 
     def loss(self, p: Array) -> float:
         """Sum of the squares at p."""
@@ -65,7 +69,7 @@ class Information:
         """
         size = len(lower)
         square, right = self.triangle[:size, :size], self.triangle[:size, size]
-        p: Array = np.linalg.solve(square, -right).astype(float)
+        p: Array = _trtrs(square, -right)[0]
         held = np.zeros(size, dtype=bool)
         for _ in range(TURNS * size):
             outside = ~held & ((p < lower) | (p > upper))
@@ -87,7 +91,7 @@ class Information:
     def covariance(self) -> Array:
         """(P, P) of p, for rows whose errors are independent and of size one."""
         size = len(self.triangle) - 1
-        root = np.asarray(np.linalg.inv(self.triangle[:size, :size]), dtype=float)
+        root, _ = _trtri(self.triangle[:size, :size])
         return root @ root.T
 
     @cached_property

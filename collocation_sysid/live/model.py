@@ -112,7 +112,7 @@ class Model:
         """Rows of the start, and those that are linearised at a time."""
         return 2 * self.segment.dynamics.reach + 2 + TOGETHER
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of parameters p."""
         return self.collocation.nq + self.collocation.nphi
@@ -166,7 +166,7 @@ class Model:
         """Samples before and after one that its reading needs."""
         return NEIGHBOURS // 2 if len(self.segment.nuisance.places("time")) else 0
 
-    @property
+    @cached_property
     def reads_plainly(self) -> bool:
         """Whether a marker is read as it is, at its place on the body, if by another clock."""
         return not len(self.segment.nuisance.places("turn", "shift", "offset"))
@@ -198,14 +198,34 @@ class Model:
             still[number] = pose
         return tuple(still)
 
+    @cached_property
+    def room(self) -> Array | None:
+        """For the factor of a row; passes take turns."""
+        return self.solver.factoriser.room(1 + self.segment.body.unsymmetric)
+
+    @cached_property
+    def out(self) -> Array:
+        """For rows that are linearised."""
+        return np.empty((TOGETHER, self.segment.dynamics.forces.linearisation_width))
+
+    @cached_property
+    def size_m(self) -> float:
+        """Of the body, across."""
+        return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
+
     def carried(self, phi: Array) -> tuple[Array, Array]:
         """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
         segment, nuisance = self.segment, self.segment.nuisance
-        nodes, place = np.unique(segment.grasping.dofs // 3, return_inverse=True)
+        nodes, place = self._grasped_nodes
         moved, by_own = nuisance.carried(segment.body.nodes_m[nodes], phi)
         slopes = np.zeros((*moved.shape, len(nuisance.moving)))
         slopes[..., np.flatnonzero(np.isin(nuisance.moving, nuisance.of_grasps))] = by_own
         return moved[place], slopes[place]
+
+    @cached_property
+    def _grasped_nodes(self) -> tuple[Index, Index]:
+        nodes, place = np.unique(self.segment.grasping.dofs // 3, return_inverse=True)
+        return nodes, place
 
     def goals(self, carried: tuple[Array, Array], poses: Sequence[Poses]) -> tuple[Array, Array]:
         """Where grasped dofs are at K poses, (K, g), and the slopes by the φ that move them."""

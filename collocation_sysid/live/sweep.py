@@ -144,16 +144,13 @@ class Sweep:
         collocation, segment = model.collocation, model.segment
         self.segment, self.phi = segment, p[collocation.nq :]
         self.setting = segment.setting(p[: collocation.nq], self.phi)
-        self.dynamics = self.setting.dynamics.first_rows(model.rows)
+        self.dynamics = self.setting.dynamics
         self.carried = model.carried(self.phi)
         self.reading = segment.observation.reading(self.phi)
         self.clock = self._weights_in_time()
         self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.shape = len(self.solver.free), 1 + len(self.moving)
-        self.size_m = float(np.linalg.norm(np.ptp(segment.body.nodes_m, axis=0)))
-        self.room = self.solver.factoriser.room(1 + segment.body.unsymmetric)
-        self.out = np.empty((TOGETHER, self.dynamics.forces.linearisation_width))
         self.mass_kg = self.dynamics.mass.row(0, self.setting.theta)
         self._forces: dict[int, Forces] = {}
         self._rows: dict[int, Row] = {}
@@ -192,9 +189,10 @@ class Sweep:
         whole = np.empty((len(kept), self.segment.dofs, self.shape[1]))
         whole[..., 1:] = [each.columns for each in kept]
         whole[..., 0] = whole[..., 1:] @ way + [each.x for each in kept]
-        whole[..., 1:] *= self.rates[moving]
+        seen = self._seen(whole)
+        seen[..., 1:] *= self.rates[moving]
         moved = [Kept(self.flat, w[:, 0], k.columns) for w, k in zip(whole, kept, strict=True)]
-        read = tuple(zip(moved, self._seen(whole), strict=True))
+        read = tuple(zip(moved, seen, strict=True))
         return replace(state, x=x, force=force, memory=memory, read=read)
 
     def _resume(self, state: State) -> None:
@@ -207,7 +205,7 @@ class Sweep:
     @property
     def is_rough(self) -> bool:
         """Whether rows are off by more than the square of a short correction."""
-        return self.longest_m > LAST_STEP * self.size_m
+        return self.longest_m > LAST_STEP * self.model.size_m
 
     @property
     def state(self) -> State:
@@ -240,7 +238,7 @@ class Sweep:
             self.x[t, self.grasped] = goals[k]
         here, found, last, careful = range(first, first + count), [], np.inf, False
         while here:
-            limit = LAST_STEP * self.size_m * (1 if len(here) == 1 else ROUGH)
+            limit = LAST_STEP * self.model.size_m * (1 if len(here) == 1 else ROUGH)
             linear = self._linearised(here)
             for t in here:
                 before = self.forward.memory
@@ -292,7 +290,7 @@ class Sweep:
         p, q, w, s = (table[rows, known] for table in self.model.stencils)
         x, force = self.x[known], self.force[known]
         nu, acceleration = q @ x, s @ x
-        at = self._forces_on(len(here)).linearise(p @ x, nu, theta, self.out[: len(here)])
+        at = self._forces_on(len(here)).linearise(p @ x, nu, theta, self.model.out[: len(here)])
         force[rows] = at.force
         given = None
         if self.segment.nuisance.moves_grasps:
@@ -322,7 +320,7 @@ class Sweep:
         matrix = row.block(at.by_position[k], at.by_velocity[k], self.solver.pattern)
         skew = row.skew_block(at.by_position_skew[k])
         try:
-            factor = self.solver.factoriser.factorise(matrix, skew, self.room)
+            factor = self.solver.factoriser.factorise(matrix, skew, self.model.room)
         except np.linalg.LinAlgError:
             return np.full(self.shape, np.nan)
         parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
