@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..problem import Problem
 from .information import Information
+
+if TYPE_CHECKING:
+    from ..fem.batched.skyline import Room
 
 # Rows that are linearised at a time, at most.
 TOGETHER = 8
@@ -199,7 +203,7 @@ class Model:
         return tuple(still)
 
     @cached_property
-    def room(self) -> Array | None:
+    def room(self) -> Room | None:
         """For the factor of a row; passes take turns."""
         return self.solver.factoriser.room(1 + self.segment.body.unsymmetric)
 

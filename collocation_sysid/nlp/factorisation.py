@@ -29,7 +29,7 @@ from .lapack import cholesky_in_place
 from .supernodal import Pardiso, SupernodalFactor, library
 
 if TYPE_CHECKING:
-    from ..fem.batched.skyline import Skyline
+    from ..fem.batched.skyline import Room, Skyline
 
 Choice = Literal["auto", "band", "sparse", "supernodal"]
 
@@ -87,15 +87,14 @@ class _SkylineFactor:
     sides: Array
     pivots: Array
     order: Index
+    rank: Index
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         first, second = self.sides[-transposed], self.sides[transposed - 1]
-        rows = np.atleast_2d(right[self.order].T)
-        result = np.empty_like(right)
+        rows = np.atleast_2d(right.take(self.order, axis=0).T)
         solved = self.skyline.solve(first, self.pivots, second, rows)
-        result[self.order] = solved.T.reshape(right.shape)
-        return result
+        return solved.T.take(self.rank, axis=0).reshape(right.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +158,7 @@ class Factoriser:
         ones = np.ones(len(rows))
         graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
         self._order = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True).astype(np.int64)
-        rank = np.empty(self._size, dtype=np.int64)
+        self._rank = rank = np.empty(self._size, dtype=np.int64)
         rank[self._order] = np.arange(self._size)
         low, high = np.minimum(rank[rows], rank[columns]), np.maximum(rank[rows], rank[columns])
         self.half_bandwidth = int((high - low).max(initial=0))
@@ -236,7 +235,7 @@ class Factoriser:
         values[self._full_source[self._full_rows == self._full_columns]] = degree
         return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
-    def factorise(self, values: Array, skew: Array = NONE, room: Array | None = None) -> Factor:
+    def factorise(self, values: Array, skew: Array = NONE, room: Room | None = None) -> Factor:
         """Factorise the matrix with (m,) lower-triangle values, and those of a skew part.
 
         Of a factor in a room that was given, nothing is left when another is put there.
@@ -299,29 +298,31 @@ class Factoriser:
         starts = np.searchsorted(rows[order], np.arange(self._size + 1))
         return starts, columns[order], self._full_source[here][order]
 
-    def room(self, sides: int) -> Array | None:
+    def room(self, sides: int) -> Room | None:
         """Room for a factor, of two sides where the matrix is not symmetric, if it can be given."""
         return self.skyline.room(sides) if self.skyline else None
 
-    def _within(self, values: Array, skew: Array, room: Array | None) -> Factor | None:
+    def _within(self, values: Array, skew: Array, room: Room | None) -> Factor | None:
         """The factor within the skyline, unless the matrix needs exchanges of rows."""
         skyline = self.skyline
         if skyline is None:
             return None
-        count = 2 if skew.size else 1
-        sides = skyline.room(count) if room is None else room[:count]
-        pivots, growth = skyline.factorise(sides, values, skew)
+        room = room or skyline.room(2 if skew.size else 1)
+        pivots, growth = skyline.factorise(room, values, skew)
         # What is not finite in the matrix is not in its pivots.
-        if not ((pivots > 0) & (pivots < np.inf) & (growth < GROWTH)).all():
+        if not (pivots.min() > 0 and pivots.max() < np.inf):
             return None
-        return _SkylineFactor(skyline, sides, pivots, self._order)
+        if skew.size and not (growth < GROWTH).all():
+            return None
+        sides = room.sides[: 2 if skew.size else 1]
+        return _SkylineFactor(skyline, sides, pivots, self._order, self._rank)
 
     def factorise_each(
         self,
         matrix: Callable[[int], tuple[Array, Array]],
         count: int,
         threads: int,
-        rooms: Sequence[Array | None] = (),
+        rooms: Sequence[Room | None] = (),
     ) -> list[Factor]:
         """Factorise `count` matrices, side by side on threads; matrix(k) gives both parts' values.
 

@@ -10,8 +10,9 @@ so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `nlp.schemes
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,15 +27,15 @@ class Row:
 
     Attributes
     ----------
-    p, q, w, s : (reach + 1,) stencil, by lag
+    p, q, w, s : floats of the stencil, by lag
     r : float
     mass_kg : (3n,) of every dof
     """
 
-    p: Array
-    q: Array
-    w: Array
-    s: Array
+    p: tuple[float, ...]
+    q: tuple[float, ...]
+    w: tuple[float, ...]
+    s: tuple[float, ...]
     r: float
     mass_kg: Array
 
@@ -42,14 +43,15 @@ class Row:
     def of(cls, dynamics: Dynamics, t: int, theta: Array) -> Row:
         """Row t of the tables, with the mass at θ."""
         tables, step_s = dynamics.tables, dynamics.step_s
-        return cls(
-            tables.p[t],
-            tables.q[t] / step_s,
-            tables.w[t],
-            tables.s[t] / step_s**2,
-            float(tables.r[t]) / step_s,
-            dynamics.mass.row(t, theta),
-        )
+        p, w = tables.p[t], tables.w[t]
+        q, s = tables.q[t] / step_s, tables.s[t] / step_s**2
+        stencil = (tuple(each.tolist()) for each in (p, q, w, s))
+        return cls(*stencil, float(tables.r[t]) / step_s, dynamics.mass.row(t, theta))
+
+    @cached_property
+    def lags(self) -> list[int]:
+        """Lags from one on that the evaluation of the force depends on."""
+        return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
     def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:
         """Lower triangle (m,) of −∂c_t/∂x_t from those of G and C."""
@@ -63,7 +65,7 @@ class Row:
         return -self.w[0] * self.p[0] * by_position_skew
 
 
-def weighted(coefficients: Array, past: Iterable[Array], shape: tuple[int, ...]) -> Array:
+def weighted(coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]) -> Array:
     """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""
     terms = [c * item for c, item in zip(coefficients[1:], past, strict=False) if c]
     if not terms:

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,6 +37,9 @@ from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
 from .unsymmetric import both_triangles, in_both_triangles, signs_by_column, signs_by_row
+
+if TYPE_CHECKING:
+    from ..fem.batched.skyline import Room
 
 # Element results and factors of this size at most are kept at a time.
 CHUNK_BYTES = 128e6
@@ -388,7 +392,7 @@ class BlockSolver:
         at: Linearisation,
         here: slice,
         rows: list[Row],
-        rooms: Sequence[Array | None] = (),
+        rooms: Sequence[Room | None] = (),
     ) -> list[Factor]:
         pattern, taken = self.pattern, dynamics.taken[here]
 
@@ -568,12 +572,14 @@ class Forward:
         """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
         t, solver = step.t, self.solver
         row = step.row
-        w, s, mass = row.w, row.s, row.mass_kg[solver.free, None]
-        right += weighted(w, self.past_increments, self.shape)
+        w, s, mass = row.w, row.s, row.mass_kg.take(solver.free)[:, None]
+        if self.weighs_past:
+            right += weighted(w, self.past_increments, self.shape)
         right -= mass * weighted(s, self.past, self.shape)
         if self.slopes is not None:
             force = force + self.slopes.force()
-        forced = force[solver.free] + self._of_past(step, row)
+        forced = force.take(solver.free, axis=0)
+        forced += self._of_past(step, row)
         if given is not None:
             forced += given.force(solver, step)
         solver.without_taken(t, right)
@@ -602,28 +608,31 @@ class Forward:
         held.slopes[t] += rows.of(step.by_velocity, NONE) @ rate
 
     def _evaluated(
-        self, weights: Array, solution: Array, t: int, given: GivenMotion | None, order: int
+        self,
+        weights: Sequence[float],
+        solution: Array,
+        t: int,
+        given: GivenMotion | None,
+        order: int,
     ) -> Array:
         """Σ_i weights[i] Y_{t−i} (3n, columns) of all dofs: how ξ, or ν, of row t changes."""
         found = np.zeros((self.solver.pattern.size, self.shape[1]))
-        of_past = weighted(weights, self.past, self.shape) if weights[1:].any() else 0.0
-        found[self.solver.free] = weights[0] * solution + of_past
+        found[self.solver.free] = weights[0] * solution + weighted(weights, self.past, self.shape)
         if given is not None:
             found[given.held_dofs] = given.of_evaluations[order][t, given.places < 0]
         return found
 
     def _of_past(self, step: Step, row: Row) -> Array:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
-        p, q = row.p[1:], row.q[1:]
-        lags = [i for i, weights in enumerate(zip(p, q, strict=True)) if any(weights)]
-        if not lags:
+        if not row.lags:
             return np.zeros(self.shape)
-        if len(lags) == 1:
-            i = lags[0]
-            block = p[i] * step.by_position + q[i] * step.by_velocity
-            return self.solver.apply(block, self.past[i], p[i] * step.skew)
+        if len(row.lags) == 1:
+            (i,) = row.lags
+            block = row.p[i] * step.by_position
+            block += row.q[i] * step.by_velocity
+            return self.solver.apply(block, self.past[i - 1], row.p[i] * step.skew)
         total = self.solver.apply(step.by_velocity, weighted(row.q, self.past, self.shape))
-        if p.any():
+        if any(row.p[1:]):
             past = weighted(row.p, self.past, self.shape)
             total += self.solver.apply(step.by_position, past, step.skew)
         return total

@@ -71,39 +71,42 @@ class Skyline:
         self._kernels = {k: (_compiled("fill", k), _compiled("factorise", k)) for k in (1, 2)}
         self._solve = _compiled("solve", 1)
 
-    def room(self, sides: int) -> Array:
-        """Zeros (sides, n, width) for the sides of a matrix; a symmetric one needs one."""
-        numbers = sides * math.prod(self.shape)
+    def room(self, sides: int) -> Room:
+        """Memory for the sides of a matrix; a symmetric one needs one."""
+        numbers, (size, width) = sides * math.prod(self.shape), self.shape
         memory = np.zeros(numbers + LINE_BYTES // 8)
         start = -memory.ctypes.data % LINE_BYTES // 8
-        return memory[start : start + numbers].reshape(sides, *self.shape)
+        return Room(
+            memory[start : start + numbers].reshape(sides, *self.shape),
+            np.zeros((2, size + width)),
+        )
 
-    def factorise(self, sides: Array, symmetric: Array, skew: Array) -> tuple[Array, Array]:
-        """Make `sides` L and U without their diagonals of ones.
+    def factorise(self, room: Room, symmetric: Array, skew: Array) -> tuple[Array, Array]:
+        """Make L and U without their diagonals of ones in a room, of a symmetric matrix only L.
 
         Parameters
         ----------
-        sides : (1, n, width) for a symmetric matrix, or (2, n, width)
-        symmetric, skew : values of the matrix's two parts; the latter is only read for two sides
+        room : Room
+        symmetric, skew : values of the matrix's two parts; without a skew one the latter is empty
 
         Returns
         -------
-        pivots : (n,) D
+        pivots : (n,) D, in the room
         growth : (n,) Σ_k |L_ik D_k U_ik| / A_ii
             How many times itself a diagonal entry has changed at most; of a symmetric matrix zero.
         """
-        size, width = self.shape
-        sides.fill(0)
-        fill, factorise = self._kernels[len(sides)]
+        (size, width), count = self.shape, 2 if skew.size else 1
+        room.sides[:count].fill(0)
+        room.results.fill(0)
+        fill, factorise = self._kernels[count]
         parts = [np.ascontiguousarray(part, dtype=float) for part in (symmetric, skew)]
-        results = np.zeros((2, size + width))
-        ends = _addresses(sides[0], sides[-1])
+        ends = room.ends[:1] * 2 if count == 1 else room.ends
         fill(len(self._source), *self._fixed, *_addresses(*parts), *ends)
-        factorise(size, width, self._reached, *ends, *_addresses(*results))
-        pivots, growth = results[:, :size]
-        if len(sides) == 2:
+        factorise(size, width, self._reached, *ends, *room.results_at)
+        pivots, growth = room.results[:, :size]
+        if count == 2:
             with np.errstate(divide="ignore", invalid="ignore"):
-                growth /= symmetric[self._diagonal]
+                growth = growth / symmetric[self._diagonal]
         return pivots, growth
 
     def solve(self, first: Array, pivots: Array, second: Array, right: Array) -> Array:
@@ -114,6 +117,20 @@ class Skyline:
         arrays = first, second, pivots, rows
         self._solve(size, width, *rows.shape, self._reached, *_addresses(*arrays))
         return rows[:, :size]
+
+
+class Room:
+    """Memory of one factor.
+
+    Parameters
+    ----------
+    sides : (1, n, width) for a symmetric matrix, or (2, n, width)
+    results : (2, n + width) pivots and growth
+    """
+
+    def __init__(self, sides: Array, results: Array) -> None:
+        self.sides, self.results = sides, results
+        self.ends, self.results_at = _addresses(*sides), _addresses(*results)
 
 
 def _addresses(*arrays: NDArray[Any]) -> list[int]:
