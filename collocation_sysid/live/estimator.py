@@ -420,13 +420,17 @@ class Estimator:
         done = 0
         self.pace.forget()
         while self.track is not None:
-            again = self.again or self._wanted(self.track, notes)
-            if again is None or not self._left(done, self.clock() - began, again.left):
+            begins = self.clock()
+            if self.again is None and self._left(done, begins - began + self.pace.turn_s):
+                self.again = self._wanted(self.track, notes)
+                self.pace.turned(self.clock() - begins)
+            again = self.again
+            if again is None:
                 break
-            if again.rows and again.base is not None and not done:
-                self._turn(self.track, again)
+            if not done:
+                self._turn(self.track, again, began)
             before = self.clock()
-            left = self._left(done, before - began, again.left)
+            left = min(self._left(done, before - began), again.left)
             if not left:
                 break
             were = again.rows
@@ -444,11 +448,11 @@ class Estimator:
                 self._judge(self.track, again, notes)
         return done
 
-    def _left(self, done: int, elapsed_s: float, most: int) -> int:
+    def _left(self, done: int, elapsed_s: float) -> int:
         """Rows that there is time for."""
         if self.options.rows is not None:
-            return min(self.options.rows - done, most)
-        return min(self.pace.rows(self.budget_s - elapsed_s), most)
+            return self.options.rows - done
+        return self.pace.rows(self.budget_s - elapsed_s)
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
         """Begin a pass where one is wanted."""
@@ -472,16 +476,22 @@ class Estimator:
             p = self._next(track)
             if self._apart(track, p, track.points) <= MOVED and not track.sweep.is_rough:
                 return None
-        self.again = Track(self.model, p, track.prior, self._block_rows, base)
-        return self.again
+        return Track(self.model, p, track.prior, self._block_rows, base)
 
-    def _turn(self, track: Track, again: Track) -> None:
-        """Go on with a pass where the estimate is now, if that is far from where it was."""
+    def _turn(self, track: Track, again: Track, began: float) -> None:
+        """Go on with a pass where the estimate is now, if that is far, and time is left then."""
         here = [again.sweep.flat]
-        if self._apart(track, self.p, here) > TURN:
-            p = self._next(track)
-            if self._apart(track, p, here) > TURN:
-                again.turn(p)
+        if again.base is None or again.rows < again.turned + TOGETHER:
+            return
+        if self._apart(track, self.p, here) <= TURN:
+            return
+        before = self.clock()
+        if not self._left(0, before - began + self.pace.turn_s):
+            return
+        p = self._next(track)
+        if self._apart(track, p, here) > TURN:
+            again.turn(p)
+            self.pace.turned(self.clock() - before)
 
     def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
         """Take a pass that has caught up in place of the first, or not."""

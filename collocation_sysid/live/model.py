@@ -20,8 +20,10 @@ from ..experiment.poses import PoseSequence
 from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
 from ..nlp.collocation import Collocation
+from ..nlp.forces import Forces
 from ..nlp.newton import NewtonOptions, Solver
 from ..nlp.observation import NEIGHBOURS, Observation
+from ..nlp.row import Row
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..problem import Problem
@@ -201,6 +203,16 @@ class Model:
         for number, pose in zip(self.moved_grasps, moved, strict=True):
             still[number] = pose
         return tuple(still)
+
+    @cached_property
+    def forces(self) -> Forces:
+        """On one row, as the problem has gravity."""
+        return self.segment.dynamics.forces.rows(slice(1))
+
+    @cached_property
+    def known_rows(self) -> dict[int, Row]:
+        """Rows whose masses are always the same, by number."""
+        return {}
 
     @cached_property
     def room(self) -> Room | None:

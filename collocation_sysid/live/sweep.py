@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..methods.robust import huberised
-from ..nlp.forces import Forces
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.rest import start_state
@@ -152,8 +151,10 @@ class Sweep:
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.shape = len(self.solver.free), 1 + len(self.moving)
         self.mass_kg = self.dynamics.mass.row(0, self.setting.theta)
-        self._forces: dict[int, Forces] = {}
-        self._rows: dict[int, Row] = {}
+        # Loads are always there: what acts on one row acts on every one.
+        still = self.dynamics.forces is segment.dynamics.forces
+        self.forces = model.forces if still else self.dynamics.forces.rows(slice(1))
+        self._rows = {} if self.setting.mass_moves else model.known_rows
         self.information = known
         state = self._begin() if start is None or at is None else self._moved(start, at)
         self._resume(state)
@@ -290,7 +291,7 @@ class Sweep:
         p, q, w, s = (table[rows, known] for table in self.model.stencils)
         x, force = self.x[known], self.force[known]
         nu, acceleration = q @ x, s @ x
-        at = self._forces_on(len(here)).linearise(p @ x, nu, theta, self.model.out[: len(here)])
+        at = self.forces.linearise(p @ x, nu, theta, self.model.out[: len(here)])
         force[rows] = at.force
         given = None
         if self.segment.nuisance.moves_grasps:
@@ -301,13 +302,6 @@ class Sweep:
         right[..., 1:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
         slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta, nu)
         return Linear(here.start, at, nu, right, slopes, given)
-
-    # Loads are always there: what acts on some rows is what acts on as many others.
-
-    def _forces_on(self, count: int) -> Forces:
-        if count not in self._forces:
-            self._forces[count] = self.dynamics.forces.rows(slice(count))
-        return self._forces[count]
 
     def _row(self, t: int) -> Row:
         if t not in self._rows:

@@ -64,7 +64,7 @@ class Track:
         self.blocks: list[Block] = []
         self.points = [self.sweep.flat]
         self.failed = False
-        self.rows = 0
+        self.rows = self.turned = 0
         self._off: list[Array] = []
 
     @property
@@ -110,6 +110,7 @@ class Track:
         """Go on from here at another p; what is done stays linearised where it was."""
         self.sweep = Sweep(self.model, p, self.information, self.sweep.state, self.p)
         self.points.append(self.sweep.flat)
+        self.turned = self.rows
 
     def read(self, said: Sequence[Said]) -> None:
         """Take what was read after the last rows."""
