@@ -44,6 +44,7 @@ STAY = 0.5
 MOVED = 0.1
 # And this far from where a pass is, its later rows are done there.
 TURN = 1.0
+MAIN = True
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than so many times, and this above, what it
@@ -212,6 +213,8 @@ class Estimator:
             notes, rows = notes + said, rows[done:]
         notes += self._read(readings, squares)
         self._estimate()
+        if MAIN and self.track is not None and not self.track.failed and self.search is None:
+            self._turn(self.track, self.track, began)
         done = self._pass_again(began, notes)
         self._shorten()
         near = np.concatenate([*squares, np.zeros(0)])
@@ -427,7 +430,7 @@ class Estimator:
             again = self.again
             if again is None:
                 break
-            if not done:
+            if not done and again.base is not None:
                 self._turn(self.track, again, began)
             before = self.clock()
             left = min(self._left(done, before - began), again.left)
@@ -478,27 +481,29 @@ class Estimator:
                 return None
         return Track(self.model, p, track.prior, self._block_rows, base)
 
-    def _turn(self, track: Track, again: Track, began: float) -> None:
+    def _turn(self, track: Track, turned: Track, began: float) -> None:
         """Go on with a pass where the estimate is now, if that is far, and time is left then."""
-        here = [again.sweep.flat]
-        if again.base is None or again.rows < again.turned + TOGETHER:
-            return
-        if self._apart(track, self.p, here) <= TURN:
+        here = [turned.sweep.flat]
+        if turned.rows < turned.turned + TOGETHER or self._apart(track, self.p, here) <= TURN:
             return
         before = self.clock()
-        if not self._left(0, before - began + self.pace.turn_s):
+        if self.options.rows is None and not self._left(0, before - began + self.pace.turn_s):
             return
         p = self._next(track)
         if self._apart(track, p, here) > TURN:
-            again.turn(p)
+            turned.turn(p)
             self.pace.turned(self.clock() - before)
 
     def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
         """Take a pass that has caught up in place of the first, or not."""
         self.again = None
         sought, self.search = self.search is not None, None
-        expected = max(track.loss, track.loss_at(again.p))
-        if not again.failed and (track.failed or again.loss <= TIMES * expected + SLACK):
+        points = [*track.points, again.points[0]]
+        expected = max(track.information.loss(point) for point in points)
+        # Of a pass that turned the sum of squares is not that of a simulation.
+        near = track.turned and self._apart(track, track.p, again.points) <= MOVED
+        fits = track.failed or near or again.loss <= TIMES * expected + SLACK
+        if not again.failed and fits:
             again.base, self.track = None, again
             self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
             self._rejected = 0

@@ -24,7 +24,7 @@ from ..methods.robust import huberised
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.rest import start_state
-from ..nlp.row import Row
+from ..nlp.row import Row, blocks
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
 from .information import Information
 from .model import TOGETHER, Model, Poses
@@ -232,29 +232,29 @@ class Sweep:
         self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
         if first < self.dynamics.first_row:
             self.x[first] = self._start(poses[0])
-            self._correct(first, np.zeros(self.shape))
-            return self._kept([np.zeros(self.shape)])
+            nothing = np.zeros((1, *self.shape))
+            self._correct(range(first, first + 1), nothing, nothing)
+            return self._kept(nothing)
         for k, t in enumerate(range(first, first + count)):
             self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
             self.x[t, self.grasped] = goals[k]
         here, found, last, careful = range(first, first + count), [], np.inf, False
         while here:
             limit = LAST_STEP * self.model.size_m * (1 if len(here) == 1 else ROUGH)
-            linear = self._linearised(here)
-            for t in here:
-                before = self.forward.memory
-                columns = self._columns(t, linear)
-                length = float(np.abs(columns[:, 0]).max(initial=0.0))
-                if not length <= limit:
-                    break
-                self.longest_m = max(self.longest_m, length)
-                self._correct(t, columns)
-                found.append(columns)
-            else:
+            before = self.forward.memory
+            columns, increments = self._columns(here, self._linearised(here))
+            lengths = np.abs(columns[..., 0]).max(axis=1, initial=0.0)
+            short = lengths <= limit
+            good = len(here) if short.all() else int(short.argmin())
+            self.longest_m = float(lengths[:good].max(initial=self.longest_m))
+            self._correct(here[:good], columns[:good], increments[:good])
+            found += list(columns[:good])
+            if good == len(here):
                 break
-            self.forward = Forward(self.solver, self.setting, self.shape, before)
+            t, length = here[good], lengths[good]
+            self.forward = self._continued(before, columns[:good], increments[:good])
             if length < last / 2:
-                self.x[t, self.solver.free] += columns[:, 0]
+                self.x[t, self.solver.free] += columns[good, :, 0]
                 last = length
             elif not careful:
                 self.x[t], careful, last = self._carefully(t, poses[t - first]), True, np.inf
@@ -262,6 +262,15 @@ class Sweep:
                 self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
             here = range(t, t + 1)
         return self._kept(found)
+
+    def _continued(self, before: Memory, columns: Array, increments: Array) -> Forward:
+        """What goes on after rows that are done, and those before."""
+        solutions, forces = (
+            (*list(new)[::-1], *old)[: len(old)]
+            for new, old in ((columns, before.solutions), (increments, before.increments))
+        )
+        memory = replace(before, solutions=solutions, increments=forces)
+        return Forward(self.solver, self.setting, self.shape, memory)
 
     def _make_room(self, count: int) -> int:
         surplus = self.end + count - self.model.rows
@@ -308,28 +317,37 @@ class Sweep:
             self._rows[t] = Row.of(self.dynamics, t, self.setting.theta)
         return self._rows[t]
 
-    def _columns(self, t: int, linear: Linear) -> Array:
-        """The correction of row t, and its columns, (free, 1 + m); NaN where it is singular."""
-        k, at, row = t - linear.first, linear.at, self._row(t)
-        matrix = row.block(at.by_position[k], at.by_velocity[k], self.solver.pattern)
-        skew = row.skew_block(at.by_position_skew[k])
-        try:
-            factor = self.solver.factoriser.factorise(matrix, skew, self.model.room)
-        except np.linalg.LinAlgError:
-            return np.full(self.shape, np.nan)
-        parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
-        step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
-        return self.forward.advance(step, linear.right[k], linear.force[k], linear.given)
+    def _columns(self, here: range, linear: Linear) -> tuple[Array, Array]:
+        """Corrections of rows and their columns, (k, free, 1 + m), and increments of the force.
 
-    def _correct(self, t: int, columns: Array) -> None:
-        """Correct row t, and be done with it."""
-        self.x[t, self.solver.free] += columns[:, 0]
+        NaN from a row on that is singular.
+        """
+        rows, at, forward = [self._row(t) for t in here], linear.at, self.forward
+        found = np.full((2, len(here), *self.shape), np.nan)
+        matrices, skews = blocks(rows, at, self.solver.pattern)
+        for k, t in enumerate(here):
+            try:
+                factor = self.solver.factoriser.factorise(matrices[k], skews[k], self.model.room)
+            except np.linalg.LinAlgError:
+                break
+            parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
+            step = Step(t, rows[k], *parts, factor, at.by_position_skew[k], linear.nu[k])
+            right, force = linear.right[k], linear.force[k]
+            found[0, k] = forward.advance(step, right, force, linear.given)
+            if forward.weighs_past:
+                found[1, k] = forward.past_increments[0]
+        return found[0], found[1]
+
+    def _correct(self, here: range, columns: Array, increments: Array) -> None:
+        """Correct rows, and be done with them."""
+        done, free = slice(here.start, here.stop), self.solver.free
+        self.x[done, free] += columns[..., 0]
         if self.forward.weighs_past:
-            # What the row says F_t is then.
-            self.force[t, self.solver.free] += self.forward.past_increments[0][:, 0]
-        self.row, self.end = self.row + 1, t + 1
+            # What the rows say F_t is then.
+            self.force[done, free] += increments[..., 0]
+        self.row, self.end = self.row + len(here), here.stop
 
-    def _kept(self, columns: Sequence[Array]) -> list[Kept]:
+    def _kept(self, columns: Sequence[Array] | Array) -> list[Kept]:
         """The last rows, whose columns (free, 1 + m) these are."""
         here = slice(self.end - len(columns), self.end)
         whole = np.zeros((len(columns), self.segment.dofs, self.shape[1]))

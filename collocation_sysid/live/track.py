@@ -80,11 +80,7 @@ class Track:
     @property
     def loss(self) -> float:
         """Of what was measured and of the prior, at its own p."""
-        return self.loss_at(self.p)
-
-    def loss_at(self, p: Array) -> float:
-        """The same to first order at another p."""
-        return self.information.loss(self.model.flat(p))
+        return self.information.loss(self.sweep.flat)
 
     def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> int:
         """Go on by rows of one block; how many it did. Their readings are taken by `read`.
