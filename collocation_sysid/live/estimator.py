@@ -44,7 +44,7 @@ STAY = 0.5
 MOVED = 0.1
 # And this far from where a pass is, its later rows are done there.
 TURN = 1.0
-MAIN = True
+MAIN = 3.0
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than so many times, and this above, what it
@@ -214,7 +214,7 @@ class Estimator:
         notes += self._read(readings, squares)
         self._estimate()
         if MAIN and self.track is not None and not self.track.failed and self.search is None:
-            self._turn(self.track, self.track, began)
+            self._turn(self.track, self.track, began, MAIN)
         done = self._pass_again(began, notes)
         self._shorten()
         near = np.concatenate([*squares, np.zeros(0)])
@@ -431,7 +431,7 @@ class Estimator:
             if again is None:
                 break
             if not done and again.base is not None:
-                self._turn(self.track, again, began)
+                self._turn(self.track, again, began, TURN)
             before = self.clock()
             left = min(self._left(done, before - began), again.left)
             if not left:
@@ -481,16 +481,16 @@ class Estimator:
                 return None
         return Track(self.model, p, track.prior, self._block_rows, base)
 
-    def _turn(self, track: Track, turned: Track, began: float) -> None:
+    def _turn(self, track: Track, turned: Track, began: float, far: float) -> None:
         """Go on with a pass where the estimate is now, if that is far, and time is left then."""
         here = [turned.sweep.flat]
-        if turned.rows < turned.turned + TOGETHER or self._apart(track, self.p, here) <= TURN:
+        if turned.rows < turned.turned + TOGETHER or self._apart(track, self.p, here) <= far:
             return
         before = self.clock()
         if self.options.rows is None and not self._left(0, before - began + self.pace.turn_s):
             return
         p = self._next(track)
-        if self._apart(track, p, here) > TURN:
+        if self._apart(track, p, here) > far:
             turned.turn(p)
             self.pace.turned(self.clock() - before)
 

@@ -174,13 +174,9 @@ class Sweep:
         was, way = self.model.rates(flat), (self.flat - flat)[moving]
         step, grown = way / was[moving], np.ones(self.shape[1])
         grown[1:] = (self.rates / was)[moving]
-        x, force, free = state.x.copy(), state.force.copy(), self.solver.free
-        last, memory = state.end - 1, state.memory
-        x[:, self.grasped] += state.given[..., 1:] @ step
-        for k, columns in enumerate(memory.solutions[: last + 1]):
-            x[last - k, free] += columns[:, 1:] @ step
+        force, memory, last = state.force.copy(), state.memory, state.end - 1
         for k, columns in enumerate(memory.increments[: last + 1]):
-            force[last - k, free] += columns[:, 1:] @ step
+            force[last - k, self.solver.free] += columns[:, 1:] @ step
         solutions, increments = (
             tuple(columns * grown for columns in each)
             for each in (memory.solutions, memory.increments)
@@ -190,6 +186,8 @@ class Sweep:
         whole = np.empty((len(kept), self.segment.dofs, self.shape[1]))
         whole[..., 1:] = [each.columns for each in kept]
         whole[..., 0] = whole[..., 1:] @ way + [each.x for each in kept]
+        x, known = state.x.copy(), min(len(kept), state.end)
+        x[state.end - known : state.end] = whole[len(kept) - known :, :, 0]
         seen = self._seen(whole)
         seen[..., 1:] *= self.rates[moving]
         moved = [Kept(self.flat, w[:, 0], k.columns) for w, k in zip(whole, kept, strict=True)]
