@@ -81,7 +81,7 @@ def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame])
         again.append(update.relinearised)
         if abs(frame.t_s - EARLY_S) < 1e-6:
             early = update
-    row_s = _row_s(problem)
+    settled, row_s = live.settle() or update, _row_s(problem)
     median, late = 1e3 * np.percentile(took, [50, 99])
     print(f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again")
     print(f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms")
@@ -92,14 +92,19 @@ def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame])
     batch = covariance(solution.collocation, solution.z).estimates
     for key, true in TRUTH[name].items():
         found, known = update.estimates[key], batch[key]
-        apart = abs(found.value - known.value) / (known.std_error or np.nan)
+        apart, at_last = (
+            abs(each.value - known.value) / (known.std_error or np.nan)
+            for each in (found, settled.estimates[key])
+        )
         off = 100 * (early.estimates[key].value / true - 1)
         error = known.std_error or np.nan
         print(
             f"    {key}: {found.value:.5g}, batch {known.value:.5g} ± {error:.2g}: "
-            f"{apart:.3f} standard errors apart; {off:+.1f} % from the truth at {EARLY_S:g} s"
+            f"{apart:.3f} standard errors apart, settled {at_last:.3f}; "
+            f"{off:+.1f} % from the truth at {EARLY_S:g} s"
         )
     print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
+    print(f"    settled in {1e3 * settled.latency_s:.0f} ms: {settled.trust.verdict}")
 
 
 def _row_s(problem: Problem) -> float:

@@ -32,6 +32,7 @@ from collocation_sysid.live import (
 )
 from collocation_sysid.live.information import Information
 from collocation_sysid.live.intake import Intake
+from collocation_sysid.live.pace import Pace
 from collocation_sysid.live.sources import as_json, datagrams, paced, recorded
 from collocation_sysid.live.track import Track
 from collocation_sysid.methods.horizon import Horizon
@@ -101,14 +102,11 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     assert live.track.information.rows == measured + priors
 
 
-def test_passes_end_where_the_batch_does():
+def test_when_frames_end_the_estimate_settles_at_the_batchs():
     problem = swing()
-    live = Estimator(problem, NO_TIME)
-    *most, last = frames_of(problem, live)
-    for frame in most:
-        live.take(frame)
-    live.budget_s = np.inf
-    update = live.take(last)
+    live = streamed(problem)
+    update = live.settle()
+    assert update is not None
     solution = cs.solve(problem, ReducedSpace())
     batch = covariance(solution.collocation, solution.z).estimates
     for name, estimate in update.estimates.items():
@@ -117,6 +115,53 @@ def test_passes_end_where_the_batch_does():
         assert estimate.std_error == pytest.approx(known.std_error, rel=0.1)
     assert update.trust.verdict == "good", update.trust.reasons
     assert update.relinearised > 0
+    assert live.budget_s == NO_TIME.budget_s
+
+
+def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
+    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    problem = swing(nuisance=Nuisance())
+    live = streamed(problem)
+    half, errors = len(live.log) // 2, []
+    for size in (1e-3, 5e-4):
+        p = live.track.p + size
+        whole, turned = (Track(live.model, at, live.prior, 99) for at in (p, live.track.p))
+        for number, row in enumerate(live.log):
+            if number == half:
+                turned.turn(p)
+            turned.again([row])
+            whole.again([row])
+        assert len(turned.points) == 2
+        ends = (each.blocks[-1].kept[-1].x for each in (turned, whole))
+        errors.append(np.abs(np.subtract(*ends)).max())
+        scale = np.sqrt(np.diag(normal_equations(whole.information.triangle)))
+        ours, theirs = (normal_equations(t.information.triangle) for t in (turned, whole))
+        np.testing.assert_allclose(
+            ours / np.outer(scale, scale), theirs / np.outer(scale, scale), atol=1e-2
+        )
+    assert 0 < errors[1] < 0.3 * errors[0] < 1e-5  # of second order
+
+
+def test_two_rows_passed_again_a_frame_follow_the_batch():
+    problem = swing()
+    live = Estimator(problem, LiveOptions(rows=2))
+    for frame in frames_of(problem, live):
+        update = live.take(frame)
+    solution = cs.solve(problem, ReducedSpace())
+    batch = covariance(solution.collocation, solution.z).estimates
+    for name, estimate in update.estimates.items():
+        assert abs(estimate.value - batch[name].value) < 0.5 * batch[name].std_error
+
+
+def test_rows_are_begun_that_end_in_time():
+    pace = Pace.of(one_s=2.0, many_s=9.0, many=8)
+    assert [pace.rows(left_s) for left_s in (0.0, 1.9, 2.1, 4.1)] == [0, 0, 1, 3]
+    pace.took(3, 8.0)
+    assert pace.rows(4.1) == 1
+    for _ in range(9):
+        pace.forget()
+    assert pace.rows(4.1) == 3
+    assert Pace().rows(1e-3) == 1
 
 
 def test_an_update_of_the_triangle_is_the_sum_of_the_normal_equations(rng):
@@ -556,15 +601,16 @@ def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
     expected = [json.loads(as_json(live.take(f))) for f in frames_of(problem, live)]
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
     ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
-    found = [json.loads(line) for line in ended.out.splitlines()]
+    *found, settled = [json.loads(line) for line in ended.out.splitlines()]
     assert [each["t_s"] for each in found] == [each["t_s"] for each in expected]
     assert found[-1]["parameters"] == expected[-1]["parameters"]
+    assert "settled after the last frame" in settled["notes"]
     assert ended.code == 0
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines[:2], "{", lines[2]])))
     ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
     assert ended.code == 2
     assert "standard input, line 3: no JSON" in ended.err
-    assert len(ended.out.splitlines()) == 3
+    assert len(ended.out.splitlines()) == 3 + 1
 
 
 def test_a_recording_is_replayed_and_filmed(tiny):

@@ -50,7 +50,7 @@ def live(
     set_: Overrides = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Identify while the recording is made: frames in, a line of JSON for each out.
+    """Identify while the recording is made: frames in, a line of JSON for each out, one at the end.
 
     A frame is a line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z,
     w]}, "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m, y_m,
@@ -79,6 +79,8 @@ def live(
             continue
         if frame is not None:
             typer.echo(as_json(estimator.take(frame)))
+    if (settled := estimator.settle()) is not None:
+        typer.echo(as_json(settled))
     if bad:
         raise typer.Exit(EXIT_BAD_INPUT)
 
@@ -136,8 +138,11 @@ def replay(
                 typer.echo(json_line(updates[-1]))
             elif watched:
                 shown.update(view.picture(updates))
-    if not as_json:
-        show(view.summary(updates))
+    settled = estimator.settle() or updates[-1]
+    if as_json:
+        typer.echo(json_line(settled))
+    else:
+        show(view.summary(updates, settled))
     if film is not None:
         typer.echo(view.film(updates, film))
 

@@ -1,17 +1,21 @@
 """Parameters while the recording is being made: one frame in, one estimate out.
 
-All frames are linearised at one p; the estimate is the Gauss–Newton step from there, within bounds
-and a trust region. When it has moved, what the window holds is passed again at the estimate, in
-what is left of each frame's time, until that pass has caught up: it takes the place of the first
-where the sum of squares is less, and else the trust region shrinks. So each pass is an iteration
-of the reduced-space method on all that has come, and what it converges to is the batch's answer.
+All frames are linearised near one p; the estimate is the Gauss–Newton step from there, within
+bounds and a trust region. When it has moved, what the window holds is passed again at the
+estimate, in what is left of each frame's time, until that pass has caught up: it takes the place
+of the first where the sum of squares is less, and else the trust region shrinks. So each pass is
+an iteration of the reduced-space method on all that has come, and what they converge to is the
+batch's answer.
+
+The estimate does not wait for that: both passes turn to where it is now, and go on from a state
+that has moved along its slopes, as in an extended Kalman filter; another pass then follows.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -42,9 +46,8 @@ from .trust import UNSETTLED, data_concerns, estimate_concerns
 STAY = 0.5
 # Estimates this far from where all is linearised, in standard errors, begin another pass.
 MOVED = 0.1
-# And this far from where a pass is, its later rows are done there.
-TURN = 1.0
-MAIN = 3.0
+# Passes turn where the estimate is so far from them: one that is catching up, and the first.
+TURN, TURN_FIRST = 1.0, 3.0
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than so many times, and this above, what it
@@ -148,6 +151,7 @@ class Estimator:
         self.intake = Intake(model.interval_s, model.substeps, model.samples_around)
         self.counts, self.samples = self.intake.counts, 0
         self.budget_s = options.budget_s or SHARE * model.interval_s
+        self.rows = options.rows
         samples = max(LONGEST, round(options.window_s / model.interval_s / BLOCKS))
         self._block_rows = samples * model.substeps
         self._blocks = max(2, round(options.window_s / model.interval_s / samples))
@@ -161,6 +165,7 @@ class Estimator:
         self.scatter = Scatter()
         self._trust, self._rejected, self.pace = TRUST, 0, Pace()
         self._away = np.zeros(len(self.names), dtype=np.int64)
+        self.last: Update | None = None
         self._rest = self._warmed_up()
 
     # Frames -----------------------------------------------------------------------------------
@@ -213,15 +218,42 @@ class Estimator:
             notes, rows = notes + said, rows[done:]
         notes += self._read(readings, squares)
         self._estimate()
-        if MAIN and self.track is not None and not self.track.failed and self.search is None:
-            self._turn(self.track, self.track, began, MAIN)
+        if self.track is not None and not self.track.failed and self.search is None:
+            self._turn(self.track, self.track, began, TURN_FIRST)
         done = self._pass_again(began, notes)
         self._shorten()
         near = np.concatenate([*squares, np.zeros(0)])
         rms_m = float(np.sqrt(near.mean())) if len(near) else float("nan")
-        estimates, trust = self._known(frame)
+        estimates, trust = self._known(frame.t_s)
         latency_s = self.clock() - began
-        return Update(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
+        self.last = Update(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
+        return self.last
+
+    @one_blas_thread()
+    def settle(self) -> Update | None:
+        """Pass the window again until the estimate stays, however long that takes.
+
+        For when frames have ended: what it comes to is the batch's answer, where the window holds
+        the whole recording. The update is that of the last frame, None where there was none.
+        """
+        began, notes = self.clock(), ["settled after the last frame"]
+        if self.last is None or self.track is None:
+            return self.last
+        hurried, self.budget_s, self.rows = (self.budget_s, self.rows), np.inf, None
+        try:
+            rows = self._pass_again(began, notes)
+        finally:
+            self.budget_s, self.rows = hurried
+        estimates, trust = self._known(self.last.t_s)
+        latency_s = self.clock() - began
+        return replace(
+            self.last,
+            estimates=estimates,
+            trust=trust,
+            notes=tuple(notes),
+            latency_s=latency_s,
+            relinearised=rows,
+        )
 
     def _of_frame(self, frame: Frame) -> list[str]:
         if not frame.has_wrench:
@@ -384,13 +416,13 @@ class Estimator:
         known = track.information.with_rows(np.zeros(size), slopes, track.sweep.flat)
         return self._best(track, known)
 
-    def _known(self, frame: Frame) -> tuple[Mapping[str, Estimate], Trust]:
+    def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
         grave: list[Concern] = []
         if self.track is None:
             grave.append(("there is no start yet: the first frame needs a pose", "doubtful"))
         elif self.track.failed:
             grave.append(("the body cannot be simulated with these parameters", "doubtful"))
-        elif self.intake.is_lost(frame.t_s):
+        elif self.intake.is_lost(t_s):
             grave.append(("the grasp is lost", "doubtful"))
         elif self.search is not None:
             grave.append(("a start is still sought", "doubtful"))
@@ -453,8 +485,8 @@ class Estimator:
 
     def _left(self, done: int, elapsed_s: float) -> int:
         """Rows that there is time for."""
-        if self.options.rows is not None:
-            return self.options.rows - done
+        if self.rows is not None:
+            return self.rows - done
         return self.pace.rows(self.budget_s - elapsed_s)
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
@@ -487,7 +519,7 @@ class Estimator:
         if turned.rows < turned.turned + TOGETHER or self._apart(track, self.p, here) <= far:
             return
         before = self.clock()
-        if self.options.rows is None and not self._left(0, before - began + self.pace.turn_s):
+        if self.rows is None and not self._left(0, before - began + self.pace.turn_s):
             return
         p = self._next(track)
         if self._apart(track, p, here) > far:

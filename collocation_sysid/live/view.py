@@ -49,17 +49,18 @@ def picture(updates: Sequence[Update]) -> RenderableType:
     trust.append("".join(f"; {reason}" for reason in last.trust.reasons[:2]), style="default")
     head = Text(
         f"t = {last.t_s:.2f} s   markers missed by {1e3 * last.marker_rms_m:.2f} mm   "
-        f"{1e3 * last.latency_s:.1f} ms a frame"
+        f"{1e3 * last.latency_s:.1f} ms"
     )
     return Group(head, table, trust)
 
 
-def summary(updates: Sequence[Update]) -> RenderableType:
-    """The last picture, and how long frames took."""
+def summary(updates: Sequence[Update], settled: Update) -> RenderableType:
+    """What the estimate has settled at, and how long frames took."""
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
-    said = f"{len(updates)} frames, latency {median:.1f} ms in the median, {late:.1f} ms at 99 %"
-    return Group(picture(updates), Text(said))
+    said = f"{len(updates)} frames, latency {median:.1f} ms in the median, {late:.1f} ms at 99 %; "
+    said += f"settled {1e3 * settled.latency_s:.0f} ms after the last"
+    return Group(picture([*updates, settled]), Text(said))
 
 
 def require_film(file: Path) -> None:
