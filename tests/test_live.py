@@ -132,6 +132,7 @@ def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
             turned.again([row])
             whole.again([row])
         assert len(turned.points) == 2
+        assert turned.turned == half
         ends = (each.blocks[-1].kept[-1].x for each in (turned, whole))
         errors.append(np.abs(np.subtract(*ends)).max())
         scale = np.sqrt(np.diag(normal_equations(whole.information.triangle)))
@@ -193,8 +194,11 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
     track, log, whole = live.track, list(live.log), live.track.information
+    track.turn(track.p)
     left = track.drop_oldest()
     assert 0 < left < len(log)
+    assert len(track.points) == 2
+    assert track.turned == len(log) - left
     assert track.information is whole
     again = Track(live.model, track.p, track.prior, live._block_rows, track)
     for row in log[left:]:

@@ -62,9 +62,9 @@ class Track:
         self.model = model
         self.sweep = Sweep(model, p, prior.joined(model.stated(p)), *self.start)
         self.blocks: list[Block] = []
-        self.points = [self.sweep.flat]
+        self._turns = [(0, self.sweep.flat)]
         self.failed = False
-        self.rows = self.turned = 0
+        self.rows = 0
         self._off: list[Array] = []
 
     @property
@@ -105,8 +105,17 @@ class Track:
     def turn(self, p: Array) -> None:
         """Go on from here at another p; what is done stays linearised where it was."""
         self.sweep = Sweep(self.model, p, self.information, self.sweep.state, self.p)
-        self.points.append(self.sweep.flat)
-        self.turned = self.rows
+        self._turns.append((self.rows, self.sweep.flat))
+
+    @property
+    def turned(self) -> int:
+        """The row of the window from which on it has not turned."""
+        return self._turns[-1][0]
+
+    @property
+    def points(self) -> list[Array]:
+        """What was flat where the window's rows are linearised."""
+        return [flat for _, flat in self._turns]
 
     def read(self, said: Sequence[Said]) -> None:
         """Take what was read after the last rows."""
@@ -158,6 +167,8 @@ class Track:
         """Let the oldest block leave as prior; how many rows it had."""
         block = self.blocks.pop(0)
         self.rows -= len(block.kept)
+        turns = [(max(0, row - len(block.kept)), flat) for row, flat in self._turns]
+        self._turns = [*[turn for turn in turns if not turn[0]][-1:], *[t for t in turns if t[0]]]
         self.prior = self.sweep.added(self.prior, block.said)
         self.start = (self.blocks[0].start, self.blocks[0].at)
         return len(block.kept)
