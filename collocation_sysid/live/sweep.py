@@ -352,8 +352,8 @@ class Sweep:
         whole[:, self.grasped] = self.given[here]
         whole[:, self.solver.free] = columns
         whole[:, :, 0] = self.x[here]
-        columns = (whole[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
-        pairs = zip(self.x[here].copy(), columns, strict=True)
+        by_flat = (whole[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
+        pairs = zip(self.x[here].copy(), by_flat, strict=True)
         found = [Kept(self.flat, *pair) for pair in pairs]
         self.read.extend(zip(found, self._seen(whole), strict=True))
         return found

@@ -44,10 +44,14 @@ class Row:
     def of(cls, dynamics: Dynamics, t: int, theta: Array) -> Row:
         """Row t of the tables, with the mass at θ."""
         tables, step_s = dynamics.tables, dynamics.step_s
-        p, w = tables.p[t], tables.w[t]
-        q, s = tables.q[t] / step_s, tables.s[t] / step_s**2
-        stencil = (tuple(each.tolist()) for each in (p, q, w, s))
-        return cls(*stencil, float(tables.r[t]) / step_s, dynamics.mass.row(t, theta))
+        return cls(
+            tuple(tables.p[t].tolist()),
+            tuple((tables.q[t] / step_s).tolist()),
+            tuple(tables.w[t].tolist()),
+            tuple((tables.s[t] / step_s**2).tolist()),
+            float(tables.r[t]) / step_s,
+            dynamics.mass.row(t, theta),
+        )
 
     @cached_property
     def lags(self) -> list[int]:
