@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +37,7 @@ from .model import TOGETHER, Model, Poses
 from .pace import Pace
 from .search import SEEN, Search
 from .statistics import Scatter, widened
-from .sweep import LoggedRow, Reading
+from .sweep import LoggedRow, Reading, Said
 from .track import Track
 from .trust import UNSETTLED, data_concerns, estimate_concerns
 
@@ -121,6 +121,28 @@ class Update:
         return f"Update(t = {self.t_s:.4g} s: {found}; {self.trust.verdict})"
 
 
+class Newest(NamedTuple):
+    """What is known, with each reading as it was linearised last, and where that was."""
+
+    information: Information
+    said: list[Said]
+    points: list[Array]
+
+    @classmethod
+    def of(cls, track: Track, again: Track | None) -> Newest:
+        """Of a pass, and of another that catches up with it and has come half the way."""
+        if again is None or again.base is None or again.failed or 2 * again.rows < track.rows:
+            return cls(track.information, track.said, track.points)
+        done = again.said
+        rest = track.said[len(done) :]
+        points = [*again.points, *track.points_from(again.rows)]
+        return cls(track.sweep.added(again.information, rest), [*done, *rest], points)
+
+    def scatter(self, flat: Array) -> Scatter:
+        """Of the residuals, to first order."""
+        return Scatter.of([said.at(flat) for said in self.said])
+
+
 class Estimator:
     """Estimates a problem's parameters from frames, one after another.
 
@@ -159,6 +181,7 @@ class Estimator:
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = Information.none(model.size)
         self.track: Track | None = None
+        self._newest = Newest(self.prior, [], [])
         self.again: Track | None = None
         self.log: list[LoggedRow] = []
         self.search = self._search() if problem.parameters.unguessed else None
@@ -338,7 +361,7 @@ class Estimator:
                 trial.again([row])
         except SimulationError:
             return None
-        self._estimates_at(trial, self.p)
+        self._estimates_at(trial.information, self.p)
         self.pace = self._timed(trial, row)
         return poses, trial.blocks[0].kept[0].x
 
@@ -372,7 +395,7 @@ class Estimator:
             self.prior = Information.none(self.model.size)
             track = Track(self.model, self.p, self.prior, self._block_rows)
             track.advance([row.poses], guesses)
-        self.track = track
+        self.track, self._newest = track, Newest.of(track, None)
 
     def _begin_anew(self) -> None:
         """Keep what is known, and wait for a start."""
@@ -390,7 +413,7 @@ class Estimator:
         """How far the estimate is from where all is linearised, in standard errors."""
         if self.track is None or self.track.failed:
             return np.inf
-        return self._apart(self.track, self.p, self.track.points)
+        return self._apart(self.track, self.p, self._newest.points)
 
     def _apart(self, track: Track, p: Array, points: Sequence[Array]) -> float:
         """How far p is at most from points, in the standard errors of a pass."""
@@ -400,7 +423,8 @@ class Estimator:
 
     def _estimate(self) -> None:
         if self.track is not None and not self.track.failed:
-            self.p = self._best(self.track, self.track.information)
+            self._newest = Newest.of(self.track, self.again)
+            self.p = self._best(self.track, self._newest.information)
 
     def _best(self, track: Track, known: Information) -> Array:
         reach = self._trust * self.model.collocation.reach_p
@@ -413,7 +437,7 @@ class Estimator:
         size, samples = self.model.size, len(self.log) / self.model.substeps
         stay = STAY * max(1.0, samples / SEEN)
         slopes = np.diag(1 / (stay * self.model.collocation.reach_p * track.sweep.rates))
-        known = track.information.with_rows(np.zeros(size), slopes, track.sweep.flat)
+        known = self._newest.information.with_rows(np.zeros(size), slopes, track.sweep.flat)
         return self._best(track, known)
 
     def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
@@ -430,17 +454,16 @@ class Estimator:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
             return {name: Estimate(value) for name, value in values.items()}, Trust.of(grave)
         if self.counts["looked"] % LOOK_EVERY == 0:
-            self.scatter = Scatter.of(self.track.residuals(self.p))
+            self.scatter = self._newest.scatter(self.model.flat(self.p))
         self.counts["looked"] += 1
-        estimates = self._estimates_at(self.track, self.p)
+        estimates = self._estimates_at(self._newest.information, self.p)
         grave += data_concerns(self.scatter, self.counts, self.samples)
         grave += estimate_concerns(estimates, self.moved)
         return estimates, Trust.of(grave)
 
-    def _estimates_at(self, track: Track, p: Array) -> dict[str, Estimate]:
+    def _estimates_at(self, known: Information, p: Array) -> dict[str, Estimate]:
         collocation, nq = self.model.collocation, self.model.collocation.nq
-        known, fitted = track.information, self.model.size
-        flat = self.model.flat(p)
+        flat, fitted = self.model.flat(p), self.model.size
         factor, quantile = widened(known, flat, fitted, self.scatter)
         rates = self.model.rates(flat)[:nq]
         of_q = factor * known.covariance[:nq, :nq] / np.outer(rates, rates)
@@ -541,7 +564,7 @@ class Estimator:
             self._rejected = 0
             if sought:
                 notes.append("begun from another stiffness")
-            self.scatter = Scatter.of(again.residuals(again.p))
+            self.scatter = Newest.of(again, None).scatter(again.sweep.flat)
         else:
             reach = self.model.collocation.reach_p
             length = float(np.abs((again.p - track.p) / reach).max())

@@ -115,17 +115,22 @@ class Track:
     @property
     def points(self) -> list[Array]:
         """What was flat where the window's rows are linearised."""
-        return [flat for _, flat in self._turns]
+        return self.points_from(0)
+
+    def points_from(self, row: int) -> list[Array]:
+        """The same of the rows from one on."""
+        before = [flat for first, flat in self._turns if first <= row]
+        return [*before[-1:], *[flat for first, flat in self._turns if first > row]]
 
     def read(self, said: Sequence[Said]) -> None:
         """Take what was read after the last rows."""
         self.blocks[-1].said += said
         self.sweep.take(said)
 
-    def residuals(self, p: Array) -> list[Array]:
-        """(M, 3) of what was read within the window, linearised to p, NaN where missing."""
-        flat = self.model.flat(p)
-        return [said.at(flat) for block in self.blocks for said in block.said]
+    @property
+    def said(self) -> list[Said]:
+        """What was read within the window."""
+        return [said for block in self.blocks for said in block.said]
 
     def again(self, rows: Sequence[LoggedRow]) -> None:
         """Go on by rows and all that was read after them, as far as is possible at once."""
