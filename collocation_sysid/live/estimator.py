@@ -235,7 +235,9 @@ class Estimator:
                 notes.append("nothing was seen for long: begun anew, as if at rest here")
         rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m)
         notes += said
-        squares: list[Array] = []
+        self.pace.forget()
+        caught = self._catch_up(began, notes)
+        squares, before = [], self.clock()
         while rows:
             done, said = self._go_on(rows, squares)
             notes, rows = notes + said, rows[done:]
@@ -243,7 +245,8 @@ class Estimator:
         self._estimate()
         if self.track is not None and not self.track.failed and self.search is None:
             self._turn(self.track, self.track, began, TURN_FIRST)
-        done = self._pass_again(began, notes)
+        self.pace.frame_s = self.clock() - before
+        done = self._pass_again(began, notes, caught)
         self._shorten()
         near = np.concatenate([*squares, np.zeros(0)])
         rms_m = float(np.sqrt(near.mean())) if len(near) else float("nan")
@@ -473,10 +476,8 @@ class Estimator:
 
     # Passing again ----------------------------------------------------------------------------
 
-    def _pass_again(self, began: float, notes: list[str]) -> int:
-        """Go on with a pass in what is left of the budget; how many rows that were."""
-        done = 0
-        self.pace.forget()
+    def _pass_again(self, began: float, notes: list[str], done: int = 0) -> int:
+        """Go on with a pass in what is left of the budget; how many rows are done then."""
         while self.track is not None:
             begins = self.clock()
             if self.again is None and self._left(done, begins - began + self.pace.turn_s):
@@ -487,24 +488,38 @@ class Estimator:
                 break
             if not done and again.base is not None:
                 self._turn(self.track, again, began, TURN)
-            before = self.clock()
-            left = min(self._left(done, before - began), again.left)
+            left = min(self._left(done, self.clock() - began), again.left)
             if not left:
                 break
-            were = again.rows
-            try:
-                again.again(self.log[were : were + left])
-            except SimulationError:
-                again.failed = True
-            done += again.rows - were
-            self.pace.took(left, self.clock() - before)
-            if self.search is not None and not self.search.done:
-                if again.failed or again.rows >= min(self.search.rows, len(self.log)):
-                    self.search.compare(again)
-                    self.again = None
-            elif again.failed or again.rows == len(self.log):
-                self._judge(self.track, again, notes)
+            done += self._advance(again, left, notes)
         return done
+
+    def _catch_up(self, began: float, notes: list[str]) -> int:
+        """End a pass that lags by few rows before others come: they are then rows of it."""
+        again = self.again
+        if again is None or again.base is None:
+            return 0
+        lag = len(self.log) - again.rows
+        elapsed_s = self.clock() - began
+        if lag > min(again.left, self._left(0, elapsed_s + self.pace.frame_s)):
+            return 0
+        return self._advance(again, lag, notes)
+
+    def _advance(self, again: Track, count: int, notes: list[str]) -> int:
+        """Go on with a pass by rows, and judge it where it has caught up; how many it did."""
+        before, were = self.clock(), again.rows
+        try:
+            again.again(self.log[were : were + count])
+        except SimulationError:
+            again.failed = True
+        self.pace.took(count, self.clock() - before)
+        if self.search is not None and not self.search.done:
+            if again.failed or again.rows >= min(self.search.rows, len(self.log)):
+                self.search.compare(again)
+                self.again = None
+        elif (again.failed or again.rows == len(self.log)) and self.track is not None:
+            self._judge(self.track, again, notes)
+        return again.rows - were
 
     def _left(self, done: int, elapsed_s: float) -> int:
         """Rows that there is time for."""

@@ -21,12 +21,15 @@ class Pace:
         By how many times the last ones took longer.
     turn_s : float
         Of a pass to turn to another p.
+    frame_s : float
+        Of the last frame without rows that are passed again; its user sets it.
     """
 
     first_s: float = 0.0
     more_s: float = 0.0
     delay: float = 1.0
     turn_s: float = 0.0
+    frame_s: float = 0.0
 
     @classmethod
     def of(cls, one_s: float, many_s: float, many: int) -> Pace:
