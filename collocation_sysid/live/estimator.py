@@ -48,6 +48,8 @@ STAY = 0.5
 MOVED = 0.1
 # Passes turn where the estimate is so far from them: one that is catching up, and the first.
 TURN, TURN_FIRST = 1.0, 3.0
+# Readings that a pass may lack for its others to count; all are joined anew with each frame.
+LATE = 20
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than so many times, and this above, what it
@@ -130,11 +132,12 @@ class Newest(NamedTuple):
 
     @classmethod
     def of(cls, track: Track, again: Track | None) -> Newest:
-        """Of a pass, and of another that catches up with it and has come half the way."""
-        if again is None or again.base is None or again.failed or 2 * again.rows < track.rows:
-            return cls(track.information, track.said, track.points)
-        done = again.said
-        rest = track.said[len(done) :]
+        """Of a pass, and of another that has nearly caught up with it."""
+        said = track.said
+        done = again.said if again is not None and again.base is not None else []
+        rest = said[len(done) :]
+        if again is None or again.failed or not done or len(rest) > min(LATE, len(done)):
+            return cls(track.information, said, track.points)
         points = [*again.points, *track.points_from(again.rows)]
         return cls(track.sweep.added(again.information, rest), [*done, *rest], points)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 # What is left after a frame of the longest delay: rows are not begun that might not end within the
 # budget, and one that took long by chance is forgotten.
-FADING = 0.9
+FADING = 0.85
 
 
 @dataclass
