@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,10 +34,11 @@ from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .information import Information
 from .intake import LONGEST, Intake
 from .model import TOGETHER, Model, Poses
+from .newest import Newest
 from .pace import Pace
 from .search import SEEN, Search
 from .statistics import Scatter, widened
-from .sweep import LoggedRow, Reading, Said
+from .sweep import LoggedRow, Reading
 from .track import Track
 from .trust import UNSETTLED, data_concerns, estimate_concerns
 
@@ -48,8 +49,6 @@ STAY = 0.5
 MOVED = 0.1
 # Passes turn where the estimate is so far from them: one that is catching up, and the first.
 TURN, TURN_FIRST = 1.0, 3.0
-# Readings that a pass may lack for its others to count; all are joined anew with each frame.
-LATE = 20
 # First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
 TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
 # A pass is accepted where the sum of squares is no more than so many times, and this above, what it
@@ -121,29 +120,6 @@ class Update:
     def __repr__(self) -> str:
         found = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
         return f"Update(t = {self.t_s:.4g} s: {found}; {self.trust.verdict})"
-
-
-class Newest(NamedTuple):
-    """What is known, with each reading as it was linearised last, and where that was."""
-
-    information: Information
-    said: list[Said]
-    points: list[Array]
-
-    @classmethod
-    def of(cls, track: Track, again: Track | None) -> Newest:
-        """Of a pass, and of another that has nearly caught up with it."""
-        said = track.said
-        done = again.said if again is not None and again.base is not None else []
-        rest = said[len(done) :]
-        if again is None or again.failed or not done or len(rest) > min(LATE, len(done)):
-            return cls(track.information, said, track.points)
-        points = [*again.points, *track.points_from(again.rows)]
-        return cls(track.sweep.added(again.information, rest), [*done, *rest], points)
-
-    def scatter(self, flat: Array) -> Scatter:
-        """Of the residuals, to first order."""
-        return Scatter.of([said.at(flat) for said in self.said])
 
 
 class Estimator:

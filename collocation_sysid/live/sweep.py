@@ -322,6 +322,8 @@ class Sweep:
         """
         rows, at, forward = [self._row(t) for t in here], linear.at, self.forward
         found = np.full((2, len(here), *self.shape), np.nan)
+        if not forward.weighs_past:
+            found[1] = 0.0
         matrices, skews = blocks(rows, at, self.solver.pattern)
         for k, t in enumerate(here):
             try:
