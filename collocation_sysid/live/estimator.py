@@ -166,7 +166,6 @@ class Estimator:
         self.search = self._search() if problem.parameters.unguessed else None
         self.scatter = Scatter()
         self._trust, self._rejected, self.pace = TRUST, 0, Pace()
-        self._away = np.zeros(len(self.names), dtype=np.int64)
         self.last: Update | None = None
         self._rest = self._warmed_up()
 

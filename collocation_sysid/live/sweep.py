@@ -24,7 +24,7 @@ from ..methods.robust import huberised
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.rest import start_state
-from ..nlp.row import Row, blocks
+from ..nlp.row import Row
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
 from .information import Information
 from .model import TOGETHER, Model, Poses
@@ -320,18 +320,20 @@ class Sweep:
 
         NaN from a row on that is singular.
         """
-        rows, at, forward = [self._row(t) for t in here], linear.at, self.forward
+        at, forward, solver = linear.at, self.forward, self.solver
         found = np.full((2, len(here), *self.shape), np.nan)
         if not forward.weighs_past:
             found[1] = 0.0
-        matrices, skews = blocks(rows, at, self.solver.pattern)
         for k, t in enumerate(here):
+            row = self._row(t)
+            matrix = row.block(at.by_position[k], at.by_velocity[k], solver.pattern)
+            skew = row.skew_block(at.by_position_skew[k])
             try:
-                factor = self.solver.factoriser.factorise(matrices[k], skews[k], self.model.room)
+                factor = solver.factoriser.factorise(matrix, skew, self.model.room)
             except np.linalg.LinAlgError:
                 break
             parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
-            step = Step(t, rows[k], *parts, factor, at.by_position_skew[k], linear.nu[k])
+            step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
             right, force = linear.right[k], linear.force[k]
             found[0, k] = forward.advance(step, right, force, linear.given)
             if forward.weighs_past:
@@ -378,10 +380,9 @@ class Sweep:
             self._fail(failure)
 
     def _fail(self, failure: NewtonFailure) -> NoReturn:
-        time_s, what = self.row * self.model.interval_s / self.model.substeps, "the step at row"
-        raise simulation_error(
-            self.model.newton, failure, time_s, f"{what} {self.row}"
-        ) from failure
+        model, what = self.model, f"the step at row {self.row}"
+        time_s = self.row * model.interval_s / model.substeps
+        raise simulation_error(model.newton, failure, time_s, what) from failure
 
     # Markers ----------------------------------------------------------------------------------
 

@@ -307,15 +307,13 @@ class Factoriser:
         skyline = self.skyline
         if skyline is None:
             return None
-        room = room or skyline.room(2 if skew.size else 1)
+        count = 2 if skew.size else 1
+        room = room or skyline.room(count)
         pivots, growth = skyline.factorise(room, values, skew)
         # What is not finite in the matrix is not in its pivots.
-        if not (pivots.min() > 0 and pivots.max() < np.inf):
+        if not (pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH):
             return None
-        if skew.size and not (growth < GROWTH).all():
-            return None
-        sides = room.sides[: 2 if skew.size else 1]
-        return _SkylineFactor(skyline, sides, pivots, self._order, self._rank)
+        return _SkylineFactor(skyline, room.sides[:count], pivots, self._order, self._rank)
 
     def factorise_each(
         self,

@@ -17,7 +17,6 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array
-from ..fem.body import Linearisation
 from ..fem.pattern import SymmetricPattern
 from .dynamics import Dynamics
 
@@ -68,20 +67,6 @@ class Row:
     def skew_block(self, by_position_skew: Array) -> Array:
         """Lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t from that of G."""
         return -self.w[0] * self.p[0] * by_position_skew
-
-
-def blocks(
-    rows: Sequence[Row], at: Linearisation, pattern: SymmetricPattern
-) -> tuple[Array, Array]:
-    """`Row.block` and `Row.skew_block` of several rows, (k, m) and (k, m or 0)."""
-    by_g, by_c = (
-        np.array([[-row.w[0] * lag[0]] for row, lag in zip(rows, lags, strict=True)])
-        for lags in ([row.p for row in rows], [row.q for row in rows])
-    )
-    values = by_g * at.by_position
-    values += by_c * at.by_velocity
-    values[:, pattern.diagonal] += [row.s[0] * row.mass_kg for row in rows]
-    return values, by_g * at.by_position_skew
 
 
 def weighted(coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]) -> Array:
