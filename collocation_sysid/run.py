@@ -423,7 +423,7 @@ def _checked(
     options = problem.uncertainty
     try:
         uncertainty = uncertainty_of(
-            fit, problem.parameters, solution.q, options.noise, options.errors, extra
+            fit, solution.collocation.parameters, solution.q, options.noise, options.errors, extra
         )
         profiles = []
         for name in options.profile:

@@ -7,22 +7,26 @@ from functools import cache
 
 import numpy as np
 import pytest
-from problems_small import GUESS, TRUTH, hung_cube, measured, relative_errors
+from problems_small import GUESS, TRUTH, hung_cube, measured, point_markers, relative_errors
+from test_static import block
+from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
 
 from collocation_sysid import (
     Body,
     InputError,
+    Nuisance,
     Problem,
     ReducedSpace,
     Region,
     Status,
     Tied,
     Unknown,
+    run,
     solve,
 )
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.scan import _Tried, scan, started, usual_parameters
+from collocation_sysid.methods.scan import _Trial, _Tried, scan, started, usual_parameters
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters
 
@@ -179,6 +183,68 @@ def test_the_scan_goes_on_beyond_an_end_that_is_best(truth, softest):
     assert 0.1 < best / truth < 10
 
 
+# Of what is felt
+
+
+def unseen(experiment, **changes):
+    """The experiment without markers, its sensors measured, and off by what `changes` say."""
+    felt = sensed(sensing(experiment))
+    nobody = point_markers(felt.body, np.zeros((0, 3)), felt.t_s)
+    return replace(felt, markers=nobody, **changes)
+
+
+def felt_offsets(experiment, offset_n):
+    readings = [g.wrench.values + offset_n for g in experiment.grasps if g.wrench is not None]
+    return with_wrenches(experiment, readings)
+
+
+def misfits(experiment):
+    found = scan(Problem([experiment], NOTHING).collocation())
+    return found.young_pa[found.best], found.misfit
+
+
+def test_a_test_bench_without_markers_starts_near_its_stiffness():
+    young_pa, misfit = misfits(unseen(block("z")))
+    assert YOUNG_PA / 2 < young_pa < 2 * YOUNG_PA
+    assert misfit[-1] > 1e3 * misfit.min()
+
+
+def test_forces_on_a_hand_tell_the_stiffness_as_markers_do():
+    young_pa, _ = misfits(unseen(wristed_cube(30)))
+    assert YOUNG_PA / 3 < young_pa < 3 * YOUNG_PA
+
+
+def test_markers_and_forces_count_alike():
+    both = sensed(wristed_cube(30))
+    seen = replace(both, grasps=[replace(g, wrench=None) for g in both.grasps])
+    trials = [_Trial(Problem([each], GUESS).collocation()) for each in (both, seen, unseen(both))]
+    together, of_markers, of_forces = (trial.guess(whole=False)[0] for trial in trials)
+    counts = [trial.collocation.measurements for trial in trials]
+    assert min(of_markers, of_forces) < together < max(of_markers, of_forces)
+    assert counts[0] == counts[1] + counts[2]
+
+
+def test_an_unknown_tare_hides_no_stiffness():
+    zeroed = felt_offsets(unseen(block("z"), nuisance=Nuisance(tare=100.0)), 0.05)
+    young_pa, _ = misfits(zeroed)
+    assert YOUNG_PA / 2 < young_pa < 2 * YOUNG_PA
+
+
+def test_a_force_that_is_felt_late_is_waited_for():
+    bench = unseen(block("z", t_s=np.arange(40.0), z_m=-0.001 * np.arange(40.0)))
+    later = np.where(bench.t_s[:, None] < 30, np.nan, 0.0)
+    young_pa, _ = misfits(felt_offsets(bench, later))
+    assert YOUNG_PA / 2 < young_pa < 2 * YOUNG_PA
+
+
+def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
+    bench = unseen(block("z"))
+    collocation, found = started(Problem([bench], guessed(mu_pa=9e3)).collocation())
+    assert found is not None
+    assert "the measurements are missed by more than an undeformed body would" in found.sentence
+    assert collocation.parameters.guesses["mu_pa"] < 2 * TRUTH["mu_pa"]
+
+
 # Solves
 
 
@@ -216,7 +282,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr("collocation_sysid.methods.scan._Trial.rigid_misfit", 1e-3)
     collocation, found = started(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
-    assert found.sentence.startswith("at the guess the markers are missed by more than those of a")
+    assert found.sentence.startswith("at the guess the measurements are missed by more than")
     assert collocation.parameters.guesses["mu_pa"] == pytest.approx(
         found.young_pa[found.best] / 2.6
     )
@@ -276,3 +342,13 @@ def test_a_search_that_is_lost_begins_again_from_a_scan(second, scanned):
     said = "the search from the guess was lost (stalled): started from E = "
     assert [note for note in solution.notes if said in note][:1] == list(solution.notes[:scanned])
     assert solution.collocation.parameters.guesses["mu_pa"] == starts[scanned]
+
+
+def test_a_linear_constant_without_a_guess_gets_an_error_bar():
+    bench = unseen(block("z"))
+    given = {"lambda_pa": 200.0, "mu_pa": Unknown(scale="linear", lower=1.0, upper=1e6)}
+    found = run(Problem([bench], given | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}))
+    estimate = found.estimates["mu_pa"]
+    assert estimate.value == pytest.approx(300.0, rel=1e-6)
+    assert estimate.std_error is not None
+    assert 0 < estimate.std_error < 10.0

@@ -2,10 +2,10 @@
 
 At each stiffness the free moduli take the values that they usually have beside each other, the
 other parameters without a guess theirs, and the first part of every recording is simulated and
-compared with its markers. A stiff body can always be simulated and moves as the grasp does; the
-softer it is, the more it sags and lags, until it fits, and then falls apart. So the best start is
-found by simulations that are cheap, and the search begins on the right side of what can be
-simulated.
+compared with all that was measured. A stiff body can always be simulated and moves as the grasp
+does; the softer it is, the more it sags and lags and the less force it gives, until it fits, and
+then falls apart. So the best start is found by simulations that are cheap, and the search begins on
+the right side of what can be simulated.
 
 The same scan is the rescue where a guess cannot be simulated, or fits worse than a rigid body.
 """
@@ -23,9 +23,11 @@ import numpy as np
 from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
-from ..nlp.collocation import Collocation
+from ..nlp.collocation import Collocation, Part
 from ..nlp.newton import NewtonOptions
 from ..nlp.parameters import Parameter, Parameters
+from ..nlp.segment import Segment
+from ..nlp.sensing import NOTHING
 from .ladder import SHARES, part_of
 from .start import marched
 
@@ -54,8 +56,8 @@ class Scan:
     young_pa : (k,) ndarray
         Young's moduli that were tried, ascending; moduli with a guess, and those fixed, kept it.
     misfit : (k,) ndarray
-        Root mean square of the markers' residuals in standard deviations; NaN where the body could
-        not be simulated.
+        Root mean square of the residuals, of markers and wrenches, in standard deviations; NaN
+        where the body could not be simulated.
     best : int
         Position of the one that was chosen.
     parameters : Parameters
@@ -85,8 +87,8 @@ class Scan:
 def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation, Scan | None]:
     """The problem with a guess of every parameter, and the scan that found it, if there was one.
 
-    Guesses that are given stay, unless the body cannot be simulated with them or misses its
-    markers by more than a rigid one, and the scan finds better ones.
+    Guesses that are given stay, unless the body cannot be simulated with them or misses what was
+    measured by more than an undeformed one, and the scan finds better ones.
 
     Parameters
     ----------
@@ -114,7 +116,7 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
         return collocation, None
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
-        reason = "at the guess the markers are missed by more than those of a rigid body"
+        reason = "at the guess the measurements are missed by more than an undeformed body would"
     found = rescue(collocation, reason, whole)
     if found is None:
         return collocation, None  # the method will tell what it needs
@@ -237,18 +239,49 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
 
 def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
-    """Root mean square of the markers' residuals, in standard deviations, on the first rows.
+    """Root mean square of all residuals, in standard deviations, on the first rows.
 
     Unknown places are where the first samples lie on the body.
     """
     collocation, p = collocation.placed(p, positions)
-    residuals = []
-    for part in collocation.parts_at(p, positions):
-        markers = part.segment.experiment.markers
-        read = part.segment.observation.predicted(part.x, part.phi)
-        off = (read - markers.positions_m[: len(read)]) / markers.sigma_m[:, None]
-        residuals.append(off[part.segment.observation.present[: len(read)]].ravel())
+    parts = collocation.parts_at(p, positions)
+    residuals = [each for part in parts for each in (_of_markers(part), _of_sensors(part))]
     return root_mean(np.concatenate(residuals) ** 2)
+
+
+def _of_markers(part: Part) -> Array:
+    markers = part.segment.experiment.markers
+    read = part.segment.observation.predicted(part.x, part.phi)
+    off = (read - markers.positions_m[: len(read)]) / markers.sigma_m[:, None]
+    return off[part.segment.observation.present[: len(read)]].ravel()
+
+
+def _of_sensors(part: Part) -> Array:
+    """Residuals with the tares, clocks and tools that suit best, and these in their deviations.
+
+    Nothing else tells them beforehand, and the residuals are nearly linear in them.
+    """
+    sensors, rows = part.segment.sensors, len(part.x)
+    if not sensors:
+        return np.zeros(0)
+    found = part.sensing.linearised(part.sensing.at(part.x), NOTHING)
+    there = np.concatenate([s.wrench.present & s.covered(rows)[:, None] for s in sensors]).ravel()
+    residual = np.concatenate([each.ravel() for each, _ in found])[there]
+    slope = np.concatenate([by.reshape(-1, by.shape[-1]) for _, by in found])[there]
+    slope = slope[:, part.segment.nq :]
+    own = slope[:, slope.any(axis=0)]
+    priors = np.eye(own.shape[1])
+    residual, own = np.append(residual, np.zeros(len(priors))), np.concatenate([own, priors])
+    return residual - own @ np.linalg.lstsq(own, residual, rcond=None)[0]
+
+
+def _samples(segment: Segment) -> int:
+    """How many first samples are compared: a part of all, and one of each kind of reading."""
+    t_s, seen = segment.experiment.t_s, [segment.experiment.markers.first_seen]
+    for sensor in segment.sensors:
+        felt_s = sensor.wrench.t_s[sensor.present.any(axis=1).argmax()] + sensor.limit_s
+        seen.append(int(np.searchsorted(t_s, felt_s)) + sensor.late)
+    return min(len(t_s), max(part_of(len(t_s), SHARES[0]), max(seen) + 1))
 
 
 class _Trial:
@@ -258,8 +291,7 @@ class _Trial:
         self.collocation = collocation
         self.samples, self.rows, self.whole = [], [], []
         for segment in collocation.segments:
-            t_s, seen = segment.experiment.t_s, segment.experiment.markers.first_seen
-            self.samples.append(min(len(t_s), max(part_of(len(t_s), SHARES[0]), seen + 1)))
+            self.samples.append(_samples(segment))
             self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
             self.whole.append(segment.grid_rows)
         self.failure: SimulationError | None = None
@@ -271,8 +303,7 @@ class _Trial:
         for segment, rows in zip(self.collocation.segments, self.rows, strict=True):
             at = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
             positions.append(at.reshape(rows, -1))
-        p = np.zeros(self.collocation.nq + self.collocation.nphi)
-        return _misfit(self.collocation, p, positions)
+        return _misfit(self.collocation, self.collocation.guess_p, positions)
 
     def guess(self, whole: bool) -> tuple[float, SimulationError | None]:
         """The misfit of the guess, or why it cannot be simulated."""

@@ -133,6 +133,8 @@ class Dynamics:
 
     def first_rows(self, rows: int) -> Dynamics:
         """The same on the first grid times only."""
+        if rows >= self.rows:
+            return self
         t = self.tables
         return replace(
             self,

@@ -54,10 +54,10 @@ class Sensing:
     # What acts on the sensed dofs -------------------------------------------------------------
 
     def at(self, x: Array) -> Forced:
-        """The reactions at positions x (N, 3n)."""
-        dynamics, dofs = self.setting.dynamics, self.segment.sensed_dofs
-        force = forces_on(dynamics, x, self.setting.theta, dofs)
-        reaction = reactions(dynamics, self._mass_kg, force, dynamics.acceleration(x)[:, dofs])
+        """The reactions at positions x (N, 3n), or at its first rows."""
+        dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
+        force, mass_kg = forces_on(dynamics, x, self.setting.theta, dofs), self._mass_kg[: len(x)]
+        reaction = reactions(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
         return Forced.still(reaction, x[:, dofs])
 
     @property

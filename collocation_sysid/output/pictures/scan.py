@@ -27,7 +27,7 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
     Parameters
     ----------
     young_pa : (k,) Young's moduli, ascending
-    misfit : (k,) in standard deviations of the markers, NaN where it could not be simulated
+    misfit : (k,) in standard deviations, NaN where it could not be simulated
     best : int
         Position of the start.
     """
