@@ -1,13 +1,14 @@
-"""Files as they are read: regular ones, and folders of results that may be damaged."""
+"""Files as they are read and written: regular, of their folder, whole or not there at all."""
 
 from __future__ import annotations
 
 import json
 import os
+import secrets
 import stat
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -56,6 +57,27 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
         raise InputError(f"is {kind}; expected a regular file", path, where)
 
 
+def is_own(folder: Path, file: Path) -> bool:
+    """Whether this is a regular file of the folder, not one elsewhere that a link leads to."""
+    try:
+        return file.is_file() and file.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # links in a circle
+        return False
+
+
+def require_own(file: Path) -> None:
+    """Refuse what is there and yet no regular file of its own folder.
+
+    Raises
+    ------
+    InputError
+        Naming the path.
+    """
+    require_regular(file)
+    if file.is_file() and not is_own(file.parent, file):
+        raise InputError("is a link to elsewhere; expected a file of this folder itself", file)
+
+
 def read_json(file: Path, what: str) -> dict[str, Any]:
     """The object in a JSON file of a folder.
 
@@ -70,7 +92,7 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     InputError
         If it is not there, is damaged, or was written by another version.
     """
-    require_regular(file)
+    require_own(file)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
@@ -100,6 +122,59 @@ def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
         raise
     except DAMAGE as error:
         raise InputError(f"{files} is damaged ({reason(error)}); {remedy}", folder) from error
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """Give a file of the same ending beside `path` to write, and name it `path` at the end.
+
+    So nobody ever sees half of it, and what was there is kept until then. A link is replaced and
+    not followed; into a device or a pipe, where nothing can be replaced, is written directly.
+
+    Raises
+    ------
+    InputError
+        Naming the path, where the disk is full or it cannot be written in.
+    """
+    target = Path(path)
+    draft = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
+    try:
+        with naming(target, draft):
+            if target.exists() and not target.is_file():
+                yield target
+                return
+            target.parent.mkdir(parents=True, exist_ok=True)
+            yield draft
+            os.replace(draft, target)
+    finally:
+        with suppress(OSError):
+            draft.unlink()
+
+
+def write_whole(path: str | Path, text: str) -> None:
+    """Write a text as UTF-8 by `whole_file`."""
+    with whole_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def naming(target: Path, draft: Path) -> Iterator[None]:
+    """Let what goes wrong while a draft is written name what the draft is to be.
+
+    Raises
+    ------
+    InputError
+        Naming the target.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = f"cannot be written: {error.strerror or error}"
+        raise InputError(reason, target) from error
+    except InputError as error:
+        if error.source is None or not Path(error.source).is_relative_to(draft):
+            raise
+        raise InputError(error.message, target, error.where) from error
 
 
 def reason(error: BaseException) -> str:

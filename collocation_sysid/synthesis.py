@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
 from .errors import InputError
 from .experiment import Experiment, write_markers_csv, write_poses_csv, write_wrench_csv
+from .files import whole_file
 from .nlp.schemes import SCHEMES
 from .nlp.simulation import Trajectory, simulate
-from .output.writers import write_frames
+from .output.writers import FRAMES_FILE, require_replaceable, run_folder, write_frames
 from .problem import Problem
 
 
@@ -62,31 +64,50 @@ def write_data(
     noises = {"--noise-m": noise_m, "--noise-n": noise_n, "--noise-nm": noise_nm}
     _refuse_options(integrator, timestep_s, noises, seed)
     _refuse_inputs(problem, place)
+    for experiment in problem.experiments if frames else ():
+        require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
     rng = np.random.default_rng(seed)
     given, substeps = problem.parameters, problem.substeps
     simulated = [
         simulate(experiment, given, integrator, timestep_s, substeps, None, progress)
         for experiment in problem.experiments
     ]
-    place.mkdir(parents=True, exist_ok=True)
     written = []
-    for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
-        noise = noise_m * rng.normal(size=trajectory.markers_m.shape)
-        markers, *others = files = _tables(experiment, place)
-        names, tracks = experiment.markers.names, trajectory.markers_m + noise
-        write_markers_csv(markers, experiment.t_s, names, tracks)
-        count = len(experiment.grasps)
-        for file, grasp in zip(others[:count], experiment.grasps, strict=True):
-            write_poses_csv(file, grasp.poses)
-        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-        of_wrench = np.repeat([noise_n, noise_nm], 3)
-        for file, sensor, wrench in zip(others[count:], sensors, trajectory.wrenches, strict=True):
-            measured = np.where(sensor.measured, wrench, np.nan)
-            write_wrench_csv(file, sensor.t_s, measured + of_wrench * rng.normal(size=wrench.shape))
-        written += files
-        if frames:
-            written.append(_write_frames(experiment, trajectory, place / experiment.name))
+    with ExitStack() as whole:  # all files appear at its end, or none
+        for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
+            files = _tables(experiment, place)
+            drafts = [whole.enter_context(whole_file(file)) for file in files]
+            _write_tables(experiment, trajectory, drafts, rng, (noise_m, noise_n, noise_nm))
+            written += files
+            if frames:
+                folder = place / experiment.name
+                there = run_folder(folder, mark=FRAMES_FILE, what="simulation")
+                _write_frames(experiment, trajectory, whole.enter_context(there))
+                written.append(folder / FRAMES_FILE)
     return written
+
+
+def _write_tables(
+    experiment: Experiment,
+    trajectory: Trajectory,
+    files: Sequence[Path],
+    rng: np.random.Generator,
+    noises: tuple[float, float, float],
+) -> None:
+    """Write markers, poses and wrenches into the files of `_tables`."""
+    noise_m, *of_wrench = noises
+    noise = noise_m * rng.normal(size=trajectory.markers_m.shape)
+    names, tracks = experiment.markers.names, trajectory.markers_m + noise
+    write_markers_csv(files[0], experiment.t_s, names, tracks)
+    count = len(experiment.grasps)
+    for file, grasp in zip(files[1 : 1 + count], experiment.grasps, strict=True):
+        write_poses_csv(file, grasp.poses)
+    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    sensed = zip(files[1 + count :], sensors, trajectory.wrenches, strict=True)
+    for file, sensor, wrench in sensed:
+        measured = np.where(sensor.measured, wrench, np.nan)
+        noise = np.repeat(of_wrench, 3) * rng.normal(size=wrench.shape)
+        write_wrench_csv(file, sensor.t_s, measured + noise)
 
 
 def _refuse_options(
@@ -140,9 +161,8 @@ def _tables(experiment: Experiment, place: Path) -> list[Path]:
     return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]
 
 
-def _write_frames(experiment: Experiment, trajectory: Trajectory, folder: Path) -> Path:
-    folder.mkdir(exist_ok=True)
+def _write_frames(experiment: Experiment, trajectory: Trajectory, folder: Path) -> None:
     body = experiment.body
-    return write_frames(
+    write_frames(
         folder, trajectory.t_s, trajectory.positions_m, body.cells, body.element, body.nodes_m
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.output.view import frame_files
 
 Damage = Callable[[Path], object]
+links = pytest.mark.skipif(os.name != "posix", reason="links need rights here")
 
 
 @pytest.fixture(scope="module")
@@ -192,3 +194,76 @@ def test_a_damaged_study_is_refused(tmp_path: Path, content: str):
 def test_a_run_of_another_version_is_refused(run: Path, command: str):
     entry(1, "schema")(run)
     assert "result.json has schema 1; expected 2, this version's" in refused(command, run)
+
+
+# Links --------------------------------------------------------------------------------------------
+
+SECRET = "a text of another folder"
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Path:
+    (tmp_path / "secret").write_text(SECRET)
+    return tmp_path / "secret"
+
+
+@links
+@pytest.mark.parametrize("name", ["x.png", "problem.toml"])
+def test_a_page_shows_nothing_that_links_lead_to_elsewhere(run: Path, elsewhere: Path, name: str):
+    (run / name).unlink(missing_ok=True)
+    (run / name).symlink_to(elsewhere)
+    assert run_command("report", run).code == 0
+    page = (run / "report.html").read_text()
+    assert SECRET not in page
+    assert base64.b64encode(SECRET.encode()).decode() not in page
+
+
+@links
+def test_nor_does_that_of_a_study(tmp_path: Path, elsewhere: Path):
+    study = tmp_path / "study"
+    study.mkdir()
+    summary = {"schema": 2, "kind": "sweep", "title": "a", "problem": "p", "headline": "",
+               "runs": [], "notes": [], "tables": [], "failures": []}  # fmt: skip
+    (study / "summary.json").write_text(json.dumps(summary))
+    (study / "sweep.png").symlink_to(elsewhere)
+    assert run_command("report", study).code == 0
+    page = (study / "report.html").read_text()
+    assert base64.b64encode(SECRET.encode()).decode() not in page
+
+
+@links
+@pytest.mark.parametrize(
+    ("name", "command"), [("result.json", "report"), ("trajectory.npz", "plot")]
+)
+def test_a_result_that_is_a_link_to_elsewhere_is_refused(
+    run: Path, tmp_path: Path, name: str, command: str
+):
+    (run / name).rename(tmp_path / name)
+    (run / name).symlink_to(tmp_path / name)
+    assert "is a link to elsewhere" in refused(command, run)
+
+
+@links
+def test_links_within_the_folder_are_followed(run: Path):
+    (run / "result.json").rename(run / "found.json")
+    (run / "result.json").symlink_to("found.json")
+    (run / "own.png").write_bytes(SECRET.encode())
+    (run / "x.png").symlink_to("own.png")
+    assert run_command("report", run).code == 0
+    assert base64.b64encode(SECRET.encode()).decode() in (run / "report.html").read_text()
+
+
+@links
+def test_a_page_is_not_written_through_a_link(run: Path, elsewhere: Path):
+    (run / "report.html").symlink_to(elsewhere)
+    assert run_command("report", run).code == 0
+    assert elsewhere.read_text() == SECRET
+    assert not (run / "report.html").is_symlink()
+
+
+@links
+def test_frames_outside_the_folder_are_refused(run: Path, elsewhere: Path):
+    frames = (run / "trajectory.pvd").read_text()
+    (run / "trajectory.pvd").write_text(frames.replace("frames/frame_0000.vtu", "../secret"))
+    with pytest.raises(InputError, match="not in the folder"):
+        frame_files(run, "swing")

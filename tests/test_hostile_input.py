@@ -203,14 +203,18 @@ def test_an_interrupt_and_sigterm_leave_the_best_result(
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path):
+@pytest.mark.parametrize("host", ["bench", "bench.lab.example.org"])
+def test_what_a_killed_run_left_is_removed_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str
+):
+    monkeypatch.setattr(writers.platform, "node", lambda: host)
     child = subprocess.run(
-        [sys.executable, "-c", "import os, platform; print(f'{platform.node()}-{os.getpid()}')"],
+        [sys.executable, "-c", "import os; print(os.getpid())"],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    stale = tmp_path / f".run.{child.stdout.strip()}-0a1b2c3d.partial"
+    stale = tmp_path / f".run.{host}-{child.stdout.strip()}-0a1b2c3d.partial"
     others = tmp_path / ".walk.elsewhere-1-0a1b2c3d.partial"
-    going_on = tmp_path / f".run.{writers.platform.node()}-{os.getpid()}-0a1b2c3d.partial"
+    going_on = tmp_path / f".run.{host}-{os.getpid()}-0a1b2c3d.partial"
     for folder in (stale, others, going_on):
         folder.mkdir()
     with writers.run_folder(tmp_path / "run") as place:

@@ -97,7 +97,7 @@ def test_pytetwild_fills_a_surface_and_the_cache_repeats_it(tmp_path, monkeypatc
 def test_a_cache_folder_that_cannot_be_made_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(surface, "version", lambda name: "0")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="folder to keep meshes in cannot be made"):
+    with pytest.raises(InputError, match="cannot be written: Not a directory"):
         tetrahedralize_surface(*cube_surface(), 0.02, cache_dir=tmp_path / "file" / "cache")
 
 

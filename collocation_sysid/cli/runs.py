@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from ..files import write_whole
 from ..folders import require_possible
 from .common import AllowCode, AsJson, OneExperiment, Out, Quiet, RunFolder, errors, examples, show
 
@@ -128,7 +129,7 @@ def report(
     study = (folder / "summary.json").is_file()
     page = comparison_page(folder) if study else run_page(folder)
     require_possible(file.parent)
-    file.write_text(page, encoding="utf-8")
+    write_whole(file, page)
     typer.echo(file)
 
 

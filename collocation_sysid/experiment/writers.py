@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from ..files import whole_file
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
 from .readers import MarkerTable
@@ -48,15 +48,8 @@ def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> Non
 
 
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
-    """Write beside the target and rename, so that a reader never meets half a file."""
-    target = Path(path)
-    draft = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        with open(draft, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(header)
-            for row in values:
-                writer.writerow("" if math.isnan(value) else _DIGITS % value for value in row)
-        os.replace(draft, target)
-    finally:
-        draft.unlink(missing_ok=True)
+    with whole_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for row in values:
+            writer.writerow("" if math.isnan(value) else _DIGITS % value for value in row)

@@ -154,6 +154,8 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     except (Exception, SystemExit) as error:
+        if isinstance(error, OSError) and done == "written":  # it tells its file itself
+            raise
         reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise InputError(
             f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "

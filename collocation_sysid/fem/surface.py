@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import subprocess
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ..errors import InputError
+from ..files import whole_file
 from .mesh_checks import cleaned
 from .mesh_files import read_tetrahedra, write_tetrahedra
 
@@ -86,15 +86,10 @@ def tetrahedralize_surface(
     digest.update(points.astype("<f8").tobytes() + faces.astype("<i8").tobytes())
     cached = Path(cache_dir) / f"mesh-{digest.hexdigest()[:16]}.vtu"
     if not cached.exists():
-        try:
-            cached.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"the folder to keep meshes in cannot be made ({error})") from error
-        # A mesh that is refused must not be kept.
-        nodes, tetrahedra, *_ = cleaned(*_run_ftetwild(points, faces, edge_length_m))
-        unfinished = cached.with_name(f"{cached.stem}.{os.getpid()}.vtu")
-        write_tetrahedra(unfinished, nodes, tetrahedra)
-        unfinished.replace(cached)
+        with whole_file(cached) as draft:
+            # A mesh that is refused must not be kept.
+            nodes, tetrahedra, *_ = cleaned(*_run_ftetwild(points, faces, edge_length_m))
+            write_tetrahedra(draft, nodes, tetrahedra)
     nodes, tetrahedra, *_ = read_tetrahedra(cached)
     return nodes, tetrahedra
 

@@ -15,6 +15,7 @@ from rich.text import Text
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.constants import unit_of
+from ..files import whole_file
 from ..output.style import BLUE, ORANGE, dress, mathematical, new_figure
 from .estimator import Update
 
@@ -85,8 +86,7 @@ def film(updates: Sequence[Update], file: str | Path) -> Path:
     lines = [_drawn(figure, k, len(names), name, t_s, updates) for k, name in enumerate(names)]
     step = max(1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND)))
     writer = PillowWriter(fps=FRAMES_A_SECOND)
-    to.parent.mkdir(parents=True, exist_ok=True)
-    with writer.saving(figure, str(to), DPI):
+    with whole_file(to) as draft, writer.saving(figure, str(draft), DPI):
         for stop in [*range(1, len(t_s), step), len(t_s)]:
             for line, values in lines:
                 for part, each in zip(line, values, strict=True):

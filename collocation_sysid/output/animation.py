@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError
+from ..files import whole_file
 from .pictures.camera import Camera
 from .pictures.scene import (
     Drawn,
@@ -102,11 +103,10 @@ def film(
         t_s = np.arange(len(t_s)) / STATES_A_SECOND
     shown = film_samples(t_s, fps, slow)
     ffmpeg = _ffmpeg(file) if file.suffix.lower() == ".mp4" else None
-    file.parent.mkdir(parents=True, exist_ok=True)
     dpi = PIXELS_WIDE[file.suffix.lower()] / (WIDTH_MM / 25.4)
     with rc_context({"animation.ffmpeg_path": ffmpeg} if ffmpeg else {}):
         writer = _writer(fps, ffmpeg)
-        with writer.saving(picture.figure, str(file), dpi):
+        with whole_file(file) as draft, writer.saving(picture.figure, str(draft), dpi):
             for number, t in enumerate(shown):
                 picture.show(int(t))
                 writer.grab_frame()

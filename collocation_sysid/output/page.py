@@ -14,6 +14,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..files import write_whole
 from .pictures.camera import Camera
 from .replay import Replay
 
@@ -39,8 +40,7 @@ def write_page(replay: Replay, file: str | Path) -> Path:
     # What would end the script early cannot be in JSON's strings.
     data = json.dumps(_content(replay)).replace("</", "<\\/")
     page = template.replace("@TITLE@", html.escape(replay.name)).replace("@DATA@", data)
-    Path(file).parent.mkdir(parents=True, exist_ok=True)
-    Path(file).write_text(page, encoding="utf-8")
+    write_whole(file, page)
     return Path(file)
 
 

@@ -25,7 +25,6 @@ def redraw(run: str | Path, folder: str | Path) -> list[Path]:
         free = [name for name, item in result["parameters"].items() if not item["fixed"]]
         confidence = Confidence.from_result(result)
         pictures = album(replays, history, free, confidence, scan=result.get("scan"))
-        folder.mkdir(parents=True, exist_ok=True)
         return save_pictures(folder, pictures)
 
 

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from ..earlier import Earlier
 from ..errors import InputError
-from ..files import RESULT_FILE, read_json
+from ..files import RESULT_FILE, read_json, whole_file
 from ..problem import Problem
 from ..refine import refinement_of
 from ..statistics.estimates import Estimate
@@ -58,8 +58,9 @@ def refine_run(
         for name in set(group) & set(found.errors):
             group[name]["numerical_error"] = asdict(found.errors[name])
     result["trust"] = _judged(before, estimates, found)
-    (file.parent / REFINEMENT_FILE).write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
-    file.write_text(as_json(result) + "\n", encoding="utf-8")
+    with whole_file(file.parent / REFINEMENT_FILE) as beside, whole_file(file) as draft:
+        beside.write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
+        draft.write_text(as_json(result) + "\n", encoding="utf-8")
     return found, result
 
 

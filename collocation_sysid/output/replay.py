@@ -20,7 +20,7 @@ from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..fem.quadratic import EDGES
-from ..files import RESULT_FILE, damage_refused, read_json
+from ..files import RESULT_FILE, damage_refused, read_json, require_own
 
 ARRAYS_FILE = "trajectory.npz"
 # Of the body, and so the same for all experiments of a run.
@@ -284,6 +284,7 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
         If there are none.
     """
     file = run / ARRAYS_FILE
+    require_own(file)
     if not file.is_file():
         raise InputError(f"this is not a run folder: it has no {ARRAYS_FILE}", run)
     try:

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..files import damage_refused
+from ..files import damage_refused, is_own
 from .animation import chosen
 from .page import write_page
 from .pictures.camera import Camera
 from .replay import Replay, read_run
 from .style import BLACK, VERMILION
+from .writers import FRAMES_FILE
 
-FRAMES_FILE = "trajectory.pvd"
 WINDOW = (1100, 800)
 FIELD = "von_mises_pa"
 
@@ -100,8 +100,8 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
     with _reading_frames(run):
         sets = ElementTree.parse(listing).getroot().iter("DataSet")
         found = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
-        if not found or not all(file.is_file() for _, file in found):
-            raise ValueError("it names no frames, or frames that are gone")
+        if not found or not all(is_own(run, file) for _, file in (*found, (0.0, listing))):
+            raise ValueError("it names no frames, or frames that are not in the folder")
         return found
 
 

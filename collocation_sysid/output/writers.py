@@ -19,13 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..fem.elements import Element
-from ..files import RESULT_FILE
+from ..files import RESULT_FILE, naming
 from .fields import ElementFields
 
 # Cell types of the VTK file format by meshio's names, which order nodes alike.
 VTK_CELL_TYPES = {"tetra": 10, "tetra10": 24}
 VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 MAX_FRAMES = 200
+FRAMES_FILE = "trajectory.pvd"
 
 
 # Frames ---------------------------------------------------------------------------------------
@@ -180,7 +181,7 @@ def write_frames(
             in_cells |= {name: values[0] for name, values in fields.at(positions[k]).items()}
         write_vtu(file, positions[k], cells, element.meshio_type, data, in_cells)
         written.append((float(times[k]), file))
-    listing = Path(folder) / "trajectory.pvd"
+    listing = Path(folder) / FRAMES_FILE
     write_pvd(listing, written)
     return listing
 
@@ -218,7 +219,8 @@ def run_folder(
     temporary = target.with_name(f".{target.name}.{owner}.partial")
     temporary.mkdir()
     try:
-        yield temporary
+        with naming(target, temporary):
+            yield temporary
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
@@ -242,7 +244,8 @@ def _remove_stale(target: Path) -> None:
     if os.name != "posix":
         return
     for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
-        found = re.fullmatch(rf"{re.escape(platform.node())}-(\d+)-\w+", folder.name.split(".")[-2])
+        left = rf".*\.{re.escape(platform.node())}-(\d+)-\w+\.partial"
+        found = re.fullmatch(left, folder.name)
         if found and not _runs(int(found[1])):
             shutil.rmtree(folder, ignore_errors=True)
 

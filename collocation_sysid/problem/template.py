@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import write_whole
 from ..folders import require_possible
 
 TEMPLATE = """\
@@ -125,7 +126,6 @@ def write_template(folder: Path) -> Path:
     require_possible(folder)
     if file.exists():
         raise InputError("it is there already; choose another name", file)
-    folder.mkdir(parents=True, exist_ok=True)
     title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
-    file.write_text(TEMPLATE.format(title=title), encoding="utf-8")
+    write_whole(file, TEMPLATE.format(title=title))
     return file

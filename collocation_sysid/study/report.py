@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from ..fem.constants import symbol_of, unit_of
-from ..files import SCHEMA
+from ..files import SCHEMA, whole_file, write_whole
 from ..output.record import as_json
 from .choice import advice, model_notes, model_rows, shown_in
 from .plan import PlannedRun, short_keys
 from .plots import comparison_plots, sweep_plots
-from .store import Record, RunStore, write_whole
+from .store import Record, RunStore
 from .table import Row, Yardstick, method_rows, run_row
 
 RESOLUTION_DPI = 150
@@ -146,7 +146,6 @@ def load_report(
 
 def write_report(report: Report, folder: Path) -> None:
     """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
-    folder.mkdir(parents=True, exist_ok=True)
     rows = report.rows
     write_whole(folder / "runs.csv", as_csv(rows))
     if report.kind == "compare":
@@ -160,7 +159,8 @@ def write_report(report: Report, folder: Path) -> None:
     else:
         figures = sweep_plots(rows, list(report.planned[0].swept))
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.png", dpi=RESOLUTION_DPI)
+        with whole_file(folder / f"{name}.png") as draft:
+            figure.savefig(draft, dpi=RESOLUTION_DPI)
 
 
 def report_json(report: Report) -> dict[str, Any]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..files import write_whole
 from ..output.record import as_json
 
 # What became of a run.
@@ -25,7 +24,6 @@ class RunStore:
 
     def save(self, record: Record) -> None:
         """Write a run's record."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self._file(record["key"]), as_json(record) + "\n")
 
     def load(self, key: str) -> Record | None:
@@ -51,14 +49,3 @@ class RunStore:
 
     def _file(self, key: str) -> Path:
         return self.folder / f"{key}.json"
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file under another name first, so that nobody ever sees half of it."""
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise

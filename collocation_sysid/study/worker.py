@@ -18,13 +18,14 @@ import numpy as np
 
 from ..errors import InputError, SimulationError
 from ..experiment.grasp import held_nodes
+from ..files import write_whole
 from ..output.record import as_json, result
 from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run, run
 from ..starting import heed_interrupts
 from .prediction import model_record
-from .store import ERROR, FINISHED, write_whole
+from .store import ERROR, FINISHED
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...arrays import Array
+from ...files import whole_file
 from ...methods.solution import Iteration
 from ..replay import Replay
 from ..style import RESOLUTION_DPI
@@ -118,6 +119,7 @@ def save_pictures(folder: str | Path, pictures: Mapping[str, Figure]) -> list[Pa
         safe = re.sub(r"[^\w.-]+", "_", name)
         file = Path(folder) / f"{safe}.png"
         # Harder compression takes longer than drawing, for a tenth of the size.
-        figure.savefig(file, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
+        with whole_file(file) as draft:
+            figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
         files.append(file)
     return files

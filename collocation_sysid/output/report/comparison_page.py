@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ...files import damage_refused, read_json
-from .page import picture, rendered
+from .page import own_pictures, picture, rendered
 
 SUMMARY_FILE = "summary.json"
 CAPTIONS = {
@@ -35,9 +35,7 @@ def comparison_page(folder: str | Path) -> str:
             runs=len(summary["runs"]),
             tables=[_checked(table) for table in summary["tables"]],
             pictures=[
-                picture(file, CAPTIONS.get(file.stem, file.stem))
-                for file in sorted(folder.glob("*.png"))
-                if file.is_file()
+                picture(file, CAPTIONS.get(file.stem, file.stem)) for file in own_pictures(folder)
             ],
         )
 

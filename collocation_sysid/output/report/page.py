@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined, TemplateError
 
-from ...files import require_regular
+from ...files import is_own
 
 # Pictures wider than this can be moved sideways on a phone rather than shrunk.
 WIDE_PX = 1000
@@ -58,9 +58,13 @@ def millimetres(metres: float | None) -> str:
     return "–" if metres is None else f"{1e3 * metres:.3g} mm"
 
 
+def own_pictures(folder: Path) -> list[Path]:
+    """The PNG of a folder; what links lead to elsewhere is not shown."""
+    return sorted(file for file in folder.glob("*.png") if is_own(folder, file))
+
+
 def picture(file: Path, caption: str) -> dict[str, Any]:
     """A PNG as an address that holds its data, its caption, and whether it is wide."""
-    require_regular(file)
     content = file.read_bytes()
     data = base64.b64encode(content).decode("ascii")
     width_px = int.from_bytes(content[16:20])  # in the header

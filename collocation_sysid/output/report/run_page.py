@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...fem.constants import symbol_of, unit_of
-from ...files import RESULT_FILE, read_json
+from ...files import RESULT_FILE, is_own, read_json
 from ..remedies import remedies_for, remedy_for
 from ..replay import LARGEST, read_arrays, reading_run
-from .page import millimetres, number, picture, rendered
+from .page import millimetres, number, own_pictures, picture, rendered
 
 SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
 SHOWN_UNITS |= {"N": (1.0, " N"), "N m": (1e3, " mN m"), "kg": (1e3, " g")}
@@ -67,7 +67,7 @@ def run_page(run: str | Path) -> str:
             nuisance=_nuisance(result),
             worst=_worst_errors(run),
             pictures=_pictures(run),
-            problem=_text(run / "problem.toml"),
+            problem=_problem(run),
         )
 
 
@@ -257,7 +257,7 @@ def _pictures(run: Path) -> list[dict[str, Any]]:
         return next((k for k in order if file.stem.startswith(k)), "")
 
     files = sorted(
-        (file for file in run.glob("*.png") if file.is_file()),
+        own_pictures(run),
         key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name),
     )
     found = []
@@ -269,5 +269,6 @@ def _pictures(run: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _text(file: Path) -> str:
-    return file.read_text(encoding="utf-8") if file.is_file() else ""
+def _problem(run: Path) -> str:
+    file = run / "problem.toml"
+    return file.read_text(encoding="utf-8") if is_own(run, file) else ""
