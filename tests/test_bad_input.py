@@ -345,12 +345,6 @@ POSE_FILES = [
     bad("poses-binary", POSES, "not a CSV text file", edit=write(POSES, b"\xff\xfe\x00\x01")),
     bad("poses-without-rows", POSES, "no rows", edit=keep_lines(POSES, 1)),
     bad(
-        "poses-with-semicolons", f"{POSES}: line 1", "semicolons", "expected commas",
-        edit=lambda folder: (folder / POSES).write_text(
-            (folder / POSES).read_text().replace(",", ";")
-        ),
-    ),
-    bad(
         "unknown-pose-column", f"{POSES}: line 1", "x_mm", "expected t_s, x_m",
         edit=replace_text("x_m", "x_mm", POSES),
     ),

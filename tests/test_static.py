@@ -348,9 +348,9 @@ def test_grasps_may_share_nodes_along_different_axes_only():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t_s,z\n0,0\n1,1\n", "the column z names no unit: call it z_m or z_mm"),
-        ("t_s,q_m\n0,0\n", "expected t_s and any of x_m, y_m, z_m (or _cm, _mm, _in)"),
-        ("t_s,z_m,z_mm\n0,0,0\n", "each axis once"),
+        ("t_s,z\n0,0\n1,1\n", "column z names no unit; expected one of m, cm, mm"),
+        ("t_s,q_m\n0,0\n", "expected t_s and any of x_m, y_m, z_m, displacement_m"),
+        ("t_s,z_m,z_mm\n0,0,0\n", "the columns z_m, z_mm may each be z"),
         ("z_m\n0\n", "expected t_s and any of"),
         ("t_s,z_m\n0,0\n0,1\n", "line 3: t_s = 0 follows 0; time must increase"),
         ("t_s,z_m\n0,\n", "line 2"),

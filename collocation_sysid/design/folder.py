@@ -25,6 +25,7 @@ from ..output.record import as_json
 from ..output.replay import Replay
 from ..output.writers import run_folder
 from ..problem import Problem
+from ..problem.schema import ProblemFile, completed
 from .designing import Bars, Design
 from .pictures import pictures
 
@@ -53,6 +54,7 @@ OF_MARKERS = (
     "template_window_s",
     "max_template_residual_m",
 )
+OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
 # A designed motion, poses.csv, and what is predicted to be seen of it at the parameters' guesses.
@@ -159,8 +161,6 @@ def _of_gripper(found: Design) -> PoseSequence:
 def _gripper_to_body(problem: Problem, name: str) -> Array | None:
     if problem.origin is None:
         return None
-    from ..problem.schema import ProblemFile  # what a file says has no place in a problem
-
     sections = ProblemFile.model_validate(tomllib.loads(problem.origin.text)).experiment
     (section,) = (section for section in sections if section.name == name)
     transform = section.grasps[0].gripper_to_body
@@ -171,7 +171,8 @@ def _content(found: Design, folder: Path) -> dict[str, Any]:
     """The problem of the designed recording, and of those there are where they count."""
     origin, recording = found.recording.problem.origin, found.recording
     assert origin is not None
-    content = tomllib.loads(origin.text)
+    content = completed(tomllib.loads(origin.text))
+    content.pop("experiment_defaults", None)
     tables = content["experiment"]
     names = [each.get("name") for each in tables]
     chosen = deepcopy(tables[names.index(recording.template.name)])
@@ -197,12 +198,20 @@ def _designed(table: dict[str, Any]) -> dict[str, Any]:
         grasp.pop(key, None)
     grasp["poses"] = POSES_FILE
     if "wrench" in grasp:
-        grasp["wrench"]["file"] = WRENCH_FILE
+        grasp["wrench"] = _of_design(grasp["wrench"])
     if "markers" in table:
         for key in OF_MARKERS:
             table["markers"].pop(key, None)
         table["markers"]["file"] = MARKERS_FILE
     return table
+
+
+def _of_design(wrench: dict[str, Any]) -> dict[str, Any]:
+    """A wrench's table with the file of the design, which is in newtons and of the mesh."""
+    parts = wrench.get("symmetry", 1)
+    sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
+    kept = {key: value for key, value in wrench.items() if key not in OF_TABLE}
+    return kept | sigmas | {"file": WRENCH_FILE}
 
 
 def _named_from(content: dict[str, Any], old: Path, new: Path) -> None:
@@ -220,7 +229,10 @@ def _relocated_experiment(table: dict[str, Any], old: Path, new: Path) -> dict[s
     grasps = table.get("grasp", [])
     for grasp in grasps if isinstance(grasps, list) else [grasps]:
         _rename(grasp, ("poses", "displacement"), old, new)
-        _rename(grasp.get("wrench", {}), ("file",), old, new)
+        for table_of_columns in (grasp.get("displacement"), grasp.get("wrench")):
+            if isinstance(table_of_columns, dict):
+                _rename(table_of_columns, ("file",), old, new)
+    _rename(table, ("file",), old, new)
     _rename(table.get("markers", {}), ("file",), old, new)
     for key, name in (("force", "file"), ("tendon", "tension"), ("pressure", "pressure")):
         for each in table.get(key, []):

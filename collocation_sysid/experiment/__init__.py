@@ -2,9 +2,8 @@
 
 from .alignment import Aligned, align
 from .clock import sample_interval_s
-from .course_files import read_pressure, read_tension
 from .experiment import Experiment
-from .force_files import read_forces
+from .force_files import read_forces, read_pressure, read_tension
 from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..errors import InputError
+from .formats.columns import DISPLACEMENT, SHIFTS, STRAIN, Columns, read_columns
 from .formats.plain import read_grid
-from .formats.text import Grid, Row, decode, listed, numbers, read_bytes
+from .formats.text import Grid, Row, decode, is_number, listed, numbers, read_bytes
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
@@ -72,11 +73,33 @@ def read_poses(
     return _sequence(path, t_s, positions_m, quaternions, lines)
 
 
-def read_displacement(path: str | Path) -> PoseSequence:
+def read_displacement(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    length_m: float | None = None,
+    timed: bool = True,
+) -> PoseSequence:
     """Read shifts from the undeformed place over time, such as those of a test bench's crosshead.
 
-    A CSV has the columns t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), in any order; along
-    the other axes nothing moves.
+    A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement or
+    strain, in any order; along the other axes nothing moves.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        The column of x, y, z, or of a machine's displacement or strain, and of t, where their names
+        are not recognised.
+    axis : {"x", "y", "z"}
+        Along which a machine's displacement or strain is.
+    sign : {1, -1}
+        What multiplies the file's values: -1 where positive ones go against the axis.
+    length_m : float, optional
+        The undeformed length that an engineering strain multiplies.
+    timed : bool
+        Whether there must be times; else rows count as seconds where there are none.
 
     Raises
     ------
@@ -84,40 +107,33 @@ def read_displacement(path: str | Path) -> PoseSequence:
         If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
         does not increase; the line is named.
     """
-    table, axes = _shifts(path)
-    positions_m = np.zeros((len(table.rows), 3))
-    for name, values in zip(axes, _columns(table, axes).T, strict=True):
-        axis, _, unit = name.partition("_")
-        positions_m[:, "xyz".index(axis)] = values * METRES_PER_UNIT[unit]
+    found = _shifts(path, columns, length_m, timed)
+    positions_m = np.zeros((len(found.t_s), 3))
+    for key, values in found.values.items():
+        along = key if key in "xyz" else axis
+        positions_m[:, "xyz".index(along)] = sign * (length_m or 1.0) * values
     unturned = np.tile([0.0, 0.0, 0.0, 1.0], (len(positions_m), 1))
-    lines = [f"line {line}" for line in table.lines]
-    return _sequence(path, _columns(table, ["t_s"])[:, 0], positions_m, unturned, lines)
+    lines = [f"line {line}" for line in found.grid.lines]
+    return _sequence(path, found.t_s, positions_m, unturned, lines)
 
 
-def displaced_axes(path: str | Path) -> str:
-    """Return along which axes a file tells shifts, such as "z"."""
-    named = {name[0] for name in _shifts(path)[1]}
+def displaced_axes(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    length_m: float | None = None,
+) -> str:
+    """Return along which axes a file tells shifts, such as "z"; see `read_displacement`."""
+    found = _shifts(path, columns, length_m, timed=False).values
+    named = {key if key in "xyz" else axis for key in found}
     return "".join(axis for axis in "xyz" if axis in named)
 
 
-def _shifts(path: str | Path) -> tuple[Grid, list[str]]:
-    """A file of shifts, and its columns but the time."""
-    table = read_grid(path, decode(read_bytes(path), path))
-    axes = [name for name in table.columns if name != "t_s"]
-    known = {f"{axis}_{unit}" for unit in METRES_PER_UNIT for axis in "xyz"}
-    moved = [name[0] for name in axes if name in known]
-    bare = [name for name in axes if name in tuple("xyz")]
-    if table.columns.count("t_s") != 1 or not axes or len(set(moved)) != len(axes):
-        hints = [
-            f"; the column {name} names no unit: call it {name}_m or {name}_mm" for name in bare
-        ]
-        raise InputError(
-            f"the columns are {listed(table.columns)}; expected t_s and any of x_m, y_m, z_m (or "
-            f"_cm, _mm, _in), each axis once{''.join(hints[:1])}",
-            path,
-            "line 1",
-        )
-    return table, axes
+def _shifts(
+    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
+) -> Columns:
+    wanted = (*SHIFTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    return read_columns(path, wanted, columns, timed=timed)
 
 
 def _sequence(
@@ -141,14 +157,10 @@ def _columns(table: Grid, names: list[str] | tuple[str, ...]) -> Array:
 
 def _with_names(table: Grid) -> Grid:
     """Give names to eight columns that have none: the first row is numbers then."""
-    if len(table.columns) != 8 or not all(map(_is_number, table.columns)):
+    if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
     return Grid(table.path, names, [Row(1, table.columns), *table.rows])
-
-
-def _is_number(cell: str) -> bool:
-    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", cell) is not None
 
 
 def _other_columns(table: Grid) -> InputError:

@@ -1,38 +1,51 @@
-"""Wrench files: CSV with t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm."""
+"""Wrench files: any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, or a machine's force or stress."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import InputError, hint_at
-from .clock import TIME_TOLERANCE_S, first_time_fault, unrounded_s
-from .formats.plain import read_grid
-from .formats.text import Grid, decode, listed, numbers, read_bytes
-from .wrench import COMPONENTS
+from ..errors import InputError
+from .clock import TIME_TOLERANCE_S, unrounded_s
+from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
 
-WRENCH_COLUMNS = tuple(f"{c}_{'n' if c.startswith('f') else 'nm'}" for c in COMPONENTS)
+WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
 
 # So many samples must lie within an experiment.
 FEWEST = 3
-# What people write, and what it says.
-_OTHER_UNITS = {
-    "kg": "kilograms, which are a mass",
-    "kgf": "kilograms-force",
-    "mn": "millinewtons",
-    "kn": "kilonewtons",
-    "lbf": "pounds-force",
-    "nmm": "newton millimetres",
-    "mnm": "millinewton metres",
-}
-_FACTORS = {"kgf": 9.80665, "mn": 1e-3, "kn": 1e3, "lbf": 4.4482216, "nmm": 1e-3, "mnm": 1e-3}
 
 
-def read_wrench(path: str | Path) -> tuple[Array, Array]:
+def read_wrench(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    area_m2: float | None = None,
+    symmetry: int = 1,
+    timed: bool = True,
+) -> tuple[Array, Array]:
     """Read what a grasp gives the body over time, columns in any order; blank cells are missing.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        The column of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t, where
+        their names are not recognised.
+    axis : {"x", "y", "z"}
+        Along which a machine's force or stress acts.
+    sign : {1, -1}
+        What multiplies the file's values: -1 where a positive one pulls the body the other way.
+    area_m2 : float, optional
+        The undeformed area that an engineering stress multiplies.
+    symmetry : int
+        The body is one of so many equal parts of what was measured.
+    timed : bool
+        Whether there must be times; else rows count as seconds where there are none.
 
     Returns
     -------
@@ -43,25 +56,17 @@ def read_wrench(path: str | Path) -> tuple[Array, Array]:
     Raises
     ------
     InputError
-        If a column names no unit or another one, is unknown or repeated, a cell is not a number,
-        or time does not increase; the line is named.
+        If a column names no unit or one of something else, is unknown or repeated, a cell is not a
+        number, or time does not increase; the line is named.
     """
-    table = read_grid(path, decode(read_bytes(path), path))
-    for column in table.columns:
-        _check_column(column, table)
-    if "t_s" not in table.columns or len(table.columns) < 2:
-        raise _other_columns(table, "")
-    t_s = numbers(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
-    if fault := first_time_fault(t_s):
-        raise InputError(fault[1], path, f"line {table.lines[fault[0]]}")
-    values = np.full((len(t_s), 6), np.nan)
-    for k, name in enumerate(WRENCH_COLUMNS):
-        if name in table.columns:
-            values[:, k] = numbers(table, [table.columns.index(name)], blank_allowed=True)[:, 0]
-    named = [name for name in WRENCH_COLUMNS if name in table.columns]
-    if empty := [name for name in named if _blank(values, name)]:
-        raise InputError(f"column {empty[0]} is blank throughout; leave it out", path)
-    return (unrounded_s(t_s) if len(t_s) > 2 else t_s), values
+    components = [quantity.key for quantity in (*FORCES, *TORQUES)]
+    wanted = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
+    found = read_columns(path, wanted, columns, blank_allowed=True, timed=timed)
+    values = np.full((len(found.t_s), 6), np.nan)
+    for key, column in found.values.items():
+        component = key if key in components else f"f{axis}"
+        values[:, components.index(component)] = sign * (area_m2 or 1.0) / symmetry * column
+    return (unrounded_s(found.t_s) if len(found.t_s) > 2 else found.t_s), values
 
 
 def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_]:
@@ -89,45 +94,4 @@ def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_
     raise InputError(
         f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(inside.sum())} samples "
         f"are in common; expected {fewest} at least. {hint}"
-    )
-
-
-def _blank(values: Array, name: str) -> bool:
-    return bool(np.isnan(values[:, WRENCH_COLUMNS.index(name)]).all())
-
-
-def _check_column(column: str, table: Grid) -> None:
-    if column in ("t_s", *WRENCH_COLUMNS):
-        if table.columns.count(column) > 1:
-            raise _other_columns(table, f"; {column} is there twice")
-        return
-    what, _, unit = column.lower().replace("·", "").partition("_")
-    if what in COMPONENTS:
-        wanted = WRENCH_COLUMNS[COMPONENTS.index(what)]
-        if not unit:
-            raise InputError(
-                f"column {column} names no unit; expected {wanted}", table.path, "line 1"
-            )
-        times = f": multiply by {_FACTORS[unit]:g}" if unit in _FACTORS else ""
-        said = f" ({_OTHER_UNITS[unit]})" if unit in _OTHER_UNITS else ""
-        raise InputError(
-            f"column {column} has the unit {unit}{said}; expected {wanted}{times}",
-            table.path,
-            "line 1",
-        )
-    if what in ("t", "time", "timestamp"):
-        raise InputError(
-            f"column {column} is no time in seconds; expected t_s, on the clock of the poses",
-            table.path,
-            "line 1",
-        )
-    raise _other_columns(table, f": {column} is none of them{hint_at(column, WRENCH_COLUMNS)}")
-
-
-def _other_columns(table: Grid, why: str) -> InputError:
-    return InputError(
-        f"the columns are {listed(table.columns)}; expected t_s and any of "
-        f"{listed(WRENCH_COLUMNS)}, each once{why}",
-        table.path,
-        "line 1",
     )

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 from ..checked import expected as wanted
 from ..errors import InputError, hint_at
-from .schema import ProblemFile
+from .schema import ProblemFile, completed
 
 Part = str | int
 Fault = Mapping[str, Any]
@@ -38,7 +38,7 @@ def explain(
     faults = error.errors(include_url=False)
     # An unknown key explains the others around it.
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    message = _message(fault, content, root)
+    message = _message(fault, completed(content), root)
     where = _place(fault, content, root)
     others = {_place(other, content, root) for other in faults} - {where}
     if others:
@@ -98,6 +98,11 @@ def _place(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
 def _where(key: Sequence[Part], content: dict[str, Any]) -> str:
     """The key as it is written in the file, experiments by their names."""
     place: Any = content
+    defaults = _inside(content, "experiment_defaults")
+    if key[:1] == ["experiment"] and len(key) > 2:
+        own = _value_at(key[:2], content)
+        if isinstance(own, dict) and key[2] not in own and _inside(defaults, key[2]) is not None:
+            key = ["experiment_defaults", *key[2:]]
     written: list[str] = []
     experiment = ""
     for part in key:

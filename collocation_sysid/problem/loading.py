@@ -79,8 +79,9 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
         names += [section.markers.file]
-        names += [grasp.poses or grasp.displacement for grasp in section.grasps]
-        names += [grasp.wrench.file for grasp in section.grasps if grasp.wrench is not None]
+        for grasp in section.grasps:
+            moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
+            names += [grasp.poses or moved, sensed]
         names += [force.file for force in section.force]
         names += [tendon.tension for tendon in section.tendon]
         names += [pressure.pressure for pressure in section.pressure]

@@ -53,6 +53,7 @@ from .recording_schema import (
     NodesSection,
     NuisanceSection,
     PressureSection,
+    TableSection,
     TendonSection,
     WrenchSection,
 )
@@ -198,8 +199,8 @@ class RecordingReader:
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.displacement is not None:
-            key = self._grasp_key(k, "displacement")
-            moved = read_displacement(existing_file(self.folder, grasp.displacement, key))
+            file = self._file(grasp.displacement, self._grasp_key(k, "displacement"))
+            moved = read_displacement(file, **grasp.displacement.layout, timed=self._timed)
             return replace(moved, interpolation=grasp.interpolation)
         if grasp.poses is None:
             return PoseSequence.fixed()
@@ -263,25 +264,43 @@ class RecordingReader:
 
     def _zero(self, k: int, grasp: GraspSection) -> str:
         """The axes of its displacement."""
-        if grasp.displacement is None:
+        if (table := grasp.displacement) is None:
             return ""
-        file = existing_file(self.folder, grasp.displacement, self._grasp_key(k, "displacement"))
-        return displaced_axes(file)
+        file = self._file(table, self._grasp_key(k, "displacement"))
+        return displaced_axes(file, table.columns, table.axis, table.length_m)
+
+    def _file(self, table: TableSection, key: str) -> Path:
+        """The file of a displacement or a wrench."""
+        name = self.section.file_of(table)
+        if name is None:
+            raise InputError("missing; expected a file here, or of the experiment", None, key)
+        return existing_file(self.folder, name, key if table.file else "file")
+
+    @property
+    def _timed(self) -> bool:
+        """Whether files must tell times: of equilibria rows are enough."""
+        return self.section.kind != "static"
+
+    def _read_wrench(self, section: WrenchSection, key: str) -> tuple[Array, Array]:
+        file, layout = self._file(section, f"{key}.file"), section.layout
+        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._timed)
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
         """What is measured within the experiment's time; zeros to simulate without a file."""
-        given = section.model_dump(exclude={"file"})
-        missing = not (self.folder / section.file).exists()
+        name = str(self.section.file_of(section))
+        given = section.model_dump(include={"frame", "point_m"})
+        given["sigma_n"] = section.sigma_n / section.symmetry
+        given["sigma_nm"] = section.sigma_nm and section.sigma_nm / section.symmetry
         try:
-            if self.simulation and missing:
+            if self.simulation and not (self.folder / name).exists():
                 given["sigma_nm"] = section.sigma_nm or 1.0
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **given)
-            at_s, values = read_wrench(existing_file(self.folder, section.file, f"{key}.file"))
+            at_s, values = self._read_wrench(section, key)
             static = self.section.kind == "static"
-            inside = within(at_s, t_s, section.file, static)
+            inside = within(at_s, t_s, name, static)
             if static and not self.section.marked:
                 inside &= _among(at_s, t_s)
-            self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
+            self._note(f"{name}: {inside.sum()} of {len(at_s)} samples are used")
             return Wrench(at_s[inside], values[inside], **given)
         except InputError as error:
             raise error.located(None, key) from error
@@ -354,14 +373,15 @@ class RecordingReader:
     def _times(self, poses: list[PoseSequence]) -> Array:
         """Those of the wrench where there are no markers, else of the poses."""
         section = self.section
-        named = [grasp.wrench.file for grasp in section.grasps if grasp.wrench is not None]
-        if not named and not section.marked:
+        sensed = [(k, grasp.wrench) for k, grasp in enumerate(section.grasps) if grasp.wrench]
+        if not sensed and not section.marked:
             raise InputError(
                 "nothing is measured: expected markers, or the wrench of a grasp", None, "markers"
             )
-        files = [self.folder / name for name in named if (self.folder / name).exists()]
-        if files and not section.marked:
-            return read_wrench(files[0])[0]
+        there = [s for s in sensed if (self.folder / str(section.file_of(s[1]))).exists()]
+        if there and not section.marked:
+            k, sensor = there[0]
+            return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
         times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
         fewest = 1 if self.section.kind == "static" else 3
         if len(times) < fewest:
@@ -414,7 +434,8 @@ class RecordingReader:
                 section.kind == "static",
             )
         except InputError as error:
-            files = [*(g.poses or g.displacement for g in section.grasps), section.markers.file]
+            moved = (g.poses or section.file_of(g.displacement) for g in section.grasps)
+            files = [*moved, section.markers.file]
             named = " and ".join(dict.fromkeys(name for name in files if name))
             raise InputError(error.message, None, named) from error
         self._note(*aligned.notes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
@@ -79,12 +79,56 @@ class TransformSection(Section):
         return matrix
 
 
-class WrenchSection(Section):
-    """The force and the torque that the grasp was measured to give the body."""
+class TableSection(Section):
+    """Columns of a file, with units in their names."""
 
-    file: Text = Field(
-        description="CSV with t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, at its own "
-        "rate; blank cells are missing."
+    file: Text | None = Field(
+        None, description="A table of columns with units; the experiment's file by default."
+    )
+    columns: dict[str, Text] = Field(
+        default_factory=dict,
+        description="Column of the file by what it is, where its name is not recognised; with a "
+        'unit behind, "Load (N)", that the file does not state.',
+    )
+    axis: Literal["x", "y", "z"] = Field(
+        "z", description="Axis of the world along which a machine measures."
+    )
+    sign: Literal[1, -1] = Field(
+        1, description="-1 where the file's positive values are against the axis, as compression."
+    )
+
+    @property
+    def layout(self) -> dict[str, Any]:
+        """How its columns are read."""
+        return self.model_dump(include={"columns", "axis", "sign", "length_m", "area_m2"})
+
+
+class DisplacementSection(TableSection):
+    """Shifts without turns from the undeformed place, as of a test bench's crosshead.
+
+    Columns t_s and any of x_m, y_m, z_m, in these or other units; or a machine's displacement, or
+    engineering strain with a length.
+    """
+
+    length_m: Positive | None = Field(
+        None, description="Undeformed length that an engineering strain multiplies."
+    )
+
+
+class WrenchSection(TableSection):
+    """The force and the torque that the grasp was measured to give the body.
+
+    Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
+    own rate; or a machine's force, or engineering stress with an area. Blank cells are missing.
+    """
+
+    area_m2: Positive | None = Field(
+        None, description="Undeformed area that an engineering stress multiplies."
+    )
+    symmetry: Annotated[int, Field(strict=True, ge=1)] = Field(
+        1,
+        description="The mesh is one of so many equal parts of what was measured, 4 for a quarter: "
+        "forces and sigmas are divided by it.",
     )
     sigma_n: Positive = Field(description="Standard deviation of the noise of each force [N].")
     sigma_nm: Positive | None = Field(
@@ -102,6 +146,24 @@ class WrenchSection(Section):
     )
 
 
+def _displacement_form(value: Any) -> str:
+    return "<file>" if isinstance(value, str) else "<table>"
+
+
+def _as_table(value: str | DisplacementSection) -> DisplacementSection:
+    return DisplacementSection.model_validate({"file": value}) if isinstance(value, str) else value
+
+
+if TYPE_CHECKING:
+    Displacement = DisplacementSection
+else:
+    Displacement = Annotated[
+        Annotated[DisplacementSection, Tag("<table>")]
+        | Annotated[Text, AfterValidator(_as_table), Tag("<file>")],
+        Discriminator(_displacement_form),
+    ]
+
+
 class GraspSection(Section):
     """Nodes held by a gripper or a test bench, and how it moves."""
 
@@ -116,10 +178,10 @@ class GraspSection(Section):
     poses: Text | None = Field(
         None, description="Poses, CSV or .npz; held where they are without poses or markers."
     )
-    displacement: Text | None = Field(
+    displacement: Displacement | None = Field(
         None,
-        description="CSV with t_s and any of x_m, y_m, z_m (or _cm, _mm, _in): a motion without "
-        "turns from the undeformed place, as of a test bench's crosshead, in place of poses.",
+        description="A file with t_s and any of x_m, y_m, z_m, or a table of file, columns, axis, "
+        "sign: shifts from the undeformed place, as of a crosshead, in place of poses.",
     )
     quaternion: Literal["xyzw", "wxyz"] | None = Field(
         None, description="Order of a quaternion whose columns in poses do not name it."
@@ -580,6 +642,11 @@ class ExperimentSection(Section):
         description="A motion; or samples each of which is an equilibrium of its own, at any times "
         "(with memory, quasi-static in time).",
     )
+    file: Text | None = Field(
+        None,
+        description="Table that displacements and wrenches are read from which name no file: CSV "
+        "as a test bench writes it.",
+    )
     grasp: Grasps = Field(
         default_factory=list, description="A table of nodes and poses, or a list of them."
     )
@@ -630,6 +697,10 @@ class ExperimentSection(Section):
     def marked(self) -> bool:
         """Whether there are markers."""
         return "markers" in self.model_fields_set
+
+    def file_of(self, table: TableSection | None) -> str | None:
+        """The file that a table is read from; None where none is named."""
+        return table and (table.file or self.file)
 
     @property
     def grasps(self) -> list[GraspSection]:

@@ -254,6 +254,10 @@ class ProblemFile(Section):
         description="Names of the model's constants: each {} or a guess to estimate it, a value, "
         "or a tie."
     )
+    experiment_defaults: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Keys that every [[experiment]] has which does not give them itself.",
+    )
     experiment: list[ExperimentSection] = Field(
         min_length=1, description="At least one [[experiment]] table, one for each recording."
     )
@@ -261,3 +265,18 @@ class ProblemFile(Section):
     solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()
     uncertainty: UncertaintySection = UncertaintySection()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed(cls, content: Any) -> Any:
+        return completed(content)
+
+
+def completed(content: Any) -> Any:
+    """The content of a problem file with what its experiments share in each of them."""
+    shared = content.get("experiment_defaults") if isinstance(content, dict) else None
+    given = content.get("experiment") if isinstance(content, dict) else None
+    if not (isinstance(shared, dict) and isinstance(given, list)):
+        return content
+    whole = [shared | table if isinstance(table, dict) else table for table in given]
+    return content | {"experiment": whole}

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import InputError
-from .text import Row, comma_rows, grid, header_number, numbers, refuse_other_count
+from .text import Row, grid, header_number, numbers, refuse_other_count, separated_rows
 from .tracks import Choose, RawTracks
 from .units import stated_unit
 
@@ -32,7 +32,7 @@ class _Columns:
 
 def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
     """Read a Motive CSV file."""
-    rows = comma_rows(text, path)
+    rows = separated_rows(text, path, ",")
     first = rows[0]
     header = dict(zip(first.cells[::2], first.cells[1::2], strict=False))
     top = next((k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None)

@@ -7,38 +7,56 @@ missing there. In both a blank cell or NaN is a missing sample, and (0, 0, 0) is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import InputError
 from ..clock import first_time_fault
-from .text import Grid, comma_rows, grid, listed, numbers
+from .text import Grid, Row, grid, is_number, listed, numbers, separated_rows
 from .tracks import Choose, RawTracks
-from .units import METRES_PER_UNIT
+from .units import METRES_PER_UNIT, UNITS, si_factor
 
 _AXES = ("x", "y", "z")
 _OTHER_FORMATS = "a C3D, TRC, Qualisys TSV or Motive CSV file"
 
 
 def read_grid(path: str | Path, text: str) -> Grid:
-    """Return a comma-separated file with a row of column names.
+    """Return a file of separated cells with a row of column names.
+
+    What a machine writes above the names is left out; units in a row of their own are joined to
+    the names, as in "Load (N)".
 
     Raises
     ------
     InputError
         If it is none, has no rows, or rows of different lengths.
     """
-    rows = comma_rows(text, path)
-    header = rows[0].cells
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise InputError(
-            "the cells are separated by semicolons or tabs; expected commas, and points in "
-            f"numbers, or {_OTHER_FORMATS}",
-            path,
-            "line 1",
-        )
-    return grid(path, header, rows[1:])
+    rows = separated_rows(text, path)
+    names = 0 if "t_s" in rows[0].cells else max(_first_of_numbers(rows) - 1, 0)
+    header = rows[names].cells
+    if names and all(map(_is_unit, header)):
+        above = rows[names - 1].cells
+        header = [f"{a} ({u.strip('()[]')})" for a, u in zip_longest(above, header, fillvalue="")]
+    return grid(path, header, rows[names + 1 :], rows[names].line)
+
+
+def _first_of_numbers(rows: Sequence[Row]) -> int:
+    """Which row is the first that holds several cells of numbers only; 0 where none does."""
+    found = (k for k, r in enumerate(rows) if len(r.cells) > 1 and _holds_numbers(r.cells))
+    return next(found, 0)
+
+
+def _holds_numbers(cells: Sequence[str]) -> bool:
+    return all(is_number(cell.replace(",", ".")) for cell in cells if cell)
+
+
+def _is_unit(cell: str) -> bool:
+    bare = cell.strip("()[]")
+    bracketed = cell in (f"({bare})", f"[{bare}]")
+    return not bare or bracketed or any(si_factor(bare, dimension) for dimension in UNITS)
 
 
 def read(path: str | Path, text: str, choose: Choose) -> RawTracks:

@@ -20,6 +20,11 @@ from ...files import require_regular
 LARGEST = 1e100
 # Letters of a cell that a message quotes.
 LONGEST = 60
+_ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
+_CONTROL, _SEPARATOR = re.compile("[\x01-\x08\x0e-\x1f]"), re.compile("[,;\t]")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_POINTED = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +42,7 @@ class Grid:
     path: Path
     columns: list[str]
     rows: list[Row]
+    names_line: int = 1
 
     @property
     def lines(self) -> list[int]:
@@ -60,31 +66,58 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def decode(content: bytes, path: str | Path) -> str:
-    """Return the text that a file's content is.
+    """Return the text that a file's content is: UTF-8, or as Windows and its machines write it.
 
     Raises
     ------
     InputError
         If it is empty, or no text.
     """
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
+    text = next(filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)), None)
+    if text is None and content:
         raise InputError("is not a CSV text file (UTF-8), nor any other format known here", path)
-    if not text.strip():
+    if not text or not text.strip():
         raise _empty(path)
     return text
+
+
+def _decoded(content: bytes, encoding: str) -> str | None:
+    """The text in an encoding; None where it is none."""
+    if encoding == "utf-16" and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return None
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError:
+        return None
+    odd = encoding != "utf-8-sig" and (_CONTROL.search(text) or not _SEPARATOR.search(text))
+    return None if "\0" in text or odd else text
 
 
 def _empty(path: str | Path) -> InputError:
     return InputError("is empty; expected a line of column names, then rows of numbers", path)
 
 
-def comma_rows(text: str, path: str | Path) -> list[Row]:
-    """Rows of a comma-separated file; blank ones are skipped."""
-    reader = csv.reader(io.StringIO(text, newline=""))
+def separated_rows(text: str, path: str | Path, separator: str | None = None) -> list[Row]:
+    """Rows of a file with this between its cells, or what most lines have; blank ones are skipped.
+
+    Where that is no comma and no number has a point, the commas of numbers are points.
+    """
+    if separator is None:
+        lines = text.splitlines()
+        shares = {mark: sum(mark in line for line in lines) / len(lines) for mark in ";\t"}
+        separator = next((mark for mark, share in shares.items() if share > 0.5), ",")
+    rows = _cells(text, path, separator)
+    if separator == "," or any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
+        return rows
+    return [Row(row.line, [_pointed(cell) for cell in row.cells]) for row in rows]
+
+
+def _pointed(cell: str) -> str:
+    return cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
+
+
+def _cells(text: str, path: str | Path, separator: str) -> list[Row]:
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
         rows = [Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
@@ -101,7 +134,7 @@ def tab_rows(text: str) -> list[Row]:
     return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def grid(path: str | Path, columns: list[str], rows: list[Row]) -> Grid:
+def grid(path: str | Path, columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
     """Return rows as wide as their column names; blank columns at the end of all rows are cut.
 
     Raises
@@ -122,7 +155,7 @@ def grid(path: str | Path, columns: list[str], rows: list[Row]) -> Grid:
                 path,
                 f"line {row.line}",
             )
-    return Grid(Path(path), columns, rows)
+    return Grid(Path(path), columns, rows, names_line)
 
 
 def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
@@ -157,6 +190,11 @@ def tracks(grid: Grid, first_columns: Sequence[int]) -> Array:
     """Coordinates (rows, M, 3) of markers whose x stands in `first_columns`, y and z after it."""
     columns = [first + axis for first in first_columns for axis in range(3)]
     return numbers(grid, columns, blank_allowed=True).reshape(-1, len(first_columns), 3)
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a plain number."""
+    return _NUMBER.fullmatch(cell) is not None
 
 
 def written_number(text: str) -> float:

@@ -1,4 +1,4 @@
-"""Units of length: how files spell them, and what they are in metres."""
+"""Units: how files spell them, and what they are in SI."""
 
 from __future__ import annotations
 
@@ -8,6 +8,22 @@ from ...errors import InputError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 
+# What a unit is times SI, by what is measured. Letters may be small, as in fz_kn, but where that
+# would be another unit.
+UNITS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0},
+    "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, '"': 0.0254},
+    "force": {"n": 1.0, "mn": 1e-3, "MN": 1e6, "kn": 1e3, "kgf": 9.80665, "lbf": 4.4482216},
+    "torque": {"nm": 1.0, "nmm": 1e-3, "mnm": 1e-3},
+    "pressure": {
+        **{"pa": 1.0, "mPa": 1e-3, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9},
+        **{"n/mm²": 1e6, "n/mm2": 1e6, "n/mm^2": 1e6, "bar": 1e5, "mbar": 1e2, "psi": 6894.757},
+    },
+    "ratio": {"-": 1.0, "1": 1.0, "mm/mm": 1.0, "m/m": 1.0, "%": 1e-2},
+}
+# What people write where a force is meant.
+_MASSES = ("g", "kg", "lb", "lbs")
+
 _WORDS = {
     "m": ("m", "meter", "meters", "metre", "metres"),
     "cm": ("cm", "centimeter", "centimeters", "centimetre", "centimetres"),
@@ -15,6 +31,21 @@ _WORDS = {
     "in": ("in", "inch", "inches"),
 }
 _SPELLINGS = {word: unit for unit, words in _WORDS.items() for word in words}
+
+
+def si_factor(unit: str, dimension: str) -> float | None:
+    """What a unit is times SI; None if it is no unit of that dimension."""
+    bare = unit.replace("·", "").replace("*", "").replace(" ", "").replace("μ", "µ")
+    known = UNITS[dimension]
+    if bare not in known and dimension == "length":
+        bare = _SPELLINGS.get(bare.lower(), bare)
+    return known.get(bare, known.get(bare.lower()))
+
+
+def expected_units(unit: str, dimension: str) -> str:
+    """What to write in place of a unit that is none of this dimension."""
+    mass = dimension == "force" and unit.lower() in _MASSES
+    return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
 
 
 def stated_unit(text: str, path: str | Path, where: str) -> str | None:

@@ -1,0 +1,280 @@
+"""Quantities over time in a table: columns found by what is measured, and by the unit they name.
+
+This project writes ``t_s`` and ``fz_n``; machines write ``Time (s)``, ``Load [kN]``, ``Weg in mm``.
+In a table of the first kind every column is to be known; the second kind has others besides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...arrays import Array
+from ...errors import InputError, hint_at
+from ..clock import first_time_fault
+from .plain import read_grid
+from .text import Grid, decode, listed, numbers, read_bytes
+from .units import expected_units, si_factor
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a column may hold.
+
+    Parameters
+    ----------
+    key : str
+        What its column is called here, before the unit.
+    dimension : str
+        Of `UNITS`.
+    unit : str
+        The SI unit, as the names of columns have it.
+    words : str
+        Any of which machines call it.
+    """
+
+    key: str
+    dimension: str
+    unit: str
+    words: str = ""
+
+    @property
+    def column(self) -> str:
+        """The name of its column here."""
+        return f"{self.key}_{self.unit}"
+
+
+TIME = Quantity("t", "time", "s", "time zeit prüfzeit temps tiempo tempo")
+SHIFTS = tuple(Quantity(axis, "length", "m") for axis in "xyz")
+FORCES = tuple(Quantity(f"f{axis}", "force", "n") for axis in "xyz")
+TORQUES = tuple(Quantity(f"t{axis}", "torque", "nm") for axis in "xyz")
+DISPLACEMENT = Quantity(
+    "displacement",
+    "length",
+    "m",
+    "displacement extension elongation compression deflection stroke crosshead position travel "
+    "weg standardweg traversenweg verformung déplacement",
+)
+FORCE = Quantity("force", "force", "n", "force load kraft standardkraft")
+STRAIN = Quantity("strain", "ratio", "1", "strain dehnung stauchung déformation")
+STRESS = Quantity("stress", "pressure", "pa", "stress spannung contrainte")
+TENSION = Quantity("tension", "force", "n", "tension")
+PRESSURE = Quantity("pressure", "pressure", "pa", "pressure druck pression")
+KNOWN = (
+    *(TIME, *SHIFTS, *FORCES, *TORQUES),
+    *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
+)
+
+# A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
+_NAMED = re.compile(
+    r"(?P<name>.*?)\s*(?:[(\[](?P<bracketed>[^()\[\]]*)[)\]]"
+    r"|(?:_|\s/\s*|\sin\s)(?P<behind>[^\s_]+))"
+)
+# Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
+_DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Quantities of a table in SI.
+
+    Attributes
+    ----------
+    grid : Grid
+        Its cells.
+    t_s : (T,) array
+    values : dict
+        (T,) array by the key of each quantity that is there, NaN where missing.
+    notes : tuple of str
+        What was assumed.
+    """
+
+    grid: Grid
+    t_s: Array
+    values: Mapping[str, Array]
+    notes: tuple[str, ...] = ()
+
+
+def read_columns(
+    path: str | Path,
+    wanted: Sequence[Quantity],
+    mapped: Mapping[str, str] | None = None,
+    blank_allowed: bool = False,
+    timed: bool = True,
+    all_of: bool = False,
+) -> Columns:
+    """Read those of the `wanted` quantities that a table has, in any order.
+
+    Parameters
+    ----------
+    path : str or Path
+    wanted : sequence of Quantity
+    mapped : mapping, optional
+        The column of a quantity, by its key; of the time too. A unit that the file does not state
+        may follow it, as in "Load (N)". Recognised by name where nothing is given.
+    blank_allowed : bool
+        Whether cells may be blank.
+    timed : bool
+        Whether there must be times; else rows count as seconds where there are none.
+    all_of : bool
+        Whether each of `wanted` must be there.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, repeated, unknown, without unit or with one of something else, a
+        cell is not a number, or time does not increase; the line is named.
+    """
+    grid = read_grid(path, decode(read_bytes(path), path))
+    if "t_s" in grid.columns and not mapped:
+        _refuse_unknown(grid, wanted, all_of)
+    found = _found(grid, wanted, mapped or {})
+    t = found.pop(TIME.key, None)
+    if len(found) < (len(wanted) if all_of else 1) or (timed and t is None):
+        raise _other_columns(grid, wanted, all_of)
+    values = {key: _values(grid, column, blank_allowed) for key, column in found.items()}
+    if t is None:
+        return Columns(grid, np.arange(float(len(grid.rows))), values, ("rows count as seconds",))
+    t_s = _values(grid, t, False)
+    if fault := first_time_fault(t_s):
+        raise InputError(fault[1], path, f"line {grid.lines[fault[0]]}")
+    return Columns(grid, t_s, values)
+
+
+def _values(grid: Grid, column: tuple[int, float], blank_allowed: bool) -> Array:
+    place, factor = column
+    values = factor * numbers(grid, [place], blank_allowed)[:, 0]
+    if np.isnan(values).all():
+        name = grid.columns[place]
+        raise InputError(f"column {name} is blank throughout; leave it out", grid.path)
+    return values
+
+
+# Which column -------------------------------------------------------------------------------------
+
+
+def _found(
+    grid: Grid, wanted: Sequence[Quantity], mapped: Mapping[str, str]
+) -> dict[str, tuple[int, float]]:
+    """The column of each quantity that is there, and its unit in SI."""
+    quantities = {quantity.key: quantity for quantity in (TIME, *wanted)}
+    for key in mapped:
+        if key not in quantities:
+            expected = f"expected one of {listed(quantities)}{hint_at(key, quantities)}"
+            raise InputError(f"columns has the key {key!r}; {expected}", grid.path)
+    chosen = {key: _mapped(grid, quantities[key], name) for key, name in mapped.items()}
+    sought = wanted if not chosen.keys() - {TIME.key} else ()
+    recognised = {
+        quantity.key: column
+        for quantity in (TIME, *sought)
+        if quantity.key not in chosen and (column := _recognised(grid, quantity)) is not None
+    }
+    return chosen | recognised
+
+
+def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
+    bare, stated = _name_and_unit(name)
+    there = name if name in grid.columns else bare
+    if grid.columns.count(there) != 1:
+        found = "is there twice" if there in grid.columns else "is not there"
+        raise _refused(
+            grid,
+            f"columns.{quantity.key} is {name!r}, which {found}; the columns are "
+            f"{listed(grid.columns)}{hint_at(name, grid.columns)}",
+        )
+    unit = _name_and_unit(there)[1] or stated
+    if quantity in (STRAIN, STRESS) and _words(there) & _DEFORMED:
+        raise _refused(
+            grid,
+            f"column {there} is of the deformed specimen; expected engineering "
+            f"{quantity.key}, by the undeformed length or area",
+        )
+    factor = None if unit is None else si_factor(unit, quantity.dimension)
+    if factor is None:
+        raise _other_unit(grid, there, unit, quantity)
+    return grid.columns.index(there), factor
+
+
+def _recognised(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
+    """The one column that is called so and has such a unit; None if nothing is called so."""
+    units = {
+        k: _name_and_unit(column)[1]
+        for k, column in enumerate(grid.columns)
+        if _is_called(column, quantity)
+    }
+    factors = {k: si_factor(unit, quantity.dimension) for k, unit in units.items() if unit}
+    fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
+    if len(fitting) > 1:
+        raise _refused(
+            grid,
+            f"the columns {listed(grid.columns[k] for k, _ in fitting)} may each be "
+            f'{quantity.key}; expected one, or columns = {{ {quantity.key} = "…" }} to say which',
+        )
+    if units and not fitting:
+        first = next(iter(units))
+        raise _other_unit(grid, grid.columns[first], units[first], quantity)
+    return fitting[0] if fitting else None
+
+
+def _is_called(column: str, quantity: Quantity) -> bool:
+    name, _ = _name_and_unit(column)
+    called = _words(name) & set(quantity.words.split())
+    return name.lower() == quantity.key or bool(called and not _words(name) & _DEFORMED)
+
+
+def _name_and_unit(column: str) -> tuple[str, str | None]:
+    """The parts of a column's name: ("Load", "kN") of "Load (kN)"."""
+    parts = _NAMED.fullmatch(column)
+    if parts is None:
+        return column, None
+    return parts["name"], parts["bracketed"] or parts["behind"]
+
+
+def _words(name: str) -> set[str]:
+    return set(re.findall(r"[^\W\d_]+", name.lower()))
+
+
+# Refusals -----------------------------------------------------------------------------------------
+
+
+def _refused(grid: Grid, message: str) -> InputError:
+    return InputError(message, grid.path, f"line {grid.names_line}")
+
+
+def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> None:
+    known = {quantity.key for quantity in KNOWN}
+    for column in grid.columns:
+        if _name_and_unit(column)[0].lower() not in known:
+            hint = hint_at(column, [quantity.column for quantity in wanted])
+            raise _other_columns(grid, wanted, all_of, f": {column} is none of them{hint}")
+
+
+def _other_columns(
+    grid: Grid, wanted: Sequence[Quantity], all_of: bool, why: str = ""
+) -> InputError:
+    expected = listed(quantity.column for quantity in wanted)
+    needed = [
+        f"; a {quantity.key} needs {size} of the undeformed specimen"
+        for quantity, size in ((STRAIN, "length_m"), (STRESS, "area_m2"))
+        if quantity not in wanted and any(_is_called(column, quantity) for column in grid.columns)
+    ]
+    return _refused(
+        grid,
+        f"the columns are {listed(grid.columns)}; expected {TIME.column} and "
+        f"{'all' if all_of else 'any'} of {expected}, each once, in these or other units"
+        f"{why}{''.join(needed)}",
+    )
+
+
+def _other_unit(grid: Grid, column: str, unit: str | None, quantity: Quantity) -> InputError:
+    has = f"has the unit {unit}" if unit else "names no unit"
+    remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
+    return _refused(
+        grid,
+        f"column {column} {has}; expected {expected_units(unit or '', quantity.dimension)}: "
+        f"{remedy}",
+    )

@@ -1,0 +1,227 @@
+"""Test-bench files as machines write them, and what the recordings of a problem share."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import displaced_axes, read_displacement, read_wrench
+from collocation_sysid.experiment.force_files import read_pressure
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.problem import Problem
+
+TIMES = [0.0, 0.1, 0.2]
+PRESSED_MM = [0.0, 0.25, 0.5]
+LOAD_N = [0.0, 2.5, 6.0]
+
+PLAIN = """\
+Time (s),Displacement (mm),Force (N)
+0,0,0
+0.1,0.25,2.5
+0.2,0.5,6
+"""
+WITH_HEADER = """\
+sample_1
+Compression test;
+Cylinder Diameter: 50mm;
+Speed (mm/min): 10;
+Time (s),Compression (mm),Load (N),Engineering Strain [-],True Strain [-],True Stress (kPa)
+0.000,0.00,0.0,-0.00,-0.00,0.0
+0.100,0.25,2.5,-0.01,-0.01,-9.9
+0.200,0.50,6.0,-0.02,-0.02,-9.8
+"""
+UNITS_BELOW = """\
+"Results Table 1"
+"Time","Compressive extension","Load"
+"(s)","(mm)","(kN)"
+"0.0","0.00","0.0000"
+"0.1","0.25","0.0025"
+"0.2","0.50","0.0060"
+"""
+GERMAN = """\
+Prüfzeit;Standardweg;Standardkraft
+s;mm;N
+0,0;0,00;0,0
+0,1;0,25;2,5
+0,2;0,50;6,0
+"""
+TABS = PLAIN.replace(",", "\t").replace(" (mm)", " / mm").replace(" (s)", " [ms]")
+TABS = TABS.replace("0.1\t", "100\t").replace("0.2\t", "200\t")
+
+
+@pytest.fixture
+def written(tmp_path: Path):
+    """Write a file of a machine."""
+
+    def write(text: str, encoding: str = "utf-8") -> Path:
+        file = tmp_path / "press.csv"
+        file.write_text(text, encoding=encoding)
+        return file
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (PLAIN, "utf-8"),
+        (WITH_HEADER, "utf-8-sig"),
+        (UNITS_BELOW, "utf-8"),
+        (GERMAN, "cp1252"),
+        (TABS, "utf-16"),
+    ],
+    ids=["plain", "header", "units below", "semicolons from Windows", "tabs in UTF-16"],
+)
+def test_a_machines_columns_are_recognised_with_their_units(written, text, encoding):
+    file = written(text, encoding)
+    moved = read_displacement(file, sign=-1)
+    np.testing.assert_allclose(moved.t_s, TIMES)
+    np.testing.assert_allclose(moved.positions_m[:, 2], -1e-3 * np.array(PRESSED_MM))
+    assert displaced_axes(file) == "z"
+    t_s, quarter = read_wrench(file, sign=-1, symmetry=4, axis="x")
+    np.testing.assert_allclose(t_s, TIMES)
+    np.testing.assert_allclose(quarter[:, 0], -np.array(LOAD_N) / 4)
+    assert np.isnan(quarter[:, 1:]).all()
+
+
+def test_strain_and_stress_become_what_a_specimen_of_that_size_does(written):
+    file = written("Strain (%),Stress [MPa]\n0,0\n1,0.02\n2,0.05\n")
+    moved = read_displacement(file, length_m=0.03, timed=False)
+    np.testing.assert_allclose(moved.positions_m[:, 2], [0, 3e-4, 6e-4])
+    t_s, values = read_wrench(file, area_m2=1e-4, timed=False)
+    np.testing.assert_array_equal(t_s, [0, 1, 2])
+    np.testing.assert_allclose(values[:, 2], [0, 2.0, 5.0])
+
+
+def test_columns_are_named_where_they_are_not_recognised(written):
+    file = written("Takt [s],Kanal 1 (mm),Kanal 2,rest\n0,0,0,5\n1,2,3,5\n")
+    moved = read_displacement(file, {"t": "Takt [s]", "displacement": "Kanal 1 (mm)"})
+    np.testing.assert_allclose(moved.positions_m[:, 2], [0, 2e-3])
+    columns = {"t": "Takt [s]", "force": "Kanal 2 (kN)"}
+    np.testing.assert_allclose(read_wrench(file, columns)[1][:, 2], [0, 3000])
+
+
+def test_one_file_in_this_projects_own_form_holds_both(written):
+    file = written("t_s,z_mm,fz_n\n0,0,0\n1,-2,\n2,-3,-1\n")
+    np.testing.assert_allclose(read_displacement(file).positions_m[:, 2], [0, -2e-3, -3e-3])
+    np.testing.assert_array_equal(read_wrench(file)[1][:, 2], [0, np.nan, -1])
+
+
+def test_pressures_have_any_unit(written):
+    file = written("Time (min),Druck (kPa)\n0,0\n1,2\n")
+    t_s, pressure_pa = read_pressure(file)
+    np.testing.assert_allclose(t_s, [0, 60])
+    np.testing.assert_allclose(pressure_pa, [0, 2000])
+
+
+BAD = {
+    "no unit": ("Time (s),Force\n0,1\n1,2\n", {}, "line 1: column Force names no unit"),
+    "a mass": ("Time (s),Load (kg)\n0,1\n1,2\n", {}, "a unit of force, one of n, mn"),
+    "two": (
+        "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
+        {},
+        'Load (N), Force (N) may each be force; expected one, or columns = { force = "…" }',
+    ),
+    "only stress": ("Time (s),Stress (kPa)\n0,1\n1,2\n", {}, "a stress needs area_m2"),
+    "no area": (PLAIN, {"area_m2": 1.0}, "expected t_s and any of stress_pa"),
+    "true stress": (
+        "Time (s),True Stress (kPa)\n0,1\n1,2\n",
+        {"area_m2": 1.0, "columns": {"stress": "True Stress (kPa)"}},
+        "column True Stress (kPa) is of the deformed specimen; expected engineering stress",
+    ),
+    "not there": (PLAIN, {"columns": {"force": "Forse (N)"}}, "did you mean 'Force (N)'"),
+    "no such key": (PLAIN, {"columns": {"load": "Force (N)"}}, "the key 'load'; expected one of t"),
+    "header": (
+        WITH_HEADER.replace("0.25,2.5", "0.25,wet"),
+        {},
+        "line 7: column Load (N) holds 'we",
+    ),
+    "mixed commas": (GERMAN.replace("0,25", "0.25"), {}, "holds '0,0'"),
+    "a length": ("Time (s),Force (mm)\n0,1\n1,2\n", {}, "Force (mm) has the unit mm"),
+}
+
+
+@pytest.mark.parametrize(("text", "how", "words"), BAD.values(), ids=BAD)
+def test_what_cannot_be_the_force_says_why_and_what_to_write(written, text, how, words):
+    with pytest.raises(InputError, match=re.escape(words)):
+        read_wrench(written(text), **how)
+
+
+# What recordings share ----------------------------------------------------------------------------
+
+SHARED = """\
+[object]
+mesh = "block.vtu"
+density_kg_m3 = 1000.0
+
+[parameters]
+young_pa = { guess = 5e4 }
+poisson = 0.3
+gamma_r_s = 0.0
+gamma_m_1_s = 0.0
+
+[experiment_defaults]
+kind = "static"
+every = 2
+grasp = [
+    { nodes = { box_m = [[-1, -1, -1], [1, 1, 1e-4]] } },
+    { nodes = { box_m = [[-1, -1, 0.0999], [1, 1, 1]] }, displacement = { sign = -1 }, \
+wrench = { sign = -1, symmetry = 4, sigma_n = 0.04 } },
+]
+
+[[experiment]]
+name = "first"
+file = "first.csv"
+
+[[experiment]]
+name = "second"
+file = "second.csv"
+every = 1
+"""
+
+
+def block_problem(folder: Path, text: str = SHARED) -> Path:
+    box_mesh((0.05, 0.05, 0.1), (1, 1, 2)).write(folder / "block.vtu")
+    for k, name in enumerate(("first", "second")):
+        (folder / f"{name}.csv").write_text(PLAIN + f"0.3,0.{7 + k},{8 + k}\n")
+    (folder / "problem.toml").write_text(text)
+    return folder / "problem.toml"
+
+
+def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
+    problem = Problem.read(block_problem(tmp_path))
+    first, second = problem.experiments
+    np.testing.assert_allclose(first.t_s, [0, 0.2])
+    np.testing.assert_allclose(second.t_s, [0, 0.1, 0.2, 0.3])
+    (sensor,) = (grasp.wrench for grasp in second.grasps if grasp.wrench)
+    np.testing.assert_allclose(sensor.values[:, 2], np.array([0, -2.5, -6, -9]) / 4)
+    assert sensor.sigma_n == 0.01
+    assert problem.origin is not None
+    assert {file.name for file in problem.origin.files} == {"block.vtu", "first.csv", "second.csv"}
+    overridden = Problem.read(tmp_path / "problem.toml", ["experiment_defaults.every=3"])
+    np.testing.assert_allclose(overridden.experiments[0].t_s, [0, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("every = 2", "every = 0", "problem.toml: experiment_defaults.every: found 0"),
+        ("kind =", "kynd =", "experiment_defaults.kynd: unknown key; did you mean 'kind'"),
+        ("every = 1", "every = 0", "experiment 'second': every: found 0"),
+        ('"first.csv"', '"third.csv"', "experiment 'first': file: "),
+        ('file = "first.csv"', "", "experiment 'first': grasp.1.displacement: missing; expected a"),
+        ("{ sign = -1 }", "{ sign = 2 }", "experiment_defaults.grasp.1.displacement.sign: found 2"),
+        ("[experiment_defaults]", "[[experiment_defaults]]", "experiment_defaults: found ["),
+    ],
+)
+def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, words):
+    assert old in SHARED
+    file = block_problem(tmp_path, SHARED.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        Problem.read(file)
+    assert words in str(caught.value)
+    assert "more to mend" not in str(caught.value)
