@@ -12,6 +12,7 @@ from .experiment.turning import TOO_FAST, fastest_turn
 from .fem.plausible import odd_material, oddities
 from .methods.solution import Solution, Status, pooled_wrench_rms
 from .nlp.schemes import as_scheme
+from .nlp.stability import instabilities
 from .problem import Problem
 from .rollout import Rollout
 from .statistics.diagnostics import MarkerDiagnosis
@@ -26,6 +27,7 @@ from .statistics.trust import (
     parameter_concerns,
     rollout_concerns,
     scheme_concerns,
+    stability_concerns,
 )
 from .statistics.uncertainty import Uncertainty
 
@@ -64,6 +66,7 @@ def concerns(
         for k in nuisance.places("time"):
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
+    yield from stability_concerns(instabilities(solution.collocation, solution.z))
     for name, rollout in rollouts.items():
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation

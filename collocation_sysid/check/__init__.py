@@ -21,10 +21,12 @@ from ..nlp.overstress import Overstress
 from ..nlp.reaction_rows import Reactions
 from ..nlp.schemes import as_scheme
 from ..nlp.sensor_rows import SensorRows
+from ..nlp.stability import instabilities
 from ..problem import Problem
 from ..statistics.cause import Cause
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
+from ..statistics.trust import stability_concerns
 from .cost import Cost, cost_notes, cost_warnings, costs
 from .derivatives import SAMPLES, derivative_errors, shortened
 from .description import description_causes
@@ -160,6 +162,7 @@ def check_problem(problem: Problem) -> Findings:
         warnings += hold_warnings(hold)
     for motion in motions:
         warnings += motion_warnings(motion)
+    warnings += [said for said, _ in stability_concerns(instabilities(collocation, z))]
     for experiment in problem.experiments:
         warnings += turning_warnings(experiment, problem.substeps)
     for recording in recordings:

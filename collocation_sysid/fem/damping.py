@@ -1,8 +1,8 @@
 """Damping laws: a potential or a stress of the rate of deformation, and the constants it needs.
 
-Kelvin and Voigt's is objective: S_v = γ_r dS/dt, S = 2 ∂ψ/∂C, is a stress in the material frame
-and dissipates γ_r Ė:4 ∂²ψ/∂C²:Ė. Rayleigh's is the same at small strain, but it also resists that
-a stretched body turns.
+Kelvin and Voigt's is objective and dissipates at any strain, with viscosities by the small-strain
+Lamé constants. Rayleigh's is the same at small strain, but it also resists that a stretched body
+turns, and feeds energy in where the stiffness is not positive.
 
 Beside it the mass of a region is damped by γ_m, see `body`.
 """
@@ -17,9 +17,12 @@ import casadi as ca
 from ..errors import InputError, hint_at
 from .constants import GAMMA_R, Constant
 from .kernel import mirrored
+from .materials import lame_constants
 
 Potential = Callable[..., ca.SX]
 Stress = Callable[..., tuple[ca.SX, ca.SX]]
+# Where the entries of Aᵀ stand in A, both stacked column after column.
+TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,22 +50,23 @@ class Damping:
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """P_v = γ_r F dS/dt = γ_r (dP/dt − Ḟ S), and γ_r (∂(dP/dt)/∂F − Ḟ ∂S/∂F).
+    """P_v = F S_v, S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹ with η = γ_r μ, ζ = γ_r λ.
 
-    With S = F⁻¹ P, ∂S/∂F:A = F⁻¹ (∂P/∂F:A − A S).
+    That is the Kirchhoff stress 2η d + ζ (tr d) 1 of the rate of deformation d, the symmetric part
+    of L = Ḟ F⁻¹: what it dissipates, 2η d:d + ζ (tr d)², is positive whatever F.
     """
-    stiffness, stress = ca.hessian(psi, F)
-    change = ca.jtimes(stress, F, rate)
-    slope = mirrored(ca.jacobian(change, F))
-    # A linear material knows no difference between the shapes; its stress does not turn along.
+    stiffness, _ = ca.hessian(psi, F)
+    # A linear material knows no difference between the shapes.
     if not ca.depends_on(stiffness, F):
-        return gamma_r_s * change, gamma_r_s * slope
-    inverse, Fdot = ca.inv(ca.reshape(F, 3, 3)), ca.reshape(rate, 3, 3)
-    S = mirrored(inverse @ ca.reshape(stress, 3, 3))
-    change -= ca.vec(Fdot @ S)
-    turning = mirrored(stiffness) - ca.kron(S, ca.SX.eye(3))
-    slope -= ca.kron(ca.SX.eye(3), Fdot @ inverse) @ turning
-    return gamma_r_s * change, gamma_r_s * slope
+        return gamma_r_s * mirrored(stiffness) @ rate, ca.SX(9, 9)
+    lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
+    one, inverse = ca.SX.eye(3), ca.inv_minor(ca.reshape(F, 3, 3))
+    L = ca.reshape(rate, 3, 3) @ inverse
+    P = (shear * (L + L.T) + lame * ca.trace(L) * one) @ inverse.T
+    stress = ca.vec(P)
+    # dF changes L as a rate −L dF would, and F⁻ᵀ by −F⁻ᵀ dFᵀ F⁻ᵀ.
+    slope = -ca.jacobian(stress, rate) @ ca.kron(one, L) - ca.kron(inverse, P)[:, TRANSPOSED]
+    return stress, slope
 
 
 def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:

@@ -17,7 +17,7 @@ their symmetric part and, where they have one, of their skew part, column after 
 All of them are derivatives of two scalars: an energy Θ(x, v) = Σ_q V_q (ψ + ψ_d), with the
 potential of a damping law that has one, and half the power that one with a stress dissipates,
 D(x, v) = ½ Σ_q V_q P_v:Ḟ. The internal force is −∂Θ/∂x − ∂D/∂v. For Rayleigh's law that is
-−∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q γ_r F dS/dt ∇N. With memory, see `memory`,
+−∂Ψ/∂x − γ_r K v, for Kelvin and Voigt's −∂Ψ/∂x − Σ_q V_q F S_v ∇N. With memory, see `memory`,
 the point has the energy V_q ((1 + s) ψ + ½ H : FᵀF), and the damping law that of ψ. Second
 derivatives are then of σ·S besides, S being the second Piola–Kirchhoff stress of ψ by its entries
 xx, yy, zz, xy, xz, yz.

@@ -90,10 +90,8 @@ class Material:
     def lame(self) -> ca.Function:
         """Small-strain (λ, μ) from the constants: C₁₁₂₂ and C₁₂₁₂ at F = I."""
         F, values = ca.SX.sym("F", 9), ca.SX.sym("values", len(self.constants))
-        tangent, _ = ca.hessian(self.psi(ca.reshape(F, 3, 3), values), F)
-        entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
-        at_rest = ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel())))
-        return ca.Function("lame", [values], [ca.simplify(at_rest)])
+        psi = self.psi(ca.reshape(F, 3, 3), values)
+        return ca.Function("lame", [values], [lame_constants(psi, F)])
 
     def _check_at_rest(self) -> None:
         F, values = ca.SX.sym("F", 9), ca.SX.sym("values", len(self.constants))
@@ -119,6 +117,13 @@ class Material:
 
     def _said(self, values: list[float]) -> str:
         return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
+
+
+def lame_constants(psi: ca.SX, F: ca.SX) -> ca.SX:
+    """Small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked (9,)."""
+    tangent, _ = ca.hessian(psi, F)
+    entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
+    return ca.simplify(ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel()))))
 
 
 def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:

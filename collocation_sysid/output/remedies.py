@@ -92,6 +92,13 @@ REMEDIES = (
         "scheme",
     ),
     Remedy(
+        "States that are not stable",
+        r"disturbances grow",
+        "Look whether the body buckles there. If not, the damping feeds energy in: take "
+        'damping = "kelvin-voigt", which cannot, and see that moduli and densities can be true.',
+        "material",
+    ),
+    Remedy(
         "The mesh",
         r"step and mesh move|elements lock|elements lie across|nearly flat",
         'Refine it, and take element = "tet10", or "tet10-p0" from ν = 0.45 on. '

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import Array
+from ..nlp.stability import Instability
 from .cause import Cause
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import normal_isf
@@ -48,6 +49,8 @@ WILD, HARDLY_TAME = MOST_WILD, 0.2
 # What a scheme adds to the damping ratio, over it; and by how much it may lengthen a period.
 DAMPING_SHARE, GROSS_DAMPING_SHARE, LITTLE_DAMPING = 0.2, 1.0, 0.005
 PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
+# Powers of e by which a disturbance may grow in a recording.
+E_FOLDINGS, GROSS_E_FOLDINGS = 1.0, 7.0
 # Standard errors that step and mesh may move a parameter: the half width of its interval.
 MOVED = 2.0
 # How what is said of the numerical error begins: estimated, and measured.
@@ -259,6 +262,15 @@ def rollout_concerns(
         f"{1e3 * fit_rms_m:.2g} mm"
     )
     return [(said, "doubtful" if missed_m > GROSS_ROLLOUT * yardstick_m else "check")]
+
+
+def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
+    """States of the answer in which disturbances grow."""
+    return [
+        (each.sentence, "doubtful" if each.e_foldings > GROSS_E_FOLDINGS else "check")
+        for each in found
+        if each.e_foldings > E_FOLDINGS
+    ]
 
 
 def scheme_concerns(
