@@ -64,7 +64,7 @@ def held_at_both_ends(body: Body, disturbed_m: float = 0.0, samples: int = 101) 
     free = np.setdiff1d(np.arange(len(start)), ends)
     start[free] += disturbed_m * np.random.default_rng(1).uniform(-1, 1, (len(free), 3))
     bottom, top = (nodes_where(body, 2, z) for z in (0.0, SIZE_M[2]))
-    up = PoseSequence([0.0, 1.0], [[0, 0, (STRETCH - 1) * SIZE_M[2]]] * 2, [[0, 0, 0, 1]] * 2)
+    up = PoseSequence.fixed().shifted((0, 0, (STRETCH - 1) * SIZE_M[2]))
     stretched = [Grasp(bottom, PoseSequence.fixed()), Grasp(top, up)]
     return Experiment(
         body,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, eigsh, splu
 
 from ..arrays import Array, Index
@@ -123,12 +124,12 @@ def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: A
 
 def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     """The largest Re(s) of s² + D s + K."""
-    size = stiffness.shape[0]
+    size = len(stiffness.diagonal())
     if size <= DENSE:
-        return _of_dense(stiffness.toarray(), damping.toarray())
+        return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
     start = np.random.default_rng(0).normal(size=size)
     lowest = [
-        eigsh(each, DIRECTIONS, which="SA", tol=TOLERANCE, v0=start, ncv=12 * DIRECTIONS)[1]
+        eigsh(each, DIRECTIONS, which="SA", tol=TOLERANCE, v0=start, ncv=12 * DIRECTIONS)[1]  # pyright: ignore[reportArgumentType]
         for each in (stiffness, damping)
         if each.nnz
     ]
@@ -139,37 +140,43 @@ def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     return max(_near(stiffness, damping, float(abs(guess))), 0.0)
 
 
-def _of_dense(stiffness: Array, damping: Array) -> float:
-    return float(_exponents(stiffness, damping).real.max())
-
-
-def _exponents(stiffness: Array, damping: Array) -> Array:
+def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
     """Every s of dense matrices."""
     size = len(stiffness)
     chain = np.block([[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]])
-    return np.linalg.eigvals(chain)
+    return np.linalg.eigvals(chain).astype(np.complex128)
+
+
+class _Turned(LinearOperator):
+    """(A + σ)/(A − σ) of A = [[0, 1], [−K, −D]] and a σ > 0.
+
+    Its eigenvalues (s + σ)/(s − σ) are beyond the unit circle where Re(s) > 0: those that
+    Arnoldi's iterations find first.
+    """
+
+    def __init__(self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> None:
+        size = len(stiffness.diagonal())
+        super().__init__(np.dtype(float), (2 * size, 2 * size))
+        self.damping, self.sigma = damping, sigma
+        self.solver = splu(
+            sp.csc_array(sigma**2 * sp.eye_array(size) + sigma * damping + stiffness)
+        )
+
+    def _matvec(self, x: Array) -> Array:
+        first, second = np.split(np.ravel(x), 2)
+        # (A − σ)(y, w) = (first, second), by way of (σ² + σ D + K) y.
+        y = self.solver.solve(-second - self.damping @ first - self.sigma * first)
+        w = first + self.sigma * y
+        return np.concatenate([first + 2 * self.sigma * y, second + 2 * self.sigma * w])
 
 
 def _near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
-    """The same of sparse ones, about as fast as σ > 0.
-
-    Of A = [[0, 1], [−K, −D]], (A + σ)/(A − σ) has the eigenvalues (s + σ)/(s − σ), which are
-    beyond the unit circle where Re(s) > 0: Arnoldi's iterations find those first.
-    """
-    size = stiffness.shape[0]
-    solver = splu(sp.csc_array(sigma**2 * sp.eye_array(size) + sigma * damping + stiffness))
-
-    def mapped(z: Array) -> Array:
-        x, v = np.split(np.ravel(z), 2)
-        # (A − σ)(y, w) = (x, v): w = x + σ y and (σ² + σ D + K) y = −v − (D + σ) x.
-        y = solver.solve(-v - damping @ x - sigma * x)
-        return np.concatenate([x + 2 * sigma * y, v + 2 * sigma * (x + sigma * y)])
-
-    operator = LinearOperator((2 * size, 2 * size), mapped, dtype=float)
-    start = np.random.default_rng(0).normal(size=2 * size)
+    """The same of sparse ones, about as fast as σ."""
+    turning = _Turned(stiffness, damping, sigma)
     try:
-        turned = eigs(operator, 4, which="LM", v0=start, ncv=60, return_eigenvectors=False)
+        found = eigs(turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60)
+        turned = np.asarray(found[0])
     except ArpackNoConvergence as stopped:
-        turned = stopped.eigenvalues
+        turned = np.asarray(stopped.eigenvalues)
     exponents = sigma * (turned + 1) / (turned - 1)
     return float(exponents.real.max(initial=0.0))
