@@ -185,3 +185,10 @@ def test_what_grows_is_told_with_its_rate(law, told):
         (sentence, _), = concerns  # fmt: skip
         assert "'bar' is not stable" in sentence
         assert "disturbances grow by" in sentence
+
+
+def test_a_body_without_damping_is_stable():
+    body = bar()
+    theta = body.theta(CONSTANTS | {"gamma_r_s": 0.0})
+    free = free_dofs(body, held(body))
+    assert growth_rate_1_s(Forces.on(body), equilibrium(body, held(body)).ravel(), free, theta) == 0

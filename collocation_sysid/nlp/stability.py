@@ -115,10 +115,13 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, theta: Array) ->
 
 
 def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
-    """Whether a matrix is positive definite, or as good as."""
-    shifted = lower.copy()
+    """Whether a matrix is positive definite, or as good as: none is."""
     own = pattern.diagonal[free_dofs]
-    shifted[own] += SHIFT * max(float((lower[own] / mass).max()), np.finfo(float).tiny) * mass
+    largest = float((lower[own] / mass).max())
+    if largest <= 0:
+        return not lower[own].any()
+    shifted = lower.copy()
+    shifted[own] += SHIFT * largest * mass
     return Factoriser.of(pattern, free_dofs).factorise(shifted).positive_definite
 
 
