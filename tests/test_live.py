@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from problem_files import run_command
+from problem_files import Outcome, run_command
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
@@ -42,6 +42,7 @@ from collocation_sysid.statistics.uncertainty import covariance
 NOISE_M = 3e-4
 # No time to pass anything again.
 NO_TIME = LiveOptions(budget_s=1e-9)
+TWENTY = 20 * "9"
 
 
 @cache
@@ -442,6 +443,28 @@ def test_a_track_that_jumps_is_left_out():
     assert live.counts["wild"] == 1
 
 
+@pytest.mark.parametrize("number", [0, 4])
+def test_what_is_nowhere_near_the_body_or_the_last_grasp_is_left_out(number):
+    problem = swing()
+    live, without = Estimator(problem, NO_TIME), Estimator(problem, NO_TIME)
+    for k, frame in enumerate(frames_of(problem, live)[:12]):
+        bad, blind = frame, frame
+        if k == number:
+            seen = frame.tracks_m.copy()
+            seen[2] = np.nan
+            blind = replace(frame, tracks_m=seen)
+            bad = replace(frame, tracks_m=np.where(np.isnan(seen), 1e6, seen))
+        if k == 6:
+            places_m, turns = frame.pose
+            nowhere = np.full_like(frame.tracks_m, np.nan)
+            blind = replace(frame, pose=None, tracks_m=nowhere)
+            bad = replace(frame, pose=(places_m + 1e6, turns))
+        said, expected = live.take(bad), without.take(blind)
+        assert ("left out, far from where they can be: m2" in said.notes) == (k == number)
+        assert any("too far from the last" in note for note in said.notes) == (k == 6)
+        assert said.estimates == expected.estimates
+
+
 def test_frames_between_samples_are_read_there():
     problem = swing()
     live = Estimator(problem, NO_TIME)
@@ -549,14 +572,21 @@ def test_frames_are_read_from_json_and_from_tables():
         ('{"t_s": true}', "line 2: t_s is True"),
         ('{"t_s": 1, "pose": {"position_m": [0, 0, 0]}}', "no quaternion_xyzw"),
         ('{"t_s": 1, "markers": {"a": [1, 2]}}', "expected 3 numbers"),
+        (f'{{"t_s": {TWENTY}}}', f"t_s is {TWENTY}; expected a finite number of seconds"),
+        (f'{{"t_s": 1, "markers": {{"a": [0, {15 * TWENTY}, 0]}}}}', "numbers up to 1e.10"),
+        (f'{{"t_s": 1, "markers": {{"a": [0, {20 * TWENTY}, 0]}}}}', "expected 3 numbers"),
+        (f'{{"t_s": {250 * TWENTY}}}', "a number is too long"),
+        (f'{{"t_s": {"[" * 100_000}', "brackets too deep"),
+        (f'{{"t_s": 1, "markers": {{"a": {"[" * 300}{"]" * 300}}}}}', "expected 3 numbers"),
         ("[1, 2]", "neither a JSON object nor a header"),
     ],
 )
 def test_bad_lines_are_named(line, said):
     reader = FrameReader([1], ["a"], "input")
     reader.read("")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=said) as refused:
         reader.read(line)
+    assert len(str(refused.value)) < 200
 
 
 @pytest.mark.parametrize("cell", ["one", "1_000"])
@@ -606,20 +636,28 @@ def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
         (position,), (quaternion,) = frame.pose
         pose = {"position_m": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
         markers = dict(zip(live.names, frame.tracks_m.tolist(), strict=True))
-        lines.append(json.dumps({"t_s": frame.t_s, "pose": pose, "markers": markers}))
+        line = json.dumps({"t_s": frame.t_s, "pose": pose, "markers": markers})
+        lines.append(line.encode())
     expected = [json.loads(as_json(live.take(f))) for f in frames_of(problem, live)]
-    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
-    ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
+
+    def streamed_bytes(*lines: bytes) -> Outcome:
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\n".join(lines))))
+        return run_command("live", "problem.toml", "--budget-ms", "1e-6")
+
+    ended = streamed_bytes(*lines)
     *found, settled = [json.loads(line) for line in ended.out.splitlines()]
     assert [each["t_s"] for each in found] == [each["t_s"] for each in expected]
     assert found[-1]["parameters"] == expected[-1]["parameters"]
     assert "settled after the last frame" in settled["notes"]
     assert ended.code == 0
-    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines[:2], "{", lines[2]])))
-    ended = run_command("live", "problem.toml", "--budget-ms", "1e-6")
+    bad = b"{", lines[0].replace(b"0", b"\xff"), b"\xff\xfe", b'{"t_s":' + 10_000 * b"["
+    ended = streamed_bytes(*lines[:2], *bad, *lines[2:])
     assert ended.code == 2
     assert "standard input, line 3: no JSON" in ended.err
-    assert len(ended.out.splitlines()) == 3 + 1
+    assert len(ended.err.splitlines()) == len(bad)
+    assert [json.loads(line)["t_s"] for line in ended.out.splitlines()[:-1]] == [
+        each["t_s"] for each in expected
+    ]
 
 
 def test_a_recording_is_replayed_and_filmed(tiny):

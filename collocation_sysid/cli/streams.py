@@ -58,14 +58,14 @@ def live(
     out, and the exit code is 2 then. An empty datagram ends.
     """
     from ..live.frames import FrameReader
-    from ..live.sources import as_json, datagrams
+    from ..live.sources import as_json, as_text, datagrams
 
     estimator = _estimator(problem, set_, allow_code, budget_ms, window_s)
 
     def opened(port: int) -> None:
         errors.print(f"listening on UDP port {port} of this machine")
 
-    lines, source = (sys.stdin, "standard input")
+    lines, source = as_text(sys.stdin.buffer), "standard input"
     if udp is not None:
         lines, source = datagrams(udp, opened), f"UDP port {udp}"
     reader = FrameReader(estimator.model.moved_grasps + 1, estimator.names, source)

@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..checked import AtLeastOne, Positive
@@ -60,8 +61,9 @@ SHARE, BLOCKS = 0.8, 12
 REJECTED = 3
 # Times that rows are timed before frames come.
 TIMED = 3
-# Residuals this many times the usual are no noise.
-JUMP = 6.0
+# Residuals this many times the usual are no noise. So many sizes of the body from where its grasp
+# carries it there is nothing of it, whatever it is made of, nor does a grasp go so far in a sample.
+JUMP, FAR = 6.0, 5.0
 # Frames between two looks at all residuals.
 LOOK_EVERY = 5
 
@@ -149,7 +151,9 @@ class Estimator:
         self.problem, self.options, self.clock = problem, options, clock
         self.model = Model.of(problem)
         model, self.names = self.model, self.model.experiment.markers.names
-        self.intake = Intake(model.interval_s, model.substeps, model.samples_around)
+        self._reach_m = FAR * model.size_m
+        around = model.samples_around
+        self.intake = Intake(model.interval_s, model.substeps, around, self._reach_m)
         self.counts, self.samples = self.intake.counts, 0
         self.budget_s = options.budget_s or SHARE * model.interval_s
         self.rows = options.rows
@@ -161,6 +165,7 @@ class Estimator:
         self.prior = Information.none(model.size)
         self.track: Track | None = None
         self._newest = Newest(self.prior, [], [])
+        self._carried_m = np.full((1, 3), np.nan)
         self.again: Track | None = None
         self.log: list[LoggedRow] = []
         self.search = self._search() if problem.parameters.unguessed else None
@@ -204,7 +209,7 @@ class Estimator:
     def take(self, frame: Frame) -> Update:
         """Take a frame that was read."""
         began = self.clock()
-        notes = self._of_frame(frame)
+        frame, notes = self._of_frame(frame)
         if self.intake.is_lost(frame.t_s):
             if frame.pose is None:
                 notes.append("the grasp is lost: nothing is read until its pose is back")
@@ -259,12 +264,30 @@ class Estimator:
             relinearised=rows,
         )
 
-    def _of_frame(self, frame: Frame) -> list[str]:
-        if not frame.has_wrench:
-            return []
-        self.counts["with a wrench"] += 1
-        once = self.counts["with a wrench"] == 1
-        return ["wrenches are not read: live takes poses and markers"] if once else []
+    def _of_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
+        """What of a frame can be read."""
+        notes = []
+        if frame.has_wrench:
+            self.counts["with a wrench"] += 1
+            if self.counts["with a wrench"] == 1:
+                notes.append("wrenches are not read: live takes poses and markers")
+        if frame.pose is not None:
+            positions_m, quaternions = frame.pose
+            middle_m = self.model.segment.body.nodes_m.mean(axis=0)
+            self._carried_m = Rotation.from_quat(quaternions).apply(middle_m) + positions_m
+        away_m = np.linalg.norm(frame.tracks_m[:, None] - self._carried_m, axis=2)
+        self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
+        nowhere = (away_m > self._reach_m).all(axis=1)
+        if nowhere.any():
+            notes.append(self._left_out(nowhere))
+            frame = replace(frame, tracks_m=np.where(nowhere[:, None], np.nan, frame.tracks_m))
+        return frame, notes
+
+    def _left_out(self, wild: NDArray[np.bool_]) -> str:
+        """Count samples (M,) that are left out."""
+        self.counts["wild"] += int(wild.sum())
+        names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
+        return f"left out, far from where they can be: {names}"
 
     def _go_on(self, rows: Sequence[LoggedRow], squares: list[Array]) -> tuple[int, list[str]]:
         """Take rows and log them, as many as it does at once; how many, and what is said."""
@@ -292,14 +315,12 @@ class Estimator:
             return []
         notes, sigma_m = [], self.model.segment.experiment.markers.sigma_m[:, None]
         for reading in readings:
-            self.samples += int(np.isfinite(reading.tracks_m[:, 0]).sum())
             if not track.failed:
                 said = track.sweep.linearised(reading, rows)
                 here = said.at(self.model.flat(self.p))
                 wild = self._wild(here)
                 if wild.any():
-                    names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
-                    notes.append(f"left out, far from where they can be: {names}")
+                    notes.append(self._left_out(wild))
                     reading = reading._replace(
                         tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
                     )
@@ -318,7 +339,6 @@ class Estimator:
         wild = length > JUMP * max(1.0, self.scatter.rms)
         if wild.sum() > np.isfinite(length).sum() / 2:
             return np.zeros_like(wild)
-        self.counts["wild"] += int(wild.sum())
         return wild
 
     # Beginnings -------------------------------------------------------------------------------

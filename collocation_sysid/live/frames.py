@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,8 @@ Pose = Any
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _KEYS = ("t_s", "pose", "markers", "wrench")
 _POSE_KEYS = ("position_m", "quaternion_xyzw")
+# Beyond so many metres or seconds numbers no longer tell micrometres and microseconds apart.
+LARGEST = 1e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,9 @@ def as_pose(given: Pose | None, numbers: Sequence[int] | Index) -> tuple[Array, 
     if isinstance(given, Mapping) and not set(given) & set(_POSE_KEYS):
         known = [str(number) for number in numbers]
         if unknown := [name for name in given if name not in known]:
-            raise InputError(f"a pose of grasp {unknown[0]!r}; expected {', '.join(known)}")
+            raise InputError(
+                f"a pose of grasp {reprlib.repr(unknown[0])}; expected {', '.join(known)}"
+            )
         each = [given.get(name) for name in known]
     elif len(numbers) == 1:
         each = [given]
@@ -102,11 +107,9 @@ def as_tracks(given: ArrayLike | Mapping[str, Any] | None, names: Sequence[str])
     else:
         for name, place in given.items():
             if name not in names:
-                raise InputError(f"a marker {name!r}; expected {', '.join(names)}")
+                raise InputError(f"a marker {reprlib.repr(name)}; expected {', '.join(names)}")
             if place is not None:
                 tracks[list(names).index(name)] = _numbers(place, (3,))
-    if np.isinf(tracks).any():
-        raise InputError("a marker's position is infinite; expected numbers, or null if missing")
     return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
 
 
@@ -114,11 +117,13 @@ def _numbers(given: Any, shape: tuple[int, ...]) -> Array:
     size = " × ".join(map(str, shape))
     try:
         found = np.array(given, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"found {given!r}; expected {size} numbers") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"found {reprlib.repr(given)}; expected {size} numbers") from None
     if found.shape != shape:
         sizes = " × ".join(map(str, found.shape)) or "single"
         raise InputError(f"found {sizes} numbers; expected {size} numbers")
+    if (beyond := np.abs(found) > LARGEST).any():
+        raise InputError(f"found {found[beyond][0]:g}; expected numbers up to {LARGEST:g}")
     return found
 
 
@@ -164,7 +169,9 @@ class FrameReader:
 
     def _of_object(self, found: Mapping[str, Any]) -> Frame:
         if unknown := [key for key in found if key not in _KEYS]:
-            raise InputError(f"found the key {unknown[0]!r}; expected {', '.join(_KEYS)}")
+            raise InputError(
+                f"found the key {reprlib.repr(unknown[0])}; expected {', '.join(_KEYS)}"
+            )
         if "t_s" not in found:
             raise InputError("there is no t_s; expected the time in seconds")
         pose = as_pose(found.get("pose"), self.grasps)
@@ -200,7 +207,9 @@ class FrameReader:
             )
         known = {*needed, *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z"))}
         if unknown := [name for name in columns if name not in known]:
-            raise InputError(f"a column {unknown[0]!r}; expected {', '.join(sorted(known))}")
+            raise InputError(
+                f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"
+            )
         return columns
 
 
@@ -213,13 +222,16 @@ def _parsed(text: str) -> Mapping[str, Any]:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"no JSON: {error.msg} at column {error.colno}") from error
+    except (ValueError, RecursionError) as error:  # Python's limits of digits and of depth
+        raise InputError("no frame: a number is too long, or brackets too deep") from error
 
 
 def as_time(given: Any) -> float:
     """A time [s]; an `InputError` for what is none."""
     number = isinstance(given, (int, float, np.number)) and not isinstance(given, bool)
-    if not number or not np.isfinite(given):
-        raise InputError(f"t_s is {given!r}; expected a finite number of seconds")
+    if not number or not abs(given) <= LARGEST:
+        expected = f"a finite number of seconds, up to {LARGEST:g}"
+        raise InputError(f"t_s is {reprlib.repr(given)}; expected {expected}")
     return float(given)
 
 
@@ -229,4 +241,4 @@ def _cell(text: str) -> float:
     try:
         return written_number(text)
     except ValueError:
-        raise InputError(f"found {text!r}; expected a number") from None
+        raise InputError(f"found {reprlib.repr(text)}; expected a number") from None

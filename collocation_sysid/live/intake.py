@@ -37,6 +37,8 @@ class Intake:
     substeps : int
     around : int
         Samples before and after one that its reading needs.
+    leap_m : float
+        Farther no grasp goes from a sample to the next.
     counts : Counter
         Of what was wrong with frames.
     """
@@ -44,6 +46,7 @@ class Intake:
     interval_s: float
     substeps: int
     around: int
+    leap_m: float = np.inf
     counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
@@ -103,6 +106,9 @@ class Intake:
         if begun and not self.is_lost(t_s) and np.isfinite(tracks_m).any():
             self._waiting.append((t_s, tracks_m))
         if not late:
+            if pose is not None and self._leaps(t_s, pose[0]):
+                pose = None
+                said.append(f"the grasp of {t_s:.6g} s is too far from the last: left out")
             said += self._gap(t_s)
             self.last_s = t_s
             if pose is not None:
@@ -111,6 +117,13 @@ class Intake:
                 self.counts["without a pose"] += 1
         rows = self._due()
         return rows, self._ready() if not rows else [], said
+
+    def _leaps(self, t_s: float, positions_m: Array) -> bool:
+        if not self._poses:
+            return False
+        before_s, before_m, _ = self._poses[-1]
+        samples = max(1.0, (t_s - before_s) / self.interval_s)
+        return bool(np.abs(positions_m - before_m).max() > samples * self.leap_m)
 
     def _gap(self, t_s: float) -> list[str]:
         if not np.isfinite(self.last_s):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,11 @@ from .model import Model
 
 # Largest datagram, and this machine's own address: nobody else is listened to.
 DATAGRAM_BYTES, HERE = 65536, "127.0.0.1"
+
+
+def as_text(lines: Iterable[bytes]) -> Iterator[str]:
+    """Lines of UTF-8; what is none of it becomes a sign that no number and no name has."""
+    return (line.decode("utf-8", errors="replace") for line in lines)
 
 
 def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
@@ -44,7 +49,7 @@ def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterato
         if opened is not None:
             opened(receiver.getsockname()[1])
         while datagram := receiver.recv(DATAGRAM_BYTES):
-            yield from datagram.decode("utf-8", errors="replace").splitlines()
+            yield from as_text(datagram.splitlines())
 
 
 def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
