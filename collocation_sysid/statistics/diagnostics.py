@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from .distributions import chi2_isf, normal_isf
 from .information import information
 from .linearised import FitBlock, LinearisedFit
 from .noise import Extra, NoiseLevel, noise_level
+from .outliers import Outlier, set_apart
 
 SIGNIFICANCE = 0.01
 # A pattern with this share of the residuals' power is worth naming.
@@ -83,8 +85,9 @@ def diagnose(fit: LinearisedFit, extra: Extra | None = None) -> tuple[MarkerDiag
         Variance that each residual has besides its noise, in units of σ², by experiment.
     """
     level = noise_level(fit, information(fit), extra)
+    alone = {outlier.series: outlier for outlier in reversed(set_apart(fit)[1])}
     return tuple(
-        _diagnose(block, marker, fit.shared, _estimated(fit, block), level)
+        _diagnose(block, marker, fit.shared, _estimated(fit, block), level, alone)
         for block in fit.blocks
         if not block.of_sensor
         for marker in np.flatnonzero(block.present.any(axis=0)).tolist()
@@ -98,9 +101,14 @@ def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
 
 
 def _diagnose(
-    block: FitBlock, marker: int, shared: int, estimated: tuple[bool, bool], level: NoiseLevel
+    block: FitBlock,
+    marker: int,
+    shared: int,
+    estimated: tuple[bool, bool],
+    level: NoiseLevel,
+    alone: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
-    present = block.present[:, marker]
+    present, name = block.present[:, marker], f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
     samples = int(present.sum())
     power = float(np.sum(residual**2))
@@ -117,7 +125,7 @@ def _diagnose(
         samples=samples,
         wild=int(block.wild[:, marker].sum()),
         rms_m=_rms_m(block, marker),
-        noise_factor=level.factors[f"{block.name}/{block.marker_names[marker]}"],
+        noise_factor=level.factors[name],
         offset_m=mean,
         constant_share=float(samples * mean @ mean / total),
         lag1=_lag1(varying, present),
@@ -126,6 +134,10 @@ def _diagnose(
         early_share=float(np.sum(residual[early] ** 2) / total),
         sentence="",
     )
+    if name in alone:
+        return replace(
+            found, sentence=f"{name}: {1e3 * found.rms_m:.2g} mm RMS; {alone[name].said}"
+        )
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
     said = _suggestion(found, pairs, block, motion, estimated)

@@ -1,4 +1,4 @@
-"""Quantiles and tails of normal, χ² and Student's distribution.
+"""Quantiles and tails of normal, χ², Student's and Beta distribution.
 
 `scipy.stats` has them as well, and takes as long to import as all else of scipy together.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from numpy.typing import ArrayLike
-from scipy.special import chdtr, chdtrc, chdtri, ndtri, stdtrit
+from scipy.special import betaincc, chdtr, chdtrc, chdtri, ndtri, stdtrit
 
 
 def normal_isf(tail: ArrayLike) -> Any:
@@ -34,3 +34,8 @@ def chi2_isf(tail: ArrayLike, freedom: ArrayLike) -> Any:
 def student_ppf(share: ArrayLike, freedom: ArrayLike) -> Any:
     """What Student's t stays below with probability `share`."""
     return stdtrit(freedom, share)
+
+
+def beta_sf(value: ArrayLike, a: ArrayLike, b: ArrayLike) -> Any:
+    """Probability of a Beta variable with parameters a, b beyond `value`."""
+    return betaincc(a, b, value)

@@ -48,6 +48,8 @@ class FitBlock:
         Of a sensor, not of markers.
     static : bool
         Whether samples are equilibria, of which no frequency can be told.
+    relaxed_first : bool
+        Whether a memory counts as relaxed at the first sample.
     """
 
     name: str
@@ -61,6 +63,7 @@ class FitBlock:
     components: Mask | None = None
     of_sensor: bool = False
     static: bool = False
+    relaxed_first: bool = False
 
     @cached_property
     def seen(self) -> Mask:
@@ -170,11 +173,18 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """
     p, blocks = collocation.parameters_of(z), []
     for part, response in zip(collocation.parts(z), responses(collocation, z), strict=True):
-        static = part.segment.experiment.static
+        experiment = part.segment.experiment
+        relaxed = part.segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
         for block in (_of_markers(part, response), *_of_sensors(part, response)):
             slope = np.zeros((*block.residual.shape, len(p)))
             slope[..., part.segment.places] = block.slope
-            block = replace(block, slope=slope, misfit=block.residual, static=static)
+            block = replace(
+                block,
+                slope=slope,
+                misfit=block.residual,
+                static=experiment.static,
+                relaxed_first=relaxed,
+            )
             blocks.append(block if collocation.huber is None else _reweighted(block, collocation))
     prior_residual, prior_slope = collocation.prior(p)
     lower, upper = collocation.bounds_p
@@ -204,7 +214,6 @@ def _of_markers(part: Part, response: Response) -> FitBlock:
         residual,
         slope,
         markers.sigma_m,
-        static=segment.experiment.static,
     )
 
 
@@ -227,7 +236,6 @@ def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
                 residual,
                 slope,
                 sensor.wrench.sigmas[[0, 3]],
-                static=part.segment.experiment.static,
                 components=seen,
                 of_sensor=True,
             )

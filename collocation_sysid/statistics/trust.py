@@ -101,7 +101,9 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     persistent = abs(found.lag1) > max(PERSISTENT, limit)
     shared = found.shared_p < RARE
     matters = uncertainty.errors == "autocorrelated" and (persistent or shared)
-    concerns: list[Concern] = []
+    concerns: list[Concern] = [
+        (f"{each.series}: {each.said}", "check") for each in uncertainty.outliers
+    ]
     if matters and persistent:
         concerns.append(
             (

@@ -42,6 +42,7 @@ from .information import Information, information
 from .linearised import AT_BOUND, LinearisedFit, linearised_fit
 from .memory_notes import memory_notes
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
+from .outliers import Outlier, set_apart
 from .pose_noise import pose_noise_draws
 from .scatter import Scatter, recordings_of, scatter_of, single_fits
 from .sensitivity import marker_sensitivities, sensitivities
@@ -106,6 +107,8 @@ class Uncertainty:
         What the user should know.
     scatter : Scatter or None
         What the recordings say one by one, where there are several.
+    outliers : tuple of Outlier
+        Samples that spoil what the residuals tell; `dependence` leaves them out.
     """
 
     names: tuple[str, ...]
@@ -124,6 +127,7 @@ class Uncertainty:
     degrees_of_freedom: float
     notes: tuple[str, ...]
     scatter: Scatter | None = None
+    outliers: tuple[Outlier, ...] = ()
 
     @property
     def reduced_chi_squared(self) -> float:
@@ -199,9 +203,9 @@ def uncertainty_of(
             f"the noise cannot be estimated from {fit.measurements} measurements of "
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
-    level, found = noise_level(fit, factored, extra), dependence(fit, factored)
-    found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
-    dependent = found.found and not _expected(fit, factored, level, found, extra)
+    level = noise_level(fit, factored, extra)
+    rest, outliers = set_apart(fit)
+    found, dependent = _dependence(rest, extra)
     correlated = errors == "autocorrelated" or (errors == "auto" and dependent)
     kind = _kind(noise, level, correlated)
     of_all, quantiles = _independent(fit, factored, kind, level)
@@ -254,6 +258,7 @@ def uncertainty_of(
             *_scatter_notes(fit, scatter),
         ),
         scatter=scatter,
+        outliers=outliers,
     )
 
 
@@ -313,6 +318,14 @@ def _independent(
     """Covariance of all parameters, and the quantiles of the shared ones."""
     of_score, freedom = level.score_covariance(kind, factored, fit.shared)
     return factored.covariance(of_score), student_ppf(0.975, freedom)
+
+
+def _dependence(fit: LinearisedFit, extra: Extra | None) -> tuple[Dependence, bool]:
+    """How the residuals hang together, and whether more than what is known to add to the noise."""
+    factored = information(fit)
+    level, found = noise_level(fit, factored, extra), dependence(fit, factored)
+    found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
+    return found, found.found and not _expected(fit, factored, level, found, extra)
 
 
 def _expected(
