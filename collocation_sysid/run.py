@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,6 +43,9 @@ from .statistics.profiling import profile_of
 from .statistics.trust import Trust, cause_concerns, numerical_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
 from .verdict import concerns, expected_rms_m, motions_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes a while to import
 
 Log = Callable[[str], None]
 # How a search ends that went astray; another start may help.
@@ -203,6 +206,38 @@ class Run:
                 "unit": unit_of(name),
             }
         return pandas.DataFrame.from_dict(rows, orient="index")
+
+    def plot(
+        self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
+    ) -> Figure:
+        """Draw the body as it moved, fitted or else simulated with the answer, and its markers.
+
+        Parameters
+        ----------
+        experiment : str, optional
+            By default the first.
+        field : {"von_mises_pa", "energy_density_j_m3", "det_f"} or None
+            What colours it, element by element; None for its regions.
+        count : int
+            How many shapes, from the first sample to the last.
+
+        Returns
+        -------
+        Figure
+            Of matplotlib. A notebook shows it, ``savefig`` writes it.
+
+        Raises
+        ------
+        InputError
+            For an unknown experiment or field, or a run without any motion.
+        """
+        from .output.animation import chosen  # how it looks is no part of a run
+        from .output.portrait import portrait
+        from .output.record import replays
+
+        replay = chosen(replays(self), experiment)
+        bodies = {each.name: each.body for each in self.problem.experiments}
+        return portrait(replay, bodies[replay.name], self.parameters, field, count)
 
     def save(self, folder: str | Path, frames: bool = True) -> Path:
         """Write the run folder, whole or not at all, and return it.

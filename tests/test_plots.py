@@ -46,6 +46,7 @@ from collocation_sysid.output.pictures.confidence import ellipse
 from collocation_sysid.output.pictures.jacobian import RASTER, SHOWN_STEPS
 from collocation_sysid.output.pictures.mesh import apart
 from collocation_sysid.output.pictures.scene import Drawn, View, sheet
+from collocation_sysid.output.pictures.shapes import COLOURS, Field
 from collocation_sysid.output.pictures.spectrum import spectral_density
 from collocation_sysid.output.replay import Replay
 from collocation_sysid.output.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
@@ -344,6 +345,31 @@ def test_shapes_stand_side_by_side_in_one_scale():
     assert boxes[0][:, 0].max() < boxes[1][:, 0].min() < boxes[2][:, 0].min()
     times = [t.get_text() for t in figure.axes[0].texts if t.get_text().endswith(" s")]
     assert times == ["0 s", "0.05 s", "0.1 s"]
+
+
+def hues(colours):
+    """Colours, however bright."""
+    return colours[:, :3] / colours[:, :3].max(axis=1, keepdims=True)
+
+
+def test_a_field_colours_each_shape_by_its_values_there():
+    seen = replay()
+    count = len(seen.surface)
+    values = np.arange(1.0, 2 * count + 1).reshape(2, count)
+    pressure = Field("pressure [Pa]", lambda positions_m: values[: len(positions_m)])
+    figure = shapes(
+        seen.t_s, seen.positions_m, seen.surface, seen.held, seen.measured_m, seen.up, 2,
+        field=pressure,
+    )  # fmt: skip
+    sheet_axes = figure.axes[0]
+    assert any(text.get_text() == "pressure [Pa]" for text in sheet_axes.texts)
+    (bar,) = sheet_axes.child_axes
+    assert bar.get_ylim() == (0.0, 2 * count)
+    skins = [c for c in sheet_axes.collections if isinstance(c, PolyCollection)]
+    for skin, own in zip(skins, values, strict=True):
+        expected = hues(COLOURS(own / values.max()))
+        for hue in hues(skin.get_facecolor()):
+            assert np.abs(expected - hue).max(axis=1).min() < 1e-6
 
 
 def test_quadratic_bodies_are_drawn_by_their_corners(tmp_path):

@@ -12,12 +12,15 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 import pytest
+from IPython.core.formatters import DisplayFormatter
+from matplotlib.collections import PolyCollection
 from problems_small import EDGE_M, TRUTH, box, hung_cube, measured, noisy, smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.check import check_problem
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.options import Options
+from collocation_sysid.output.fields import ElementFields
 
 UNKNOWN = {
     "lambda_pa": 200.0,
@@ -168,6 +171,31 @@ def test_a_run_without_a_file_is_saved_like_any_other(tmp_path):
     assert not (folder / "problem.toml").exists()
 
 
+def test_a_notebook_shows_the_body_of_a_run_once():
+    shown, _ = DisplayFormatter().format(identified().plot())
+    assert shown["image/png"].startswith(b"\x89PNG")
+    assert set(shown) == {"image/png", "text/plain"}
+
+
+@pytest.mark.parametrize("field", ["von_mises_pa", "energy_density_j_m3", "det_f"])
+def test_a_drawn_body_is_coloured_by_what_its_material_feels(field):
+    run = identified()
+    (positions_m,), body = run.solution.positions_m, run.problem.bodies[0]
+    felt = ElementFields.of(body, body.theta(run.parameters)).at(positions_m[[0, -1]])[field]
+    (bar,) = run.plot(field=field, count=2).axes[0].child_axes
+    low, high = bar.get_ylim()
+    outer = felt[:, body.mesh.surface_cells]
+    assert high == pytest.approx(outer.max(), rel=1e-6)
+    assert low == pytest.approx(outer.min(), rel=1e-6) or low == 0 < outer.min() < high / 5
+
+
+def test_what_cannot_be_drawn_is_told_with_what_can():
+    with pytest.raises(cs.InputError, match=r"'det'; expected .* did you mean 'det_f'\?"):
+        identified().plot(field="det")
+    with pytest.raises(cs.InputError, match=r"found 'sway'; expected one of hung cube"):
+        identified().plot("sway")
+
+
 # Several bodies -----------------------------------------------------------------------------------
 
 
@@ -187,8 +215,13 @@ def two_specimens() -> cs.Problem:
     return cs.Problem(made, shared, rollout=cs.RolloutOptions("scheme"))
 
 
+@cache
+def two_found() -> cs.Run:
+    return cs.run(two_specimens())
+
+
 def test_two_bodies_share_a_parameter_by_name(tmp_path):
-    run = cs.run(two_specimens())
+    run = two_found()
     assert run.solution.status.converged
     assert run.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
     assert run.parameters["core.mu_pa"] == pytest.approx(500.0, rel=1e-4)
@@ -199,6 +232,15 @@ def test_two_bodies_share_a_parameter_by_name(tmp_path):
     nodes = [len(body.nodes_m) for body in two_specimens().bodies]
     assert result["problem"]["nodes"] == sum(nodes)
     assert len(result["provenance"]["mesh_sha256"]) == 2
+
+
+def test_a_body_that_was_only_predicted_is_drawn_with_its_regions():
+    axes = two_found().plot("again", field=None, count=2).axes[0]
+    assert not axes.child_axes
+    skins = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    assert len(skins) == 2
+    reds_over_blues = {round(r / b, 2) for r, _, b, _ in skins[0].get_facecolor()}
+    assert len(reds_over_blues) == 2
 
 
 def test_a_check_looks_at_every_body():

@@ -115,7 +115,9 @@ def film(
     return file
 
 
-def chosen(replays: Sequence[Replay], experiment: str | None, run: str | Path) -> Replay:
+def chosen(
+    replays: Sequence[Replay], experiment: str | None, run: str | Path | None = None
+) -> Replay:
     """The experiment of that name, or the first.
 
     Raises
@@ -129,9 +131,8 @@ def chosen(replays: Sequence[Replay], experiment: str | None, run: str | Path) -
     if experiment is None:
         return next(iter(seen.values()))
     if experiment not in seen:
-        raise InputError(
-            f"found {experiment!r}; expected one of {', '.join(seen)}", run, "--experiment"
-        )
+        key = None if run is None else "--experiment"
+        raise InputError(f"found {experiment!r}; expected one of {', '.join(seen)}", run, key)
     return seen[experiment]
 
 

@@ -5,6 +5,7 @@ Figures are `matplotlib.figure.Figure` objects without pyplot: no display, no gl
 
 from __future__ import annotations
 
+from io import BytesIO
 from math import inf
 
 from matplotlib.axes import Axes
@@ -35,6 +36,15 @@ RESOLUTION_DPI = 200
 _GREY = "#606060"
 
 
+class Picture(Figure):
+    """A figure that a notebook shows, be pyplot there or not."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        png = BytesIO()
+        self.savefig(png, dpi=RESOLUTION_DPI)
+        return png.getvalue(), {"width": round(96 * self.get_figwidth())}
+
+
 def mathematical(name: str) -> str:
     """The symbol of a parameter as matplotlib sets it, with its region behind."""
     symbol, _, region = symbol_of(name).partition(" ")
@@ -45,7 +55,7 @@ def mathematical(name: str) -> str:
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
     """An empty figure that arranges itself."""
-    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
+    figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr]
     return figure
 
@@ -59,7 +69,7 @@ def framed_figure(
     top_mm: float,
 ) -> Figure:
     """An empty figure with margins around its axes; it draws in half the time of a `new_figure`."""
-    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4))
     figure.subplots_adjust(
         left_mm / width_mm,
         foot_mm / height_mm,

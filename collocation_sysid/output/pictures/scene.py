@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array
-from ..style import BLACK, SMALL_PT, VERMILION
+from ..style import BLACK, SMALL_PT, VERMILION, Picture
 from .camera import Camera, Triangles
 
 EDGE = "#5A6B7B"
@@ -30,7 +30,7 @@ _SQUARE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
     """A figure with one invisible pair of axes in millimetres from the lower left corner."""
-    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4))
+    figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width_mm), ylim=(0, height_mm))
     axes.set_axis_off()
@@ -114,14 +114,23 @@ class Drawn:
         self.rings = axes.add_line(Line2D([], [], mfc="none", zorder=4, **_DOT))
         self.dots = axes.add_line(Line2D([], [], mfc=VERMILION, zorder=5, **_DOT))
 
-    def show(self, positions_m: Array, held: NDArray[np.bool_], markers_m: Array) -> None:
+    def show(
+        self,
+        positions_m: Array,
+        held: NDArray[np.bool_],
+        markers_m: Array,
+        skins: Array | None = None,
+    ) -> None:
         """Show nodes (n, 3), those of them that are grasped, and markers (M, 3).
 
-        Markers that the body hides are rings; grasped nodes turned away are left out.
+        Markers that the body hides are rings; grasped nodes turned away are left out. `skins` (F, 3)
+        are the triangles' colours; by default those of their parts.
         """
         camera = self.view.camera
         polygons, brightness, faces = camera.faces(positions_m, self.surface)
-        colours: Any = brightness[:, None] * self.skins[faces]
+        if skins is not None:  # colours that tell something are shaded half as much
+            brightness = (1 + brightness) / 2
+        colours: Any = brightness[:, None] * (self.skins if skins is None else skins)[faces]
         self.skin.set_verts(list(self.view.origin_mm + self.view.mm_per_m * polygons))
         self.skin.set_facecolor(colours)
         if not self.edged:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ...arrays import Array
-from ..style import BLACK, PAGE_MM, TEXT_PT, dress
+from ..style import BLACK, PAGE_MM, TEXT_PT, Picture, dress
 from .models import models
 
 Box = tuple[float, float, float, float]
@@ -47,7 +47,7 @@ def tracks(
     title = _chosen(len(shown), len(names))
     head = LEGEND_MM + (5.0 if title else 0.0)
     height = head + len(shown) * (ROW_MM + GAP_MM) - GAP_MM + FOOT_MM
-    figure = Figure(figsize=(PAGE_MM / 25.4, height / 25.4))
+    figure = Picture(figsize=(PAGE_MM / 25.4, height / 25.4))
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ...arrays import Array
 from ...experiment.wrench import COMPONENTS, UNITS
-from ..style import BLACK, PAGE_MM, TEXT_PT, dress
+from ..style import BLACK, PAGE_MM, TEXT_PT, Picture, dress
 from .models import models
 
 HEIGHT_MM = 42.0
@@ -25,7 +25,7 @@ def wrench_picture(sensed: Array) -> Figure:
     t_s, measured, fitted, rolled_out = np.split(sensed, [1, 7, 13], axis=1)
     there = np.asarray(np.isfinite(measured).any(axis=0))
     rows = [k for k in range(2) if there[3 * k : 3 * k + 3].any()]
-    figure = Figure(figsize=(PAGE_MM / 25.4, HEIGHT_MM * len(rows) / 25.4), layout="constrained")
+    figure = Picture(figsize=(PAGE_MM / 25.4, HEIGHT_MM * len(rows) / 25.4), layout="constrained")
     grid = figure.subplots(len(rows), 3, sharex=True, squeeze=False)
     drawn = models(*(each if np.isfinite(each).any() else None for each in (fitted, rolled_out)))
     for axes, kind in zip(grid, rows, strict=True):
