@@ -30,6 +30,7 @@ from .fem.memory import Prony
 from .fem.mesh import TetMesh
 from .fem.regions import Region
 from .fem.selection import Ball, Box, Indices, Named
+from .fem.structured import box_mesh, cylinder_mesh
 from .methods.casadi_nlp import Sleqp, SqpMethod
 from .methods.continuation import Continuation
 from .methods.interior_point import InteriorPoint
@@ -40,7 +41,7 @@ from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameter, Parameters, Tied, Unknown
 from .nlp.schemes import Scheme, Stencil
-from .nlp.simulation import Trajectory, simulate, with_markers
+from .nlp.simulation import Trajectory, simulate, with_markers, with_wrenches
 from .problem import Problem, RolloutOptions, UncertaintyOptions
 from .refine import refine
 from .run import Run, run, solve
@@ -95,6 +96,8 @@ __all__ = [
     "UncertaintyOptions",
     "Unknown",
     "Wrench",
+    "box_mesh",
+    "cylinder_mesh",
     "live",
     "place_markers",
     "refine",
@@ -102,4 +105,5 @@ __all__ = [
     "simulate",
     "solve",
     "with_markers",
+    "with_wrenches",
 ]

@@ -37,7 +37,8 @@ _fetched = [name for name, file in _measured.items() if (_here / "../problems" /
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",
     "gallery_dirs": "generated/gallery",
-    "filename_pattern": "/(" + "|".join(["plot_", *_fetched]) + ")",
+    "filename_pattern": "/(" + "|".join([r"\d_\w+\.py", *_fetched]) + ")",
+    "image_scrapers": ("matplotlib", "gallery_pictures.last_figure"),
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "download_all_examples": False,
@@ -48,6 +49,7 @@ html_math_renderer = "mathml"  # which browsers draw themselves, without a netwo
 html_title = f"collocation_sysid {release}"
 
 autosummary_generate = True
+autosummary_filename_map = {"collocation_sysid.Run": "collocation_sysid.run-class"}  # beside `run`
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give shapes and units, which types cannot

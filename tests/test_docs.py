@@ -13,6 +13,7 @@ import pytest
 from problem_files import EXPERIMENT, PROBLEM, run_command
 from pydantic import ValidationError
 
+import collocation_sysid as cs
 from collocation_sysid.problem.schema import ProblemFile
 
 ROOT = Path(__file__).parents[1]
@@ -118,6 +119,13 @@ def test_the_reference_of_the_problem_file_has_every_key(reference):
         assert f"| `{key}` |" in page
     assert "## `[[experiment]]`" in page
     assert "## `[solver.reduced-space]`" in page
+
+
+def test_the_reference_lists_what_is_public_and_nothing_else():
+    page = (ROOT / "docs" / "api.md").read_text()
+    listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)
+    live = [f"live.{name}" for name in cs.live.__all__]
+    assert sorted(listed) == sorted([*(set(cs.__all__) - {"live"}), *live])
 
 
 def test_the_reference_of_the_command_line_has_every_command_and_option(reference):

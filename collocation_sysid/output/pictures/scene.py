@@ -123,8 +123,8 @@ class Drawn:
     ) -> None:
         """Show nodes (n, 3), those of them that are grasped, and markers (M, 3).
 
-        Markers that the body hides are rings; grasped nodes turned away are left out. `skins` (F, 3)
-        are the triangles' colours; by default those of their parts.
+        Markers that the body hides are rings; grasped nodes turned away are left out. Triangles
+        have the colours `skins` (F, 3), by default those of their parts.
         """
         camera = self.view.camera
         polygons, brightness, faces = camera.faces(positions_m, self.surface)

@@ -109,7 +109,8 @@ def shapes(
         start += scale * (last - first) + gap
     draw_directions(axes, camera, (6.0, FOOT_MM + 3.0))
     draw_scale(axes, scale, (2.0, total - 2.5))
-    draw_key(axes, key("grasped", "measured", "behind the body"), (PAGE_MM * 0.3, total - 1.0))
+    seen = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
+    draw_key(axes, key("grasped", *seen), (PAGE_MM * 0.3, total - 1.0))
     return figure
 
 

@@ -21,6 +21,10 @@ print(run.table())
 assert 250e3 < run.parameters["young_pa"] < 275e3
 
 # %%
+# The beam as it swings with the largest weight.
+run.plot(problem.experiments[-1].name, count=4)
+
+# %%
 # Its tip, as measured and as fitted.
 for experiment, fitted_m in zip(problem.experiments, run.solution.readings_m, strict=True):
     (line,) = plt.plot(experiment.t_s, 1e3 * fitted_m[:, 0, 2], label=experiment.name)

@@ -20,6 +20,10 @@ print(run.table())
 assert 68e3 < run.derived["young_pa"] < 77e3
 
 # %%
+# A quarter of the cylinder between its platens.
+run.plot()
+
+# %%
 # The runs that were fitted, and the load that the material gives.
 fitted = [experiment for experiment in problem.experiments if not experiment.validation]
 for experiment in fitted:

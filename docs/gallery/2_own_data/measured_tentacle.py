@@ -20,6 +20,10 @@ print(run.table())
 assert run.solution.rms_m < 0.01
 
 # %%
+# The tentacle at the largest tension of its first tendon.
+run.plot(problem.experiments[3].name)
+
+# %%
 # The tentacle from the side at the four tensions of the first tendon, its markers as measured, and
 # how far the model misses them.
 for experiment, positions_m in zip(problem.experiments[:4], run.solution.positions_m, strict=False):

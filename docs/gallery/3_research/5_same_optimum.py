@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
-body = cs.Body(box_mesh((0.06, 0.06, 0.12), (1, 1, 2)), density_kg_m3=30.0)
+body = cs.Body(cs.box_mesh((0.06, 0.06, 0.12), (1, 1, 2)), density_kg_m3=30.0)
 t_s = 0.01 * np.arange(30)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 0, 3] = 0.03 * (1 - np.cos(12 * t_s))

@@ -13,10 +13,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
 folder = Path(tempfile.mkdtemp())
-mesh = box_mesh((0.06, 0.06, 0.18), (1, 1, 3))
+mesh = cs.box_mesh((0.06, 0.06, 0.18), (2, 2, 6))
 mesh.write(folder / "block.vtu")  # any format that meshio reads
 
 # %%
@@ -81,6 +80,10 @@ assert low < truth["young_pa"] < high
 # ``save`` writes what the command writes: result.json, the trajectory, plots, frames for ParaView.
 run.save(folder / "run", frames=False)
 print(*sorted(file.name for file in (folder / "run").iterdir()), sep="\n")
+run.plot(field="energy_density_j_m3", count=4)
+
+# %%
+# A corner of its tip.
 plt.plot(t_s, 1e3 * tracks_m[:, 0, 0], ".", label="tip_1, as tracked")
 plt.plot(t_s, 1e3 * run.solution.readings_m[0][:, 0, 0], label="as fitted")
 plt.xlabel("time [s]")

@@ -10,7 +10,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
 t_s = 0.01 * np.arange(50)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
@@ -22,7 +21,7 @@ known = {"poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 
 def bar(divisions: tuple[int, int, int], tracks_m: np.ndarray) -> cs.Experiment:
     """A swung bar of so many cells."""
-    body = cs.Body(box_mesh((0.12, 0.04, 0.04), divisions), density_kg_m3=60.0)
+    body = cs.Body(cs.box_mesh((0.12, 0.04, 0.04), divisions), density_kg_m3=60.0)
     seen = cs.Markers(t_s, tracks_m, sigma_m=2e-4, places_m=places_m)
     return cs.Experiment(body, t_s, [hand], seen, name="swing", nuisance=cs.Nuisance.none())
 
@@ -35,6 +34,7 @@ tracks_m += np.random.default_rng(10).normal(scale=2e-4, size=tracks_m.shape)
 problem = cs.Problem([bar((6, 2, 2), tracks_m)], {"young_pa": cs.Unknown(1e4), **known})
 run = cs.refine(cs.run(problem))
 print(run.table())
+run.plot(count=3)
 
 # %%
 # The interval of the noise alone misses the truth by far; the one that holds the discretisation

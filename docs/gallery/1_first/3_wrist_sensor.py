@@ -12,10 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.simulation import with_wrenches
 
-block = cs.Body(box_mesh((0.2, 0.06, 0.06), (4, 1, 1)), density_kg_m3=100.0)
+block = cs.Body(cs.box_mesh((0.2, 0.06, 0.06), (8, 2, 2)), density_kg_m3=100.0)
 t_s = 0.01 * np.arange(60)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 2, 3] = 0.04 * np.sin(13 * t_s) * np.minimum(1, t_s / 0.2) ** 2
@@ -33,14 +31,18 @@ simulated, rng = cs.simulate(swing, truth, "midpoint"), np.random.default_rng(4)
 tracks_m = simulated.markers_m + rng.normal(scale=5e-4, size=simulated.markers_m.shape)
 (felt,) = simulated.wrenches
 felt = felt + rng.normal(size=felt.shape) * np.repeat([0.05, 0.005], 3)
-recording = with_wrenches(cs.with_markers(swing, tracks_m), [felt])
+recording = cs.with_wrenches(cs.with_markers(swing, tracks_m), [felt])
 blind = replace(recording, grasps=(replace(recording.grasps[0], wrench=None),))
 
 # %%
-# With the sensor E and the density have error bars; without it the density must be taken on trust.
+# With the sensor E and the density have error bars.
 unknown = {"young_pa": cs.Unknown(1e4), **known}
 with_sensor = cs.run(cs.Problem([recording], {**unknown, "density_kg_m3": cs.Unknown(50.0)}))
 print(with_sensor.table())
+with_sensor.plot(count=3)
+
+# %%
+# Without the sensor each density taken on trust has a modulus of its own.
 for density, colour in ((50.0, "C0"), (100.0, "C1"), (200.0, "C2")):
     without = cs.solve(cs.Problem([blind], {**unknown, "density_kg_m3": density}))
     plt.plot(density, 1e-3 * without.parameters["young_pa"], "o", color=colour)

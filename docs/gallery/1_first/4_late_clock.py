@@ -12,9 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
-block = cs.Body(box_mesh((0.06, 0.06, 0.18), (1, 1, 3)), density_kg_m3=40.0)
+block = cs.Body(cs.box_mesh((0.06, 0.06, 0.18), (1, 1, 3)), density_kg_m3=40.0)
 t_s = 0.01 * np.arange(60)
 truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 

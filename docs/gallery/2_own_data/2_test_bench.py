@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
-quarter = box_mesh((0.02, 0.02, 0.02), (2, 2, 2))  # of a block, between its planes of symmetry
+quarter = cs.box_mesh((0.02, 0.02, 0.02), (3, 3, 3))  # of a block, between its planes of symmetry
 body = cs.Body(quarter, element="tet10", density_kg_m3=1070.0)
 down_m = np.linspace(0.0005, 0.004, 6)  # of the crosshead
 t_s = np.arange(len(down_m), dtype=float)
@@ -54,6 +53,11 @@ assert low < 7e4 < high
 assert runs["slides"].parameters["young_pa"] > 1.1 * runs["sticks"].parameters["young_pa"]
 
 # %%
+# The quarter that is computed, pressed further and further.
+runs["sticks"].plot(count=3)
+
+# %%
+# Its force.
 plt.plot(1e3 * down_m, -force_n, "k.", label="measured")
 for label, run in runs.items():
     (fitted,) = run.solution.wrenches["press"]

@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
-mesh = box_mesh((0.1, 0.03, 0.03), (4, 1, 1))
+mesh = cs.box_mesh((0.1, 0.03, 0.03), (8, 2, 2))
 t_s = 0.01 * np.arange(120)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 2, 3] = 0.02 * np.sin(np.pi * np.minimum(t_s / 0.4, 1)) ** 2
@@ -49,6 +48,10 @@ assert low < 2e4 < high
 low, high = with_branch.interval("instantaneous_young_pa")
 assert low < 2e4 * 1.33 < high
 assert without.trust.verdict != "good"
+
+# %%
+# The block with memory.
+with_branch.plot(count=3)
 
 # %%
 # What each leaves of the tip's height.

@@ -10,11 +10,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
 # %%
 # A body is a mesh, a material and a mass; the hand holds the nodes at its top.
-block = cs.Body(box_mesh((0.06, 0.06, 0.18), (1, 1, 3)), density_kg_m3=40.0)
+block = cs.Body(cs.box_mesh((0.06, 0.06, 0.18), (2, 2, 6)), density_kg_m3=40.0)
 t_s = 0.01 * np.arange(60)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 0, 3] = 0.04 * np.sin(14 * t_s) * np.minimum(1, t_s / 0.2) ** 2
@@ -38,6 +37,10 @@ print(run.table(), run.trust.verdict, sep="\n")
 low, high = run.interval("young_pa")
 assert low < truth["young_pa"] < high
 assert run.trust.verdict == "good"
+
+# %%
+# The block as it moved, coloured by the stress in it.
+run.plot(count=4)
 
 # %%
 # How the tip moves, as seen and as the identified block does when it is simulated again.

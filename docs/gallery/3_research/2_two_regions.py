@@ -9,10 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.fem.structured import box_mesh
 
 core = cs.Region("core", cs.Box((-1, -1, -1), (0.04, 1, 1)))
-body = cs.Body(box_mesh((0.12, 0.03, 0.03), (6, 1, 1)), density_kg_m3=60.0, regions=[core])
+body = cs.Body(cs.box_mesh((0.12, 0.03, 0.03), (9, 2, 2)), density_kg_m3=60.0, regions=[core])
 t_s = 0.01 * np.arange(80)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 2, 3] = 0.03 * np.sin(15 * t_s) * np.minimum(1, t_s / 0.2) ** 2
@@ -32,6 +31,10 @@ tracks_m += np.random.default_rng(7).normal(scale=2e-4, size=tracks_m.shape)
 unknown = {"young_pa": cs.Unknown(4e4), "core.young_pa": cs.Unknown(4e4)}
 run = cs.run(cs.Problem([cs.with_markers(swing, tracks_m)], {**unknown, **known, **damping}))
 print(run.table())
+run.plot(field=None, count=3)
+
+# %%
+# The intervals, and the truth.
 for k, name in enumerate(unknown):
     low, high = run.interval(name)
     assert low < truth[name] < high
