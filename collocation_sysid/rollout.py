@@ -94,8 +94,7 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
 def _read(segment: Segment, phi: Array, trajectory: Trajectory) -> list[Array]:
     """What the experiment's sensors read, with its φ, of what was simulated."""
     grid, forced = trajectory.reactions
-    gravity = segment.nuisance.gravity(phi)[0] if len(phi) else segment.nuisance.gravity_m_s2
-    return [replace(sensor, on=grid).readings(forced, phi, gravity) for sensor in segment.sensors]
+    return [replace(sensor, on=grid).readings(forced, phi) for sensor in segment.sensors]
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:

@@ -322,8 +322,7 @@ def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
         turned = Rotation.from_rotvec(size * turn) * Rotation.from_quat(poses.quaternions_xyzw)
         off = PoseSequence(poses.t_s, poses.positions_m + size * shift, turned.as_quat())
         other = replace(sensor, grasp=replace(sensor.grasp, poses=off))
-        still = np.zeros(3), np.zeros((3, 0))
-        return other.linearised(forced, np.zeros(0, dtype=int), np.zeros(0), still, 0)[0]
+        return other.linearised(forced, np.zeros(0, dtype=int), np.zeros(0), 0)[0]
 
     given = [np.tile(each, (rows, 1, 1)) for each in (shift, turn)]
     found = sensor.frame_response(forced, np.zeros(0), *given)[..., 0]

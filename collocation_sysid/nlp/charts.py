@@ -26,7 +26,7 @@ BETTER, SAMPLES_OFF = 0.01, 1.0
 AGAIN, SAME = 2, 1e-6
 
 
-class Reading(NamedTuple):
+class ShapeFunctions(NamedTuple):
     """Weights of the nodes in what each marker reads, and their derivatives by its φ.
 
     weights (M, npe), slopes (M, npe, k), curvatures (M, npe, k, k)
@@ -121,7 +121,7 @@ class Chart:
         moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre)
         return self.points_m + self.sigma_m[:, None] * moved
 
-    def reading(self, phi: Array) -> tuple[Index, Reading]:
+    def reading(self, phi: Array) -> tuple[Index, ShapeFunctions]:
         """Nodes (M, npe) that each marker reads, and with what weights, at φ (M, k)."""
         element, k = self.body.element, self.axes.shape[2]
         nodes, weights = self.nodes.copy(), self.weights.copy()
@@ -140,7 +140,7 @@ class Chart:
             curvatures[here] = np.einsum(
                 "mail,mik,mln->makn", _second_derivatives(element, local), along, along
             )
-        return nodes, Reading(weights, slopes, curvatures)
+        return nodes, ShapeFunctions(weights, slopes, curvatures)
 
     @cached_property
     def _shape(self) -> Shape:

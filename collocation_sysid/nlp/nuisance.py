@@ -323,15 +323,19 @@ class NuisanceMap:
     @cached_property
     def _gravity(self) -> ca.Function:
         phi = ca.SX.sym("phi", len(self.of_gravity))
-        values = phi * self.scales[self.of_gravity]
+        gravity = self.gravity_expression(phi)
+        second = [ca.densify(ca.hessian(gravity[i], phi)[0]) for i in range(3)]
+        return ca.Function("gravity", [phi], [gravity, ca.jacobian(gravity, phi), *second])
+
+    def gravity_expression(self, phi: ca.SX) -> ca.SX:
+        """Gravity (3,) in the body's frame, of the φ of `of_gravity`."""
+        values = phi * self.scales[self.of_gravity][:, None]
         kinds, gravity = [self.kinds[k] for k in self.of_gravity], ca.DM(self.gravity_m_s2)
         if tilt := [k for k, kind in enumerate(kinds) if kind == "tilt"]:
             gravity = self._tilted(values[tilt])
         if turn := [k for k, kind in enumerate(kinds) if kind == "turn"]:
             gravity = rotation(values[turn]).T @ gravity
-        gravity = ca.SX(gravity)
-        second = [ca.densify(ca.hessian(gravity[i], phi)[0]) for i in range(3)]
-        return ca.Function("gravity", [phi], [gravity, ca.jacobian(gravity, phi), *second])
+        return ca.SX(gravity)
 
     def _tilted(self, angles: ca.SX) -> ca.SX:
         size = float(np.linalg.norm(self.gravity_m_s2))

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -24,20 +23,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..experiment.markers import Markers
-from .charts import Chart, Reading
+from .charts import Chart, ShapeFunctions
 from .nuisance import NuisanceMap, rotation
+from .reading import Reading, lagrange_weights
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5
-
-
-class _Sample(NamedTuple):
-    """Functions of one sample's u and data; each holds what its users need and no more."""
-
-    value: ca.Function  # residual
-    slope: ca.Function  # residual, and its Jacobian by u
-    loss: ca.Function  # loss, and its gradient
-    hessian: ca.Function  # of the loss
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +71,7 @@ class Observation:
         """(T, 3M) of 1/σ, zero where a sample is missing."""
         return np.repeat(self.present / self.markers.sigma_m, 3, axis=1)
 
-    def reading(self, phi: Array) -> tuple[Index, Reading]:
+    def reading(self, phi: Array) -> tuple[Index, ShapeFunctions]:
         """Nodes (M, npe) that the markers read, and with what weights, at φ."""
         return self.chart.reading(_extended(phi)[self.place_places])
 
@@ -127,29 +118,14 @@ class Observation:
         return np.hstack([offsets, np.tile(common, (len(offsets), 1))])
 
     @cached_property
-    def _sample(self) -> _Sample:
-        nodes = ca.SX.sym("h", 3 * self._neighbours)
-        phi = ca.SX.sym("phi", self._phi_places.shape[1])
-        data = ca.SX.sym("data", 3 + 1 + 1)  # ŷ, 1/σ, place in the window
-        measured, weight, place = ca.vertsplit(data, [0, 3, 4, 5])
-        u = ca.vertcat(nodes, phi)
-        residual = weight * (self._reading(nodes, phi, place) - measured)
-        square = ca.sumsqr(residual)
-        loss = square
-        if self.huber is not None:
-            limit = self.huber**2
-            beyond = 2 * self.huber * ca.sqrt(ca.fmax(square, limit)) - limit
-            loss = ca.if_else(square > limit, beyond, square)
-        hessian, gradient = ca.hessian(loss, u)
-        return _Sample(
-            ca.Function("value", [u, data], [residual]),
-            ca.Function("slope", [u, data], [residual, ca.densify(ca.jacobian(residual, u))]),
-            ca.Function("loss", [u, data], [loss, gradient]),
-            ca.Function("hessian", [u, data], [ca.densify(hessian)], {"cse": True}),
-        )
+    def _sample(self) -> Reading:
+        """Of u = (h(x_i), φ of its marker), with the sample's place in the window."""
+        inputs = 3 * self._neighbours + self._phi_places.shape[1]
+        return Reading(self._reading, inputs, 1, 3, self.huber)
 
-    def _reading(self, nodes: ca.SX, phi: ca.SX, place: ca.SX) -> ca.SX:
+    def _reading(self, u: ca.SX, place: ca.SX) -> ca.SX:
         """The reading y of one sample."""
+        nodes, phi = ca.vertsplit(u, [0, 3 * self._neighbours, u.numel()])
         first = self._phi_places[0] if len(self._phi_places) else []
         scale = self.nuisance.scales[first]
         kinds = [self.nuisance.kinds[i] for i in first]
@@ -162,7 +138,8 @@ class Observation:
         reading = at[:, 0]
         if "time" in kinds:
             step_s = float(self.markers.t_s[1] - self.markers.t_s[0])
-            reading = at @ lagrange_weights(place + values("time") / step_s, self._neighbours)
+            places = [ca.SX(k) for k in range(self._neighbours)]
+            reading = at @ lagrange_weights(place + values("time") / step_s, places)
         if "turn" in kinds:
             pivot = ca.DM(self.nuisance.pivot_m)
             reading = rotation(values("turn")) @ (reading - pivot) + pivot
@@ -174,17 +151,16 @@ class Observation:
 
     @cached_property
     def _data(self) -> Array:
-        """(5, T, M) measured position, 1/σ, and place in the window of every sample."""
-        tracks = np.nan_to_num(self.markers.positions_m)
-        samples, count = tracks.shape[:2]
-        place = np.arange(samples) - self._first_neighbour
-        return np.stack(
-            [
-                *np.moveaxis(tracks, 2, 0),
-                self.weights[:, ::3],
-                np.broadcast_to(place[:, None], (samples, count)),
-            ]
-        )
+        """(7, T, M) place in the window, measured position, and 1/σ thrice, of every sample."""
+        tracks = np.moveaxis(np.nan_to_num(self.markers.positions_m), 2, 0)
+        place = np.arange(tracks.shape[1]) - self._first_neighbour
+        place = np.broadcast_to(place[:, None], tracks.shape[1:])
+        weights = np.broadcast_to(self.weights[:, ::3], tracks.shape)
+        return np.concatenate([place[None], tracks, weights])
+
+    @property
+    def _all(self) -> int:
+        return len(self.grid_rows)
 
     def _inputs(self, x: Array, phi: Array, samples: int) -> Array:
         """(3 neighbours + f, samples, M): u of the first samples."""
@@ -201,28 +177,12 @@ class Observation:
         at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
         return np.einsum("ma...,tmai->tmi...", weights, at)
 
-    def _mapped(self, chosen: ca.Function, u: Array, data: Array | None = None) -> list[Array]:
-        """Outputs of a function of `_sample` for the first samples, (…, samples, M) each."""
-        samples, count = u.shape[1:]
-        data = self._data[:, :samples] if data is None else data
-        if not count:
-            sizes = [chosen.size_out(k) for k in range(chosen.n_out())]
-            return [np.zeros((*size, samples, 0)) for size in sizes]
-        outputs = chosen.map(samples * count)(u.reshape(len(u), -1), data.reshape(len(data), -1))
-        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-        shaped = []
-        for k, output in enumerate(outputs):
-            rows, columns = chosen.size_out(k)
-            full = output.full().reshape(rows, samples * count, columns).transpose(0, 2, 1)
-            shaped.append(full.reshape(rows, columns, samples, count))
-        return shaped
-
     # All samples ------------------------------------------------------------------------------
 
     def residuals(self, x: Array, phi: Array) -> Array:
         """(T, 3M) of (y − ŷ) / σ at grid positions x (N, 3n); zero where missing."""
-        (values,) = self._mapped(self._sample.value, self._inputs(x, phi, len(self.grid_rows)))
-        return np.moveaxis(values[:, 0], 0, 2).reshape(values.shape[2], 3 * values.shape[3])
+        values = self._sample.residual.value(self._inputs(x, phi, self._all), self._data)
+        return np.moveaxis(values, 0, 2).reshape(self._all, -1)
 
     def at_samples(self, by_p: Array, phi: Array) -> Array:
         """Derivatives of h(x) at the samples, (R, 3M, m), from those of the first rows of x."""
@@ -255,7 +215,8 @@ class Observation:
         count, size = len(self.markers.names), shared + self.nuisance.size
         if samples == 0:
             return np.zeros((0, count, 3)), np.zeros((0, count, 3, size))
-        values, by_u = self._mapped(self._sample.slope, self._inputs(x, phi, samples))
+        u, data = self._inputs(x, phi, samples), self._data[:, :samples]
+        values, by_u = self._sample.residual.slopes(u, data)
         by_nodes = self._by_readings(by_u)
         slope = np.zeros((samples, count, 3, size))
         slope[..., columns] = self._around(by_nodes, at_samples)
@@ -268,11 +229,11 @@ class Observation:
             slope[:, m, :, shared + self.place_places[m]] = np.einsum(
                 "riat,tiak->ktr", by_nodes[..., m], by_place[:, :, m]
             )
-        return np.moveaxis(values[:, 0], 0, 2), slope
+        return np.moveaxis(values, 0, 2), slope
 
     def response(self, x: Array, phi: Array, at_samples: Array) -> Array:
         """Change (T, M, 3, c) of the residuals where h(x) at the samples changes by (T, 3M, c)."""
-        (_, by_u) = self._mapped(self._sample.slope, self._inputs(x, phi, len(self.grid_rows)))
+        _, by_u = self._sample.residual.slopes(self._inputs(x, phi, self._all), self._data)
         return self._around(self._by_readings(by_u), at_samples)
 
     def _by_readings(self, by_u: Array) -> Array:
@@ -292,9 +253,8 @@ class Observation:
         samples = self._readable(x)
         u = self._inputs(x, phi, samples)
         data = self._data[:, :samples].copy()
-        data[:3], data[3] = 0.0, 1.0
-        (values,) = self._mapped(self._sample.value, u, data)
-        return np.moveaxis(values[:, 0], 0, 2)
+        data[1:4], data[4:] = 0.0, 1.0
+        return np.moveaxis(self._sample.residual.value(u, data), 0, 2)
 
     def of_samples(self, positions_m: Array, phi: Array) -> Array:
         """Readings (T, M, 3) [m] of the body's positions (T, n, 3) at the samples."""
@@ -316,8 +276,7 @@ class Observation:
 
     def loss(self, x: Array, phi: Array) -> float:
         """L(x, φ)."""
-        losses, _ = self._mapped(self._sample.loss, self._inputs(x, phi, len(self.grid_rows)))
-        return float(losses.sum())
+        return float(self._sample.loss.value(self._inputs(x, phi, self._all), self._data).sum())
 
     def gradient(self, x: Array, phi: Array) -> tuple[Array, Array]:
         """∂L/∂x (N, 3n) and ∂L/∂φ (k,)."""
@@ -334,8 +293,8 @@ class Observation:
 
     def _slope(self, x: Array, phi: Array) -> Array:
         """(u, T, M) slope of each sample's loss."""
-        _, slope = self._mapped(self._sample.loss, self._inputs(x, phi, len(self.grid_rows)))
-        return slope[:, 0]
+        _, slope = self._sample.loss.slopes(self._inputs(x, phi, self._all), self._data)
+        return slope[0]
 
     def _slope_by_reading(self, x: Array, phi: Array, by_u: Array | None = None) -> Array:
         """(T, M, 3) slope of the loss by h(x) at each sample."""
@@ -447,7 +406,7 @@ class Observation:
         return self._hessian_values(np.zeros((self.grid_rows[-1] + 1, dofs)), np.zeros(0))
 
     def _hessian_values(self, x: Array, phi: Array) -> Array:
-        (by_u,) = self._mapped(self._sample.hessian, self._inputs(x, phi, len(self.grid_rows)))
+        by_u = self._sample.loss.curvature(self._inputs(x, phi, self._all), self._data)
         operator = self._operator(self._operator_values(x, phi))
         found = self._hessian(operator, np.moveaxis(by_u, (0, 1), (2, 3)))
         rows, columns = self.hessian_structure
@@ -495,22 +454,3 @@ def operator_of(nodes: Index, weights: Array, node_count: int) -> sp.csr_array:
 def _extended(phi: Array) -> Array:
     """φ with a zero after it, which −1 finds."""
     return np.append(phi, 0.0)
-
-
-def lagrange_weights(place: ca.SX, count: int) -> ca.SX:
-    """Weights of samples 0 … count − 1 at a place between them."""
-    return ca.vertcat(
-        *(
-            ca.SX(1.0)
-            if count == 1
-            else _product([(place - j) / (i - j) for j in range(count) if j != i])
-            for i in range(count)
-        )
-    )
-
-
-def _product(factors: list[ca.SX]) -> ca.SX:
-    result = factors[0]
-    for factor in factors[1:]:
-        result = result * factor
-    return result

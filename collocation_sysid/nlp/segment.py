@@ -136,7 +136,7 @@ class Segment:
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """Of the grasps whose wrench is measured."""
-        return sensors_of(self.experiment, Grid.of(self.dynamics), self.nuisance)
+        return sensors_of(self.experiment, Grid.of(self.dynamics), self.nuisance, self.huber)
 
     @cached_property
     def sensed_dofs(self) -> Index:

@@ -43,14 +43,6 @@ class Sensing:
         """Length of (q, φ)."""
         return self.segment.nq + len(self.phi)
 
-    @property
-    def gravity(self) -> tuple[Array, Array]:
-        """Gravity (3,) and its slopes (3, k) by φ."""
-        nuisance = self.segment.nuisance
-        if not any(kind.startswith("tool") for kind in nuisance.kinds):
-            return nuisance.gravity_m_s2, np.zeros((3, len(self.phi)))
-        return nuisance.gravity(self.phi)[:2]
-
     # What acts on the sensed dofs -------------------------------------------------------------
 
     def at(self, x: Array) -> Forced:
@@ -89,7 +81,7 @@ class Sensing:
     def linearised(self, forced: Forced, columns: Index) -> list[tuple[Array, Array]]:
         """Residuals (S, 2, 3) of each sensor, and slopes (S, 2, 3, size) by (q, φ)."""
         return [
-            sensor.linearised(forced, columns, self.phi, self.gravity, self.size)
+            sensor.linearised(forced, columns, self.phi, self.size)
             for sensor in self.segment.sensors
         ]
 
@@ -98,7 +90,7 @@ class Sensing:
         count = forced.reaction_by.shape[2]
         columns, size = np.arange(count), count + len(self.phi)
         return [
-            sensor.linearised(forced, columns, self.phi, self.gravity, size)[1][..., :count]
+            sensor.linearised(forced, columns, self.phi, size)[1][..., :count]
             for sensor in self.segment.sensors
         ]
 
@@ -119,7 +111,7 @@ class Sensing:
 
     def of(self, sensors: Sequence[Sensor], forced: Forced) -> list[Array]:
         """The same of the experiment's sensors on any grid, from the reactions there."""
-        return [sensor.readings(forced, self.phi, self.gravity[0]) for sensor in sensors]
+        return [sensor.readings(forced, self.phi) for sensor in sensors]
 
     # Loss -------------------------------------------------------------------------------------
 
@@ -127,24 +119,24 @@ class Sensing:
         """L_w."""
         if not self.segment.sensors:
             return 0.0
-        found = self.linearised(self.at(x), NOTHING)
-        return float(sum(robust(residual, self.segment.huber)[0].sum() for residual, _ in found))
+        forced = self.at(x)
+        given = [
+            sensor.given(forced, NOTHING, self.phi, self.size) for sensor in self.segment.sensors
+        ]
+        pairs = zip(self.segment.sensors, given, strict=True)
+        return sum(sensor.loss(value, self.phi) for sensor, (value, _) in pairs)
 
     def gradient(self, x: Array) -> tuple[Array, Array]:
         """∂L_w/∂x (N, 3n) and ∂L_w/∂(q, φ) (nq + k,)."""
         forced, by_p = self.at(x), np.zeros(self.size)
         of_reaction, of_place = np.zeros_like(forced.reaction), np.zeros_like(forced.reaction)
-        for sensor, (residual, slope) in zip(
-            self.segment.sensors, self.linearised(forced, NOTHING), strict=True
-        ):
-            of_residual = robust(residual, self.segment.huber)[1]
-            by_p += np.einsum("sfa,sfap->p", of_residual, slope)
-            pull = of_residual.reshape(-1, 6) * sensor.present / sensor.wrench.sigmas
+        for sensor in self.segment.sensors:
+            value, by_phi = sensor.given(forced, NOTHING, self.phi, self.size)
+            by_given, by_own = sensor.loss_slopes(value, self.phi)
+            by_p += np.einsum("ka,kap->p", by_given, by_phi)
+            by_p[self.segment.nq + sensor.read_phi] += by_own
             by_force, by_place = sensor.arms(forced)
-            k = sensor.grid[: len(by_force)]
-            if not len(k):
-                continue
-            on_grid = sensor.kernels(self.phi, len(k))[0].T @ pull
+            k, on_grid = sensor.grid[: len(value)], sensor.before_low_pass(by_given, self.phi)
             rows = np.ix_(k + sensor.late, sensor.places), np.ix_(k, sensor.places)
             of_reaction[rows[0]] += np.einsum("ka,kag->kg", on_grid, by_force)
             of_place[rows[1]] += np.einsum("ka,kag->kg", on_grid, by_place)
@@ -181,24 +173,3 @@ class Sensing:
         of_memory, of_q = segment.pulled_through_memory(x, setting, whole)
         by_p[: segment.nq] += of_q
         return by_x + of_memory, by_p
-
-
-def robust(residual: Array, huber: float | None) -> tuple[Array, Array]:
-    """ρ (S, 2) of residuals (S, 2, 3), and its slopes by them."""
-    square = np.sum(residual**2, axis=2)
-    if huber is None:
-        return square, 2 * residual
-    length = np.sqrt(np.maximum(square, huber**2))
-    rho = np.where(square > huber**2, 2 * huber * length - huber**2, square)
-    return rho, 2 * residual * (huber / length)[..., None]
-
-
-def robust_curvature(residual: Array, huber: float | None) -> Array:
-    """(S, 2, 3, 3) second derivatives of ρ by the residuals."""
-    found = np.broadcast_to(2 * np.eye(3), (*residual.shape, 3))
-    if huber is None:
-        return found
-    square = np.sum(residual**2, axis=2)[..., None, None]
-    length = np.sqrt(np.maximum(square, huber**2))
-    along = residual[..., :, None] * residual[..., None, :] / length**2
-    return huber / length * (found - 2 * np.where(square > huber**2, along, 0.0))

@@ -17,10 +17,10 @@ compared at its own time, however many there are in a step, so that no average h
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
+import casadi as ca
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
@@ -30,11 +30,15 @@ from ..experiment.grasp import Grasp
 from ..experiment.wrench import Wrench
 from ..fem.pattern import dofs_of
 from .dynamics import Dynamics
+from .generated import Generated
 from .nuisance import SENSOR_DEVIATIONS, NuisanceMap
 from .reaction import centred_rows
+from .reading import Reading, lagrange_weights
 
 # Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
 NEIGHBOURS = 4
+# Numbers of Q, the grasp's turn and its rate, its shift from the sensor's point, and its rate.
+TOOL_DATA = (9, 9, 9, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,97 +111,57 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class Tool:
-    """What a tool takes on the grid, and how: at the force `pull` a kilogram, `arm` off the point.
+class Samples:
+    """The samples of a sensor at a point.
 
     Attributes
     ----------
-    mass_kg : float
-    pull, arm : (n, 3)
-    axes : (n, 3, 3) Q, of the sensor
-    turns, turn_rates : (n, 3, 3) of the grasp, and their second derivatives
+    reading : Reading
+    window : (S, u) grid times that each is read between
+    inputs, data : as `reading` takes them
     """
 
-    mass_kg: float
-    pull: Array
-    arm: Array
-    axes: Array
-    turns: Array
-    turn_rates: Array
+    reading: Reading
+    window: Index
+    inputs: Array
+    data: Array
 
     @property
-    def value(self) -> Array:
-        """(n, 6)."""
-        return self.mass_kg * self._unit
+    def residual(self) -> Array:
+        """(S, 6)."""
+        return self.reading.residual.value(self.inputs, self.data).T
+
+    def along(self, slope: Array) -> tuple[Array, Array, Array]:
+        """Residuals (S, 6), their slopes by what Y (n, 6, c) changes by, and those by their φ."""
+        residual, by_u = self.reading.residual.slopes(self.inputs, self.data)
+        by_u, count = np.moveaxis(by_u, 2, 0), 6 * self.window.shape[1]
+        around = slope[self.window].reshape(len(self.window), count, -1)
+        return residual.T, by_u[..., :count] @ around, by_u[..., count:]
 
     @property
-    def _unit(self) -> Array:
-        return self._both(self.pull[:, :, None])[:, :, 0]
+    def loss(self) -> float:
+        """Σ ρ."""
+        return float(self.reading.loss.value(self.inputs, self.data).sum())
 
-    def _both(self, force: Array) -> Array:
-        axes = np.swapaxes(self.axes, 1, 2)
-        return np.concatenate([axes @ force, axes @ _cross(self.arm) @ force], axis=1)
+    def loss_slopes(self, grid: int) -> tuple[Array, Array]:
+        """∂loss by Y (grid, 6) and by φ."""
+        by_u = self.reading.loss.slopes(self.inputs, self.data)[1][0]
+        samples, used = self.window.shape
+        of_given = np.zeros((grid, 6))
+        np.add.at(of_given, self.window, by_u[: 6 * used].T.reshape(samples, used, 6))
+        return of_given, by_u[6 * used :].sum(axis=1)
 
     @property
-    def slopes(self) -> Array:
-        """(n, 6, 7) by mass, centre and gravity."""
-        by_centre = self._both(self.turn_rates)
-        by_centre[:, 3:] -= np.swapaxes(self.axes, 1, 2) @ _cross(self.pull) @ self.turns
-        by_gravity = -self._both(np.broadcast_to(np.eye(3), self.axes.shape))
-        both = self.mass_kg * np.concatenate([by_centre, by_gravity], axis=2)
-        return np.concatenate([self._unit[..., None], both], axis=2)
-
-    def curvature(self, weights: Array) -> Array:
-        """(7, 7) second derivatives of Σ weights (n, 6) · value by the same."""
-        force, torque = (
-            np.einsum("kij,kj->ki", self.axes, each) for each in np.split(weights, 2, axis=1)
+    def loss_curvature(self) -> tuple[Array, Array, Array]:
+        """∂²loss of each sample: Y by Y (S, u, 6, u, 6), Y by φ (S, u, 6, m), φ by φ (m, m)."""
+        by_u = np.moveaxis(self.reading.loss.curvature(self.inputs, self.data), 2, 0)
+        samples, used = self.window.shape
+        own, both = by_u[:, : 6 * used], (samples, used, 6)
+        return (
+            own[..., : 6 * used].reshape(*both, used, 6),
+            own[..., 6 * used :].reshape(*both, -1),
+            by_u[:, 6 * used :, 6 * used :].sum(axis=0),
         )
-        lever = force + np.cross(torque, self.arm)
-        crossed = _cross(torque) @ self.turns
-        found = np.zeros((7, 7))
-        found[0, 1:4] = np.einsum("kij,ki->j", self.turn_rates, lever)
-        found[0, 1:4] += np.einsum("kij,ki->j", self.turns, np.cross(self.pull, torque))
-        found[0, 4:] = -lever.sum(axis=0)
-        found[1:4, 4:] = -self.mass_kg * crossed.sum(axis=0).T
-        found[1:4, 1:4] = self.mass_kg * np.einsum("kij,kil->jl", self.turn_rates, crossed)
-        return found + found.T
-
-
-@dataclass(frozen=True, eq=False)
-class Interpolation:
-    """Lagrange's weights (S, u) of samples at values `around` (S, u); zero where not covered.
-
-    `slopes` and `curvatures` are their derivatives by the samples' times.
-    """
-
-    around: Index
-    values: Array
-    slopes: Array
-    curvatures: Array
-
-    @classmethod
-    def of(cls, at_s: Array, t_s: Array, most: int, covered: NDArray[np.bool_]) -> Interpolation:
-        """From the values at `most` of the times `t_s` (n,) around each of `at_s` (S,)."""
-        count, used = len(t_s), min(most, len(t_s))
-        first = np.searchsorted(t_s, at_s, side="right") - 1 - (used - 1) // 2
-        around = np.clip(first, 0, count - used)[:, None] + np.arange(used)
-        found = np.zeros((3, len(at_s), used))
-        for i in range(used):
-            # Of a product with two derivatives, as a polynomial in a shift of its factors.
-            found[0, :, i] = 1.0
-            for j in range(used):
-                if j != i:
-                    span = t_s[around[:, i]] - t_s[around[:, j]]
-                    factor, slope = (at_s - t_s[around[:, j]]) / span, 1 / span
-                    found[2, :, i] = found[2, :, i] * factor + 2 * found[1, :, i] * slope
-                    found[1, :, i] = found[1, :, i] * factor + found[0, :, i] * slope
-                    found[0, :, i] *= factor
-        return cls(around, *(found * covered[:, None]))
-
-    def matrix(self, weights: Array, count: int) -> sp.csr_array:
-        """(S, count) from weights (S, u), any of the three."""
-        rows = np.repeat(np.arange(len(weights)), weights.shape[1])
-        return sp.csr_array((weights.ravel(), (rows, self.around.ravel())), (len(weights), count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +178,8 @@ class Sensor:
     nuisance : NuisanceMap
     places : (d,) of the dofs of the grasp's nodes among those that are sensed
     held : (d,) one along the axes that it holds, else zero
+    huber : float or None
+        See `Reading`.
     """
 
     number: int
@@ -223,6 +189,7 @@ class Sensor:
     nuisance: NuisanceMap
     places: Index
     held: Array
+    huber: float | None = None
 
     # Where and when --------------------------------------------------------------------------
 
@@ -307,28 +274,39 @@ class Sensor:
         value = np.einsum("kag,kg->ka", of_force, reaction)
         return value, of_force @ by_reaction + of_place @ forced.position_by[k][:, self.places]
 
-    def tool(self, gravity_m_s2: Array, phi: Array, count: int) -> Tool | None:
-        """What the tool takes; None where there is none."""
-        if not len(self.phi_places("tool-mass")):
-            return None
-        (mass,), off = self._value("tool-mass", phi), self._value("tool-centre", phi)
+    @cached_property
+    def tool_phi(self) -> Index:
+        """Positions in φ of what a tool's share depends on; none where there is no tool."""
+        if not len(mass := self.phi_places("tool-mass")):
+            return mass
+        centre = self.phi_places("tool-centre")
+        return np.concatenate([mass, centre, self.nuisance.of_gravity])
+
+    @cached_property
+    def tool(self) -> Generated:
+        """What it takes (6,), m (a_c − g) at c: of `tool_phi`, at a column of `tool_data`."""
+        return Generated(self._tool_takes, len(self.tool_phi), sum(TOOL_DATA))
+
+    def _tool_takes(self, phi: ca.SX, data: ca.SX) -> ca.SX:
+        axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(data, np.cumsum([0, *TOOL_DATA]))
+        axes, turn, turn_rate = (ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate))
+        count = len(self.tool_phi) - len(self.nuisance.of_gravity)
+        own, tilts = ca.vertsplit(phi, [0, count, len(self.tool_phi)])
+        own *= self.nuisance.scales[self.tool_phi[:count]][:, None]
+        about = self.wrench.frame == "grasp"
+        centre = ca.DM(self.wrench.point_m if about else self.nuisance.grasp_pivot_m)
+        centre = centre + own[1:] if own.numel() > 1 else centre
+        gravity = self.nuisance.gravity_expression(tilts)
+        pull = own[0] * (turn_rate @ centre + shift_rate - gravity)
+        return ca.vertcat(axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull))
+
+    def tool_data(self, count: int) -> Array:
+        """(33, n) Q, the turn of the grasp with its rate, and its shift from o with its rate."""
         axes, points = (each[:count] for each in self.frames)
         turns, shifts = self._poses(self.grid[:count])
         turn_rates, shift_rates = self._accelerations(count)
-        about = self.wrench.frame == "grasp"
-        centre = self.wrench.point_m if about else self.nuisance.grasp_pivot_m
-        centre = centre + off if len(off) else centre
-        pull = turn_rates @ centre + shift_rates - gravity_m_s2
-        arm = turns @ centre + shifts - points
-        return Tool(float(mass), pull, arm, axes, turns, turn_rates)
-
-    def tool_by_phi(self, gravity_phi: Array) -> Array:
-        """(7, k) derivatives of the tool's mass and centre, and of gravity (3, k), by φ."""
-        found = np.concatenate([np.zeros((4, gravity_phi.shape[1])), gravity_phi])
-        for first, kind in ((0, "tool-mass"), (1, "tool-centre")):
-            here = self.phi_places(kind)
-            found[first + np.arange(len(here)), here] = self.nuisance.scales[here]
-        return found
+        parts = (axes, turns, turn_rates, shifts - points, shift_rates)
+        return np.concatenate([each.reshape(count, -1) for each in parts], axis=1).T
 
     def _accelerations(self, count: int) -> tuple[Array, Array]:
         """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
@@ -344,99 +322,139 @@ class Sensor:
 
     # At the samples ---------------------------------------------------------------------------
 
-    def interpolation(self, phi: Array, count: int) -> Interpolation:
-        """ℓ, of the first `count` times of the grid."""
-        shift = self._value("sensor-time", phi)
-        covered = self.covered(int(self.grid[count - 1]) + self.late + 1)
-        at_s = self.wrench.t_s + (float(shift[0]) if len(shift) else 0.0)
-        used = 2 if self.on.static else NEIGHBOURS
-        return Interpolation.of(at_s, self.on.t_s[self.grid[:count]], used, covered)
+    def window(self, phi: Array, count: int) -> Index:
+        """(S, u) of the first `count` times of the grid those that each sample is read between."""
+        shift, t_s = self._value("sensor-time", phi), self.on.t_s[self.grid[:count]]
+        used = min(2 if self.on.static else NEIGHBOURS, count)
+        late = np.searchsorted(t_s, self.wrench.t_s + shift.sum(), side="right")
+        first = np.clip(late - 1 - (used - 1) // 2, 0, count - used)
+        return first[:, None] + np.arange(used)
+
+    @cached_property
+    def read_phi(self) -> Index:
+        """Positions in φ of what a sample is read by: the shift of the clock, if any, and tares."""
+        return np.concatenate([self.phi_places(kind) for kind in ("sensor-time", "tare")])
+
+    def _reading(self, used: int) -> Reading:
+        """Of u = (Y at `used` grid times, φ of `read_phi`), with these times from the sample's."""
+        late, tared = len(self.phi_places("sensor-time")), self.tared
+        scales = self.nuisance.scales[self.read_phi][:, None]
+
+        def expression(u: ca.SX, places: ca.SX) -> ca.SX:
+            given, own = ca.vertsplit(u, [0, 6 * used, u.numel()])
+            own = own * scales
+            at = own[0] if late else ca.SX(0)
+            read = ca.reshape(given, 6, used) @ lagrange_weights(at, ca.vertsplit(places))
+            read[tared] += own[late:]
+            return read
+
+        return Reading(expression, 6 * used + len(self.read_phi), used, 6, self.huber)
+
+    def samples(self, given: Array, phi: Array, weight: Array) -> Samples:
+        """All of them at Y (n, 6), with weights 1/σ (S, 6)."""
+        window, measured = self.window(phi, len(given)), np.nan_to_num(self.wrench.values)
+        count, used = window.shape
+        if used not in self._readings:
+            self._readings[used] = self._reading(used)
+        own = np.broadcast_to(phi[self.read_phi, None], (len(self.read_phi), count))
+        places = self.on.t_s[self.grid][window] - self.wrench.t_s[:, None]
+        return Samples(
+            self._readings[used],
+            window,
+            np.concatenate([given[window].reshape(count, -1).T, own]),
+            np.concatenate([places, measured, weight], axis=1).T,
+        )
+
+    @cached_property
+    def _readings(self) -> dict[int, Reading]:
+        return {}
+
+    @property
+    def weight(self) -> Array:
+        """(S, 6) 1/σ of all samples, zero where nothing is compared."""
+        return self.present / self.wrench.sigmas
 
     def lag_s(self, phi: Array) -> float | None:
         """T of the low-pass, None where there is none."""
         lag = self._value("sensor-lag", phi)
         return float(lag[0]) if len(lag) else None
 
-    def kernels(self, phi: Array, count: int) -> tuple[sp.csr_array, sp.csr_array, Array]:
-        """From the grid to the samples (S, n): ℓ L, its slope by the shift, and that by the lag.
-
-        The last is of shape (0, 0) where no lag is estimated.
-        """
-        around, lag_s = self.interpolation(phi, count), self.lag_s(phi)
-        value, slope = (around.matrix(each, count) for each in (around.values, around.slopes))
-        if lag_s is None:
-            return value, slope, np.zeros((0, 0))
-        smoothing, by_lag = low_pass(lag_s, self.on.step_s, count)
-        smooth = (sp.csr_array(np.asarray(each @ smoothing)) for each in (value, slope))
-        return next(smooth), next(smooth), np.asarray(value @ by_lag)
-
-    def with_tare(self, read: Array, phi: Array) -> Array:
-        """Readings (S, 6), in place."""
-        read[:, self.tared] += self._value("tare", phi)
-        return read
-
     @property
     def tared(self) -> Index:
         """The components of its tares."""
         return np.flatnonzero(self.wrench.measured)[: len(self.phi_places("tare"))]
 
-    def read(
-        self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
-    ) -> tuple[Array, Array]:
-        """ŷ (S, 6) and its slopes (S, 6, size); zero where it cannot be read.
+    def given(self, forced: Forced, columns: Index, phi: Array, size: int) -> tuple[Array, Array]:
+        """Y = L W (n, 6) with what the tool takes, and its slopes (n, 6, size).
 
         Parameters
         ----------
         forced : Forced
         columns : (c,) positions in (q, φ) of what `forced` changes by
         phi : (k,) the last of (q, φ)
-        gravity : (3,) and (3, k) its slopes by φ
         size : int
             Length of (q, φ).
         """
         value, changes = self.on_grid(forced)
-        slope = np.zeros((*value.shape, size))
+        slope, first, count = np.zeros((*value.shape, size)), size - len(phi), len(value)
         slope[..., columns] = changes
-        first = size - len(phi)
-        if (tool := self.tool(gravity[0], phi, len(value))) is not None:
-            value = value + tool.value
-            slope[..., first:] += tool.slopes @ self.tool_by_phi(gravity[1])
-        if not len(value):
-            return np.zeros((len(self.wrench.t_s), 6)), np.zeros((len(self.wrench.t_s), 6, size))
-        return self._sampled(value, slope, phi, first)
+        if len(self.tool_phi):
+            own = np.broadcast_to(phi[self.tool_phi, None], (len(self.tool_phi), count))
+            taken, by_phi = self.tool.slopes(own, self.tool_data(count))
+            value = value + taken.T
+            slope[..., first + self.tool_phi] += np.moveaxis(by_phi, 2, 0)
+        for place in self.phi_places("sensor-lag"):
+            smoothing, by_lag = self._low_pass(phi, count)
+            slope = (smoothing @ slope.reshape(count, -1)).reshape(slope.shape)
+            slope[..., first + place] += self.nuisance.scales[place] * (by_lag @ value)
+            value = smoothing @ value
+        return value, slope
 
-    def _sampled(self, value: Array, slope: Array, phi: Array, first: int) -> tuple[Array, Array]:
-        kernel, by_shift, by_lag = self.kernels(phi, len(value))
-        count, size = len(value), slope.shape[2]
-        read = kernel @ value
-        of_read = (kernel @ slope.reshape(count, 6 * size)).reshape(len(read), 6, size)
-        scales = self.nuisance.scales
-        for kind, own in (("sensor-time", by_shift), ("sensor-lag", by_lag)):
-            for place in self.phi_places(kind):
-                of_read[..., first + place] += scales[place] * (own @ value)
-        tare = self.phi_places("tare")
-        of_read[:, self.tared, first + tare] += scales[tare]
-        return self.with_tare(read, phi), of_read
+    def _low_pass(self, phi: Array, count: int) -> tuple[Array, Array]:
+        """L (n, n) and its slope by T; one where there is none."""
+        lag_s = self.lag_s(phi)
+        if lag_s is None:
+            return np.eye(count), np.zeros((count, count))
+        return low_pass(lag_s, self.on.step_s, count)
 
-    def readings(self, forced: Forced, phi: Array, gravity_m_s2: Array) -> Array:
+    def before_low_pass(self, by_given: Array, phi: Array) -> Array:
+        """Slopes of a scalar by W (n, 6), from those by Y."""
+        return self._low_pass(phi, len(by_given))[0].T @ by_given
+
+    def readings(self, forced: Forced, phi: Array) -> Array:
         """ŷ (S, 6), NaN where it is not known."""
-        still = gravity_m_s2, np.zeros((3, len(phi)))
-        nothing = np.zeros(0, dtype=np.int64)
-        read, _ = self.read(forced, nothing, phi, still, len(phi))
+        value, _ = self.given(forced, np.zeros(0, dtype=np.int64), phi, len(phi))
+        if not len(value):
+            return np.full(self.wrench.values.shape, np.nan)
+        samples = self.samples(value, phi, np.ones(self.wrench.values.shape))
+        read = samples.residual + np.nan_to_num(self.wrench.values)
         return np.where(self.covered(len(forced.reaction))[:, None], read, np.nan)
 
     # Residuals --------------------------------------------------------------------------------
 
     def linearised(
-        self, forced: Forced, columns: Index, phi: Array, gravity: tuple[Array, Array], size: int
+        self, forced: Forced, columns: Index, phi: Array, size: int
     ) -> tuple[Array, Array]:
         """Residuals (ŷ − w) / σ, (S, 2, 3) force and torque, and slopes; zero where missing."""
-        read, slope = self.read(forced, columns, phi, gravity, size)
+        value, slope = self.given(forced, columns, phi, size)
+        count = len(self.wrench.t_s)
+        if not len(value):
+            return np.zeros((count, 2, 3)), np.zeros((count, 2, 3, size))
         here = self.wrench.present & self.covered(len(forced.reaction))[:, None]
-        weight = here / self.wrench.sigmas
-        residual = weight * (read - np.nan_to_num(self.wrench.values))
-        slope = weight[..., None] * slope
-        return residual.reshape(-1, 2, 3), slope.reshape(len(slope), 2, 3, size)
+        samples = self.samples(value, phi, here / self.wrench.sigmas)
+        residual, found, by_own = samples.along(slope)
+        found[..., size - len(phi) + self.read_phi] += by_own
+        return residual.reshape(count, 2, 3), found.reshape(count, 2, 3, size)
+
+    def loss(self, given: Array, phi: Array) -> float:
+        """Σ ρ at Y (n, 6)."""
+        return self.samples(given, phi, self.weight).loss if len(given) else 0.0
+
+    def loss_slopes(self, given: Array, phi: Array) -> tuple[Array, Array]:
+        """∂loss by Y (n, 6), and by φ of `read_phi`."""
+        if not len(given):
+            return np.zeros_like(given), np.zeros(len(self.read_phi))
+        return self.samples(given, phi, self.weight).loss_slopes(len(given))
 
     def frame_response(self, forced: Forced, phi: Array, shifts: Array, turns: Array) -> Array:
         """Changes (S, 2, 3, c) of the residuals where poses are off, by the frame carried along.
@@ -454,19 +472,23 @@ class Sensor:
         moved = shifts[k] + np.cross(turns[k], (axes @ self.wrench.point_m)[:, None])
         both = [np.cross(force, turns[k]), np.cross(torque, turns[k]) - np.cross(moved, force)]
         change = np.concatenate([np.einsum("kji,kcj->kic", axes, each) for each in both], axis=1)
-        read = self.kernels(phi, count)[0] @ change.reshape(count, -1)
-        weight = self.present / self.wrench.sigmas
-        return (weight[..., None] * read.reshape(len(read), 6, -1)).reshape(len(read), 2, 3, -1)
+        smoothed = self._low_pass(phi, count)[0] @ change.reshape(count, -1)
+        samples = self.samples(np.zeros((count, 6)), phi, self.weight)
+        found = samples.along(smoothed.reshape(change.shape))[1]
+        return found.reshape(len(found), 2, 3, -1)
 
 
-def sensors_of(experiment: Experiment, grid: Grid, nuisance: NuisanceMap) -> tuple[Sensor, ...]:
+def sensors_of(
+    experiment: Experiment, grid: Grid, nuisance: NuisanceMap, huber: float | None = None
+) -> tuple[Sensor, ...]:
     """The sensors of an experiment's grasps."""
     dofs, found = sensed_dofs(experiment), []
     for grasp in experiment.grasps:
         if grasp.wrench is not None:
             own = dofs_of(grasp.nodes)
             held, places = np.isin(own, grasp.dofs).astype(np.float64), np.searchsorted(dofs, own)
-            found.append(Sensor(len(found), grasp, grasp.wrench, grid, nuisance, places, held))
+            where = grid, nuisance, places, held
+            found.append(Sensor(len(found), grasp, grasp.wrench, *where, huber))
     return tuple(found)
 
 
@@ -512,13 +534,16 @@ def fading(lag_s: float, step_s: float) -> Array:
     """(3, 3) e, a and b of y_k = e y_{k−1} + a W_{k−1} + b W_k, each with two slopes by T."""
     if lag_s < 1e-6 * step_s:
         return np.array([[0.0, 0.0, 0.0], [0.0, 1 / step_s, 0.0], [1.0, -1 / step_s, 0.0]])
+    return _fading()(lag_s, step_s).full()
+
+
+@cache
+def _fading() -> ca.Function:
+    lag_s, step_s = ca.SX.sym("lag_s"), ca.SX.sym("step_s")
     share = lag_s / step_s
-    e = float(np.exp(-1 / share))
-    by_e = e / (share * lag_s)
-    twice = by_e * (1 / share - 2) / lag_s
+    e = ca.exp(-1 / share)
     a = share * (1 - e) - e
-    by_a = (1 - e) / step_s - share * by_e - by_e
-    twice_a = -2 * by_e / step_s - (share + 1) * twice
-    return np.array(
-        [[e, by_e, twice], [a, by_a, twice_a], [1 - e - a, -by_e - by_a, -twice - twice_a]]
-    )
+    value = ca.vertcat(e, a, 1 - e - a)
+    slope = ca.jacobian(value, lag_s)
+    both = ca.horzcat(value, slope, ca.jacobian(slope, lag_s))
+    return ca.Function("fading", [lag_s, step_s], [both])

@@ -21,23 +21,12 @@ from .addition import Addition
 from .collocation import Part
 from .reaction_rows import Reactions
 from .segment import Weights
-from .sensing import robust, robust_curvature
-from .sensor import NEIGHBOURS, Forced, Interpolation, Sensor, Tool, fading
+from .sensor import NEIGHBOURS, Forced, Samples, Sensor, fading
 
 # e_{abc}: what turns and arms a × b have in c.
 LEVI_CIVITA = np.zeros((3, 3, 3))
 for _a, _b, _c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     LEVI_CIVITA[_a, _b, _c], LEVI_CIVITA[_b, _a, _c] = 1.0, -1.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """The samples at a point: ℓ, Y (n, 6), residuals (S, 2, 3), and weights (S, 6) of readings."""
-
-    around: Interpolation
-    given: Array
-    residual: Array
-    weight: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,23 +82,22 @@ class SensorRows(Addition):
         of_reactions = self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
         return of_reactions**0.75 * self._unit**0.25
 
-    @cached_property
-    def _tool(self) -> Index:
-        """The φ in what the tool takes."""
-        if not len(mass := self.sensor.phi_places("tool-mass")):
-            return mass
-        turns = self.segment.nuisance.places("tilt", "turn")
-        return np.concatenate([mass, self.sensor.phi_places("tool-centre"), turns])
-
     # Values -------------------------------------------------------------------------------------
 
     def _on_grid(self, part: Part, forced: Forced) -> Array:
         """W (n, 6)."""
-        value, tool = self.sensor.on_grid(forced)[0], self._tool_at(part)
-        return value if tool is None else value + tool.value
+        value = self.sensor.on_grid(forced)[0]
+        return value + self.sensor.tool.value(*self._tool_at(part)).T if len(self._tool) else value
 
-    def _tool_at(self, part: Part) -> Tool | None:
-        return self.sensor.tool(part.sensing.gravity[0], part.phi, len(self._times))
+    @property
+    def _tool(self) -> Index:
+        return self.sensor.tool_phi
+
+    def _tool_at(self, part: Part) -> tuple[Array, Array]:
+        """The φ and the data of what the tool takes on the grid."""
+        count = len(self._times)
+        own = np.broadcast_to(part.phi[self._tool, None], (len(self._tool), count))
+        return own, self.sensor.tool_data(count)
 
     def _forced(self, part: Part, z: Array) -> Forced:
         return Forced.still(self.reactions.newtons(z), part.x[:, self.reactions.dofs])
@@ -185,9 +173,9 @@ class SensorRows(Addition):
         force_n, unit = self.segment.force_n, self._row_unit[:, None]
         found = [np.tile(own, self.count // 6), -by_force * force_n / unit]
         found.append(-by_place[:, 3:] * self.segment.length_m / unit[3:])
-        if (tool := self._tool_at(part)) is not None:
-            by_phi = self.sensor.tool_by_phi(part.sensing.gravity[1])
-            found.append(-tool.slopes @ by_phi[:, self._tool] / unit)
+        if len(self._tool):
+            _, by_phi = self.sensor.tool.slopes(*self._tool_at(part))
+            found.append(-np.moveaxis(by_phi, 2, 0) / unit)
         if len(self._lag):
             e, a, b = self._fading(part)[:, 0]
             before, wrench = np.tile(own, count - 1), np.tile(-b * own, (count, 1))
@@ -200,11 +188,9 @@ class SensorRows(Addition):
     def _lag_scale(self) -> float:
         return float(self.segment.nuisance.scales[self._lag[0]])
 
-    @cached_property
+    @property
     def _reading(self) -> Index:
-        """The φ in how the samples are read: the shift of the clock, if any, and tares."""
-        kinds = ("sensor-time", "tare")
-        return np.concatenate([self.sensor.phi_places(kind) for kind in kinds])
+        return self.sensor.read_phi
 
     @cached_property
     def _bands(self) -> list[tuple[int, Index]]:
@@ -250,8 +236,7 @@ class SensorRows(Addition):
         crossed = -np.einsum("abc,ka->kbc", LEVI_CIVITA, turned)
         scale = segment.length_m * segment.force_n
         found = [np.repeat(crossed[:, b, c], len(nodes)) * scale for b, c, nodes in self._crossing]
-        read = self._read(part, z)
-        found += [loss_weight * each for each in self._loss_curvature(read)]
+        found += [loss_weight * each for each in self._loss_curvature(self._samples(part, z))]
         if len(self._lag):
             (e, a, b), mu = self._fading(part)[:, 1] * self._lag_scale, of_rows[1] * self._unit
             of_wrench = np.zeros_like(mu)
@@ -270,90 +255,51 @@ class SensorRows(Addition):
     ) -> Array | float:
         """Second derivatives (k, k) by φ of loss_weight · loss + multipliers · g."""
         found, of_rows = np.zeros((len(part.phi),) * 2), self._of_rows(multipliers)
-        if (tool := self._tool_at(part)) is not None:
-            _, first, second = self.segment.nuisance.gravity(part.phi)
-            by_phi = self.sensor.tool_by_phi(first)
-            found -= by_phi.T @ tool.curvature(of_rows[0]) @ by_phi
-            of_gravity = np.einsum("ka,kag->g", of_rows[0], tool.slopes[..., 4:])
-            found -= np.einsum("g,gij->ij", of_gravity, second)
+        if len(self._tool):
+            bent = self.sensor.tool.curvature(*self._tool_at(part), of_rows[0].T)
+            found[np.ix_(self._tool, self._tool)] -= bent.sum(axis=2)
         if len(self._lag):
             bent = self._smoothed(part, *self._own(z), order=2) * self._lag_scale**2
             found[self._lag, self._lag] -= np.sum(of_rows[1] * bent)
-        read = self._read(part, z)
-        slopes = self._by_phi(read).reshape(*read.residual.shape, -1)
-        bending = self._robust_curvature(read)
-        own = np.einsum("sbip,sbij,sbjr->pr", slopes, bending, slopes)
-        if len(shift := self.sensor.phi_places("sensor-time")):
-            bent = read.around.matrix(read.around.curvatures, len(self._times)) @ read.given
-            scale = self.segment.nuisance.scales[shift[0]]
-            own[0, 0] += scale**2 * np.sum(self._pull(read) * bent)
+        own = self._samples(part, z).loss_curvature[2]
         found[np.ix_(self._reading, self._reading)] += loss_weight * own
         return found
 
     # Loss ---------------------------------------------------------------------------------------
 
-    def _read(self, part: Part, z: Array) -> _Read:
-        wrench, given = self.sensor.wrench, self._own(z)[-1]
-        around = self.sensor.interpolation(part.phi, len(given))
-        read = self.sensor.with_tare(around.matrix(around.values, len(given)) @ given, part.phi)
-        weight = self.sensor.present / wrench.sigmas
-        residual = weight * (read - np.nan_to_num(wrench.values))
-        return _Read(around, given, residual.reshape(-1, 2, 3), weight)
-
-    def _pull(self, read: _Read) -> Array:
-        """∂loss (S, 6) by readings."""
-        return robust(read.residual, self.segment.huber)[1].reshape(-1, 6) * read.weight
-
-    def _robust_curvature(self, read: _Read) -> Array:
-        return robust_curvature(read.residual, self.segment.huber)
-
-    def _by_phi(self, read: _Read) -> Array:
-        """(S, 6, m) residuals by the φ of `_reading`."""
-        shift, scales = self.sensor.phi_places("sensor-time"), self.segment.nuisance.scales
-        found = np.zeros((*read.weight.shape, len(self._reading)))
-        if len(shift):
-            moved = read.around.matrix(read.around.slopes, len(self._times)) @ read.given
-            found[..., 0] = scales[shift[0]] * moved
-        tared = self.sensor.tared
-        found[:, tared, len(shift) + np.arange(len(tared))] = scales[self._reading[len(shift) :]]
-        return read.weight[..., None] * found
+    def _samples(self, part: Part, z: Array) -> Samples:
+        return self.sensor.samples(self._own(z)[-1], part.phi, self.sensor.weight)
 
     def loss(self, part: Part, z: Array) -> float:
         """L_w of this sensor."""
-        return float(robust(self._read(part, z).residual, self.segment.huber)[0].sum())
+        return self.sensor.loss(self._own(z)[-1], part.phi)
 
     def gradient(self, part: Part, z: Array) -> tuple[Array, Array]:
         """∂L_w by the variables (count,) and by φ (k,)."""
-        read, of_phi, own = self._read(part, z), np.zeros(len(part.phi)), np.zeros(self.count)
-        pull = self._pull(read)
-        onto = read.around.matrix(read.around.values, len(self._times)).T @ pull
-        own[self._given] = onto * self._unit
-        slopes = robust(read.residual, self.segment.huber)[1].reshape(-1, 6)
-        of_phi[self._reading] = np.einsum("sa,sap->p", slopes, self._by_phi(read))
+        of_phi, own = np.zeros(len(part.phi)), np.zeros(self.count)
+        by_given, of_phi[self._reading] = self.sensor.loss_slopes(self._own(z)[-1], part.phi)
+        own[self._given] = by_given * self._unit
         return own, of_phi
 
-    def _loss_curvature(self, read: _Read) -> list[Array]:
+    def _loss_curvature(self, samples: Samples) -> list[Array]:
         """∂²L_w: φ of `_reading` by Y (n, 6, m), then each of `_bands` (n − apart, entries)."""
-        count, around = len(self._times), read.around
-        bending, weight = self._robust_curvature(read), read.weight.reshape(-1, 2, 3)
-        bent = np.einsum("sbij,sbjp->sbip", bending, self._by_phi(read).reshape(*weight.shape, -1))
-        bent = (weight[..., None] * bent).reshape(len(weight), -1)
-        by_phi = around.matrix(around.values, count).T @ bent
-        by_phi = by_phi.reshape(count, 6, -1)
-        if len(shift := self.sensor.phi_places("sensor-time")):
-            pulled = around.matrix(around.slopes, count).T @ self._pull(read)
-            by_phi[..., 0] += self.segment.nuisance.scales[shift[0]] * pulled
-        unit = self._unit.reshape(2, 3)
-        pairs = (weight * unit)[..., :, None] * bending * (weight * unit)[..., None, :]
+        count, window = len(self._times), samples.window
+        twice, by_phi, _ = samples.loss_curvature
+        of_phi = np.zeros((count, 6, len(self._reading)))
+        np.add.at(of_phi, window, by_phi)
+        # Forces and torques are groups of their own.
+        grouped = twice.reshape(*twice.shape[:2], 2, 3, -1, 2, 3)
         bands = [np.zeros((count, 2, 3, 3)) for _ in self._bands]
-        for i, j in combinations_with_replacement(range(around.values.shape[1]), 2):
-            both = (around.values[:, i] * around.values[:, j])[:, None, None, None]
-            np.add.at(bands[j - i], around.around[:, i], both * pairs)
+        for i, j in combinations_with_replacement(range(window.shape[1]), 2):
+            pairs = np.einsum("sgagb->sgab", grouped[:, i, :, :, j])
+            np.add.at(bands[j - i], window[:, i], pairs)
+        unit = self._unit.reshape(2, 3)
+        scale = unit[:, :, None] * unit[:, None, :]
         kept = [
-            band[: count - apart].reshape(-1, 18)[:, entries]
+            (scale * band[: count - apart]).reshape(-1, 18)[:, entries]
             for band, (apart, entries) in zip(bands, self._bands, strict=True)
         ]
-        return [by_phi * self._unit[:, None], *kept]
+        return [of_phi * self._unit[:, None], *kept]
 
 
 def _all(pairs: list[tuple[Index, Index]]) -> tuple[Index, Index]:

@@ -125,7 +125,7 @@ def simulate(
     markers = experiment.markers.observe(positions)
     ideal = NuisanceMap.of(replace(experiment, nuisance=Nuisance.none()))
     wrenches = tuple(
-        sensor.readings(forced, np.zeros(ideal.size), ideal.gravity_m_s2)
+        sensor.readings(forced, np.zeros(ideal.size))
         for sensor in sensors_of(experiment, at, ideal)
     )
     return Trajectory(experiment.t_s, positions, v.reshape(shape), markers, (at, forced), wrenches)

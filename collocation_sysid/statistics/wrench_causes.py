@@ -101,7 +101,7 @@ def _of_sensor(part: Part, sensor: Sensor, forced: Forced) -> list[Cause]:
 def _misfit(part: Part, sensor: Sensor, forced: Forced, tare: float) -> float:
     """RMS of the residuals in standard deviations, tares of so many sigmas allowed for."""
     nuisance = part.segment.nuisance
-    read = sensor.readings(forced, np.zeros(nuisance.size), part.sensing.gravity[0])
+    read = sensor.readings(forced, np.zeros(nuisance.size))
     # Sigmas are those of what is measured, whatever a trial makes of it.
     apart = (read - sensor.wrench.values) / sensor.wrench.sigmas
     there = np.isfinite(apart)

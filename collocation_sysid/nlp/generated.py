@@ -1,0 +1,89 @@
+"""Small expressions of a few numbers, at many instances, with derivatives that nobody writes.
+
+Instances come last: inputs u are (k, …), data (d, …), and values (m, …), for any shape … of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from ..arrays import Array
+
+Expression = Callable[[ca.SX, ca.SX], ca.SX]
+
+
+@dataclass(frozen=True, eq=False)
+class Generated:
+    """An expression y(u, data), mapped over its instances.
+
+    Attributes
+    ----------
+    expression : callable
+        ``expression(u, data) -> y`` in CasADi operations, of columns.
+    inputs, data : int
+        Lengths k of u and d of the data.
+    """
+
+    expression: Expression
+    inputs: int
+    data: int
+
+    def value(self, u: Array, data: Array) -> Array:
+        """(m, …)."""
+        return self._mapped(self._value, u, data)[0][:, 0]
+
+    def slopes(self, u: Array, data: Array) -> tuple[Array, Array]:
+        """The values (m, …), and ∂y/∂u (m, k, …)."""
+        value, slopes = self._mapped(self._slopes, u, data)
+        return value[:, 0], slopes
+
+    def curvature(self, u: Array, data: Array, weights: Array | None = None) -> Array:
+        """∂²/∂u² (k, k, …) of Σ weights · y, for weights (m, …); one by default."""
+        weights = (
+            np.ones((self._symbols[2].numel(), *data.shape[1:])) if weights is None else weights
+        )
+        return self._mapped(self._curvature, u, data, weights)[0]
+
+    @cached_property
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        u, data = ca.SX.sym("u", self.inputs), ca.SX.sym("data", self.data)
+        return u, data, ca.densify(ca.SX(self.expression(u, data)))
+
+    @cached_property
+    def _value(self) -> ca.Function:
+        u, data, y = self._symbols
+        return ca.Function("value", [u, data], [y])
+
+    @cached_property
+    def _slopes(self) -> ca.Function:
+        u, data, y = self._symbols
+        return ca.Function("slopes", [u, data], [y, ca.densify(ca.jacobian(y, u))], CSE)
+
+    @cached_property
+    def _curvature(self) -> ca.Function:
+        u, data, y = self._symbols
+        weights = ca.SX.sym("weights", y.numel())
+        second, _ = ca.hessian(ca.dot(weights, y), u)
+        return ca.Function("curvature", [u, data, weights], [ca.densify(second)], CSE)
+
+    def _mapped(self, function: ca.Function, u: Array, *others: Array) -> list[Array]:
+        """Outputs (rows, columns, …) of a function."""
+        shape = others[0].shape[1:]
+        count = int(np.prod(shape))
+        sizes = [function.size_out(k) for k in range(function.n_out())]
+        if not count:
+            return [np.zeros((*size, *shape)) for size in sizes]
+        given = [each.reshape(len(each), count) for each in (u, *others)]
+        found = []
+        for size, output in zip(sizes, function.map(count).call(given), strict=True):
+            full = output.full().reshape(size[0], count, size[1]).transpose(0, 2, 1)
+            found.append(full.reshape(*size, *shape))
+        return found
+
+
+CSE = {"cse": True}
