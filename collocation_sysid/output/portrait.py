@@ -36,6 +36,7 @@ def portrait(
     if field is not None and field not in FIELDS:
         expected = f"expected one of {', '.join(FIELDS)}{hint_at(field, list(FIELDS))}"
         raise InputError(f"no field {field!r}; {expected}")
+    assert replay.shapes_m is not None  # it was chosen among those that have some
     return shapes(
         replay.t_s, replay.shapes_m, replay.surface, replay.held, replay.measured_m, replay.up,
         count, replay.surface_nodes, replay.surface_parts,
