@@ -29,7 +29,7 @@ html_theme = "furo"
 # Scripts with a recorded object in them run where its data have been fetched.
 _measured = {
     "measured_beam": "srl_beam/beam_gravity_V2_a.c3d",
-    "measured_cylinders": "phantom_compression/EF30_0T_A1_force.csv",
+    "measured_cylinders": "phantom_compression/EF30_0T_A1.csv",
     "measured_tentacle": "soft_tentacle/m1_u01_markers.csv",
 }
 _here = Path(__file__).parent

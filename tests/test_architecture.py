@@ -22,7 +22,7 @@ LAYERS = (
     {"statistics"},
     {"problem"},
     {"check", "earlier", "rollout", "second_start", "verdict", "run", "refine"},
-    {"output", "synthesis"},
+    {"output", "synthesis", "beginning"},
     {"export"},
     {"terminal", "method_tables"},
     {"live"},

@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from problem_files import run_command
 
+from collocation_sysid import run
+from collocation_sysid.beginning import SWUNG, YOUNG_PA
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.experiment.force_files import read_pressure
-from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
 
 TIMES = [0.0, 0.1, 0.2]
@@ -225,3 +228,68 @@ def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, w
         Problem.read(file)
     assert words in str(caught.value)
     assert "more to mend" not in str(caught.value)
+
+
+# New problems -------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        ("compression", {"run_1.csv"}),
+        ("tension", {"run_1.csv"}),
+        ("swing", {"body.vtu", "poses.csv", "markers.csv"}),
+    ],
+)
+def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, data):
+    monkeypatch.chdir(tmp_path)
+    begun = run_command("new", "mine", "--kind", kind)
+    assert begun.code == 0
+    assert {Path(line).name for line in begun.out.splitlines()} == {"problem.toml", *data}
+    assert "collocation-sysid check mine/problem.toml" in begun.err
+    assert "collocation-sysid solve mine/problem.toml" in begun.err
+    guessed = ("--set", "parameters.young_pa.guess=3e4" if kind != "swing" else "solver.huber=9.0")
+    assert run_command("check", "mine/problem.toml", *guessed).code == 0
+    problem = Problem.read("mine/problem.toml", guessed[1:])
+    found = run(problem, seek_causes=False)
+    assert found.trust.verdict == "good"
+    low, high = found.interval("young_pa")
+    assert low < (SWUNG["young_pa"] if kind == "swing" else YOUNG_PA) < high
+
+
+def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_command("new", "mine", "--kind", "compression")
+    file = tmp_path / "mine" / "run_1.csv"
+    ours = Problem.read("mine/problem.toml", simulation=True).experiments[0].grasps[1].wrench
+    text = file.read_text().replace("Displacement (mm),Force (N)", "Standardweg (mm),Kraft (N)")
+    text = "Probe 7\nWerkstoff,Silikon\n\n" + text
+    file.write_text(text.replace(",", ";").replace(".", ","), encoding="cp1252")
+    again = Problem.read("mine/problem.toml", simulation=True).experiments[0].grasps[1].wrench
+    assert ours is not None
+    assert again is not None
+    np.testing.assert_array_equal(again.values, ours.values)
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ("edge_length_m = 1e-5", "object.edge_length_m: makes 4.5e+11 elements; expected at most"),
+        ("mass_kg = 1.0", "edge_length_m belongs to surface, cylinder or box_m"),
+        ('edge_length_m = 0.01\nmesh = "a.vtu"', "found mesh and cylinder; expected exactly one"),
+    ],
+)
+def test_a_shape_that_cannot_be_meshed_is_refused(tmp_path, shape, words):
+    cylinder = f"cylinder = {{ diameter_m = 0.05, height_m = 0.03 }}\n{shape}"
+    text = SHARED.replace('mesh = "block.vtu"', cylinder)
+    with pytest.raises(InputError) as caught:
+        Problem.read(block_problem(tmp_path, text))
+    assert words in str(caught.value)
+
+
+def test_a_quarter_of_a_cylinder_has_a_quarter_of_its_volume():
+    whole, quarter = (cylinder_of_edge(0.05, 0.03, 0.011, part) for part in (False, True))
+    assert whole.volume_m3 == pytest.approx(np.pi * 0.025**2 * 0.03, rel=1e-9)
+    assert quarter.volume_m3 == pytest.approx(whole.volume_m3 / 4, rel=1e-9)
+    assert quarter.points_m[:, :2].min() == 0.0

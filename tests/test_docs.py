@@ -74,7 +74,7 @@ def in_a_problem(code: str) -> dict[str, Any]:
     experiment = block.pop("experiment", {})
     if isinstance(experiment, dict):
         experiment = [whole["experiment"][0] | experiment]
-    if not {"mesh", "surface"} & set(block.get("object", ["mesh"])):
+    if not {"mesh", "surface", "cylinder", "box_m"} & set(block.get("object", ["mesh"])):
         block["object"] |= whole["object"]
     return whole | block | {"experiment": experiment}
 

@@ -164,8 +164,9 @@ def measured(
     text, folder = path.read_text(), Path(os.environ.get(variable, path.parent)).resolve()
     if not all((folder / each).is_file() for each in re.findall(r'"(\w+\.csv)"', text)):
         pytest.skip(f"needs the measured data: python scripts/get_{name}.py")
-    mesh = path.parent / tomllib.loads(text)["object"]["mesh"]
-    return Problem.read(path, [f"object.mesh={mesh}", *changes], folder=folder)
+    mesh = tomllib.loads(text)["object"].get("mesh")
+    beside = [f"object.mesh={path.parent / mesh}"] if mesh else []
+    return Problem.read(path, [*beside, *changes], folder=folder)
 
 
 @pytest.mark.slow

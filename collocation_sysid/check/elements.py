@@ -110,13 +110,14 @@ def element_warnings(
             f"{FOR_VOLUME}"
         )
     needed = CELLS_ACROSS.get(name, 0.0)
-    if shape.length_m > SLENDER * shape.thickness_m and shape.cells_across < needed:
+    if shape.length_m > SLENDER * shape.thickness_m and shape.cells_across < needed - ROUND_OFF:
         off, found = ("stiff", "low") if name == LINEAR else ("soft", "high")
         instead = f"{FOR_BENDING}, or refine" if name == LINEAR else "refine"
         warnings.append(
             f"only about {shape.cells_across:.1f} {name} elements lie across the body's "
             f"{1e3 * shape.thickness_m:.3g} mm, too {off} in bending, so that the stiffness found "
-            f"will be too {found}: {instead} the mesh to {needed:.0f} or more"
+            f"of a real body will be too {found} (not of data simulated with these elements, which "
+            f"are as {off}): {instead} the mesh to {needed:.0f} or more"
         )
     return warnings
 

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import json
+import shlex
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from .common import AsJson, examples
+from .common import AsJson, errors, examples
 
 commands = typer.Typer()
+
+
+class Kind(StrEnum):
+    """What a new problem is of."""
+
+    COMPRESSION = "compression"
+    TENSION = "tension"
+    SWING = "swing"
 
 
 @commands.command(epilog=examples("methods", "methods interior-point"))
@@ -41,9 +51,28 @@ def schema() -> None:
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
 
 
-@commands.command(epilog=examples("new my_object", "check my_object/problem.toml"))
-def new(name: Annotated[str, typer.Argument(help="Name of the new folder.")]) -> None:
+@commands.command(
+    epilog=examples(
+        "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
+    )
+)
+def new(
+    name: Annotated[str, typer.Argument(help="Name of the new folder.")],
+    kind: Annotated[
+        Kind | None,
+        typer.Option(help="With a simulated recording of this kind, so that it runs as it is."),
+    ] = None,
+) -> None:
     """Write a commented problem file to start from."""
+    from ..beginning import begin
     from ..problem.template import write_template
 
-    typer.echo(write_template(Path(name)))
+    file, *data = [write_template(Path(name))] if kind is None else begin(Path(name), kind.value)
+    typer.echo(file)
+    for each in data:
+        typer.echo(each)
+    yours = "put your mesh, poses and marker tracks beside it and name them in it"
+    example = "it runs as it is, on data simulated here; then put your own in their place"
+    errors.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
+    for command in ("check", "solve"):
+        errors.print(f"  collocation-sysid {command} {shlex.quote(str(file))}", soft_wrap=True)

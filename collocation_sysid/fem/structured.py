@@ -2,12 +2,73 @@
 
 from __future__ import annotations
 
+from math import pi, sin, sqrt
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from .mesh import TetMesh
 from .mesh_checks import orient
+
+# A quarter of a cylinder needs a multiple of four; the volume is right with any.
+_SECTORS = 8
+_MOST_ELEMENTS = 1_000_000
+
+
+def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
+    """Mesh a box with a corner at the origin, in edges of about this length.
+
+    Raises
+    ------
+    InputError
+        If that makes more than a million elements.
+    """
+    divisions = _divided(np.asarray(size_m, dtype=float), edge_length_m)
+    _refuse_many(6 * float(np.prod(divisions)))
+    return box_mesh(size_m, divisions.astype(int))
+
+
+def cylinder_of_edge(
+    diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
+) -> TetMesh:
+    """Mesh an upright cylinder of the right volume, in edges of about this length.
+
+    Parameters
+    ----------
+    diameter_m, height_m, edge_length_m : float
+    quarter : bool
+        Only x, y ≥ 0, between the planes of symmetry x = 0 and y = 0.
+
+    Raises
+    ------
+    InputError
+        If that makes more than a million elements.
+    """
+    rings, layers = _divided(np.array([diameter_m / 2, height_m]), edge_length_m)
+    _refuse_many(3 * _SECTORS * float(rings**2 * layers))
+    corners = _SECTORS * rings
+    radius_m = diameter_m / 2 * sqrt(2 * pi / corners / sin(2 * pi / corners))
+    whole = cylinder_mesh(radius_m, height_m, int(rings), int(layers), _SECTORS)
+    if not quarter:
+        return whole
+    points_m = np.where(np.abs(whole.points_m) < 1e-12 * diameter_m, 0.0, whole.points_m)
+    kept = (points_m[whole.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
+    corners_kept, tetrahedra = np.unique(whole.tetrahedra[kept], return_inverse=True)
+    return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4))
+
+
+def _divided(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
+    return np.maximum(np.round(size_m / edge_length_m), 1)
+
+
+def _refuse_many(elements: float) -> None:
+    if elements > _MOST_ELEMENTS:
+        raise InputError(
+            f"makes {elements:.3g} elements; expected at most {_MOST_ELEMENTS:,}: a larger length",
+            None,
+            "edge_length_m",
+        )
 
 
 def box_mesh(

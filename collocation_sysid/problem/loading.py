@@ -14,6 +14,7 @@ from ..fem.materials import Material
 from ..fem.mesh import TetMesh
 from ..fem.plausible import oddities
 from ..fem.regions import Region
+from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..nlp.parameters import Parameters, Tied, Unknown
 from .code import load_material
 from .densities import completed, guessed
@@ -115,8 +116,15 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     if section.mesh is not None:
         file = existing_file(folder, section.mesh, "mesh")
         return TetMesh.read(file, section.length_unit)
-    assert section.surface is not None  # by the schema
-    assert section.edge_length_m is not None
+    assert section.edge_length_m is not None  # by the schema
+    if section.cylinder is not None:
+        shape = section.cylinder
+        return cylinder_of_edge(
+            shape.diameter_m, shape.height_m, section.edge_length_m, shape.quarter
+        )
+    if section.box_m is not None:
+        return box_of_edge(section.box_m, section.edge_length_m)
+    assert section.surface is not None
     surface = existing_file(folder, section.surface, "surface")
     cache = folder / ".meshes"
     return TetMesh.from_surface(surface, section.edge_length_m, section.length_unit, cache)

@@ -68,12 +68,30 @@ class PronySection(Section):
     )
 
 
+class CylinderSection(Section):
+    """An upright cylinder, its base on z = 0 about the origin."""
+
+    diameter_m: Positive
+    height_m: Positive
+    quarter: Flag = Field(
+        default=False, description="Only its part x, y ≥ 0, between planes of symmetry."
+    )
+
+
 class ObjectSection(Section):
-    """The soft object: its mesh or surface, mass and material."""
+    """The soft object: its mesh, surface or shape, mass and material."""
 
     mesh: Text | None = Field(None, description="Tetrahedral mesh in any meshio format.")
     surface: Text | None = Field(None, description="Closed surface to fill with tetrahedra.")
-    edge_length_m: Positive | None = Field(None, description="Wanted edge length of a surface.")
+    cylinder: CylinderSection | None = Field(
+        None, description="A cylinder to mesh: diameter_m, height_m, quarter."
+    )
+    box_m: tuple[Positive, Positive, Positive] | None = Field(
+        None, description="Lengths [x, y, z] of a box to mesh, with a corner at the origin."
+    )
+    edge_length_m: Positive | None = Field(
+        None, description="Wanted edge length of a surface, cylinder or box."
+    )
     length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
     mass_kg: Positive | None = Field(
         None,
@@ -102,9 +120,12 @@ class ObjectSection(Section):
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ObjectSection:
-        require_one(self, "mesh", "surface")
-        if (self.surface is None) != (self.edge_length_m is None):
-            raise ValueError("edge_length_m belongs to surface; expected both or neither")
+        require_one(self, "mesh", "surface", "cylinder", "box_m")
+        if (self.mesh is None) != (self.edge_length_m is not None):
+            raise ValueError(
+                "edge_length_m belongs to surface, cylinder or box_m; expected it with one of "
+                "these, and not with mesh"
+            )
         if len(given_keys(self, "mass_kg", "density_kg_m3")) > 1:
             require_one(self, "mass_kg", "density_kg_m3")
         regions = [region.name for region in self.region]

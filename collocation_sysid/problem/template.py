@@ -114,8 +114,100 @@ method = "reduced-space"       # or "interior-point", "shooting", ...
 """
 
 
-def write_template(folder: Path) -> Path:
-    """Write problem.toml into a folder, which is made; its name is the title.
+BENCH = """\
+title = {title}
+
+{story}
+
+[object]
+{shape}
+density_kg_m3 = 1100.0         # of no effect here: there is neither motion nor gravity
+material = "neo-hookean"       # or mooney-rivlin, yeoh, gent, ...: compare --materials ranks them
+element = "tet10-p0"           # rubber, which would lock linear elements
+
+[parameters]                   # {{}} is estimated, a number alone is fixed
+young_pa    = {{}}               # no guess is needed; {{ guess = 1e5, lower = 1e3, upper = 1e7 }}
+poisson     = 0.49             # loads hardly tell it
+gamma_r_s   = 0.0              # equilibria tell no damping
+gamma_m_1_s = 0.0
+
+[experiment_defaults]          # what every [[experiment]] has that does not say it itself
+kind = "static"                # each sample is an equilibrium of its own
+gravity_m_s2 = [0.0, 0.0, 0.0]
+every = 10                     # every tenth row: ten to thirty samples tell what thousands do
+# window_s = [2.0, 60.0]       # leave out what is before {contact}
+# nuisance = {{ displacement_zero = {{ prior_m = 0.0002 }}, tare = "none" }}   # how zeros are known
+
+[[experiment_defaults.grasp]]  # the lower {ends}, which holds all axes
+nodes = {{ box_m = [[-1, -1, -1], [1, 1, 0.0001]] }}
+
+[[experiment_defaults.grasp]]  # the upper one: box_m begins just below the specimen's height
+nodes = {{ box_m = [[-1, -1, {below}], [1, 1, 1]] }}
+# axes = "z"                   # here and below, where the specimen slides on {ends}s
+{columns}
+
+[[experiment_defaults.grasp]]  # the plane of symmetry x = 0, between the {ends}s
+nodes = {{ box_m = [[-0.0001, -1, 0.0001], [0.0001, 1, {below}]] }}
+axes = "x"
+
+[[experiment_defaults.grasp]]  # the plane of symmetry y = 0
+nodes = {{ box_m = [[-1, -0.0001, 0.0001], [1, 0.0001, {below}]] }}
+axes = "y"
+
+[[experiment]]                 # one for each run; all share the parameters
+name = "run_1"
+file = "run_1.csv"             # {file}
+
+# [[experiment]]
+# name = "run_2"
+# file = "run_2.csv"
+# validation = true            # not fitted, only predicted
+"""
+
+COMPRESSION = {
+    "story": """\
+# A cylinder pressed between platens: crosshead and load cell. A quarter is modelled, between its
+# planes of symmetry.""",
+    "shape": """\
+cylinder = { diameter_m = 0.05, height_m = 0.03, quarter = true }   # or mesh = "specimen.vtu"
+edge_length_m = 0.011""",
+    "contact": "the platen touches all over",
+    "ends": "platen",
+    "below": "0.0299",
+    "columns": """\
+displacement = { sign = -1 }   # the file counts downwards as positive; the model's z is upwards
+# displacement = { sign = -1, columns = { displacement = "Kanal 1 (mm)" } }   # names of your own
+wrench = { sign = -1, symmetry = 4, sigma_n = 0.1 }   # a quarter of the load, its noise too""",
+    "file": "Time (s),Displacement (mm),Force (N); what machines write above is left out",
+}
+
+TENSION = {
+    "story": """\
+# A bar pulled between clamps: engineering strain and stress. A quarter is modelled, between its
+# planes of symmetry: half as wide and half as thick.""",
+    "shape": """\
+box_m = [0.008, 0.008, 0.02]   # half the width, half the thickness, the length between the clamps
+edge_length_m = 0.004          # or mesh = "specimen.vtu" in place of both""",
+    "contact": "the bar is straight",
+    "ends": "clamp",
+    "below": "0.0199",
+    "columns": """\
+displacement = { length_m = 0.02 }   # what strain multiplies; {} where the file has an extension
+# displacement = { length_m = 0.02, columns = { strain = "Kanal 1 (%)" } }    # names of your own
+wrench = { area_m2 = 2.56e-4, symmetry = 4, sigma_n = 0.02 }   # of the whole bar""",
+    "file": "Time (s),Strain (%),Stress (kPa); what machines write above is left out",
+}
+
+# What each kind of problem is written from.
+KINDS = {
+    "swing": (TEMPLATE, {}),
+    "compression": (BENCH, COMPRESSION),
+    "tension": (BENCH, TENSION),
+}
+
+
+def write_template(folder: Path, kind: str = "swing") -> Path:
+    """Write problem.toml of a kind into a folder, which is made; its name is the title.
 
     Raises
     ------
@@ -127,5 +219,6 @@ def write_template(folder: Path) -> Path:
     if file.exists():
         raise InputError("it is there already; choose another name", file)
     title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
-    write_whole(file, TEMPLATE.format(title=title))
+    text, words = KINDS[kind]
+    write_whole(file, text.format(title=title, **words))
     return file
