@@ -24,10 +24,11 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..checked import AtLeastOne, Positive
-from ..errors import SimulationError
+from ..errors import InputError, SimulationError
 from ..methods.options import Options
 from ..nlp.lapack import one_blas_thread
 from ..problem import Problem
+from ..run import Run
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
 from ..statistics.trust import GROSS_MISFIT, Concern, Trust
@@ -42,6 +43,7 @@ from .statistics import Scatter, widened
 from .sweep import LoggedRow, Reading
 from .track import Track
 from .trust import UNSETTLED, data_concerns, estimate_concerns
+from .whole import recording_of, solved
 
 # Standard deviation of a prior about the last pass for where the next one is, until many samples
 # tell of it.
@@ -59,6 +61,8 @@ TIMES, SLACK = 1.25, 1.0
 SHARE, BLOCKS = 0.8, 12
 # After so many passes that were rejected in a row another start is sought.
 REJECTED = 3
+# So often the window is passed at most when frames have ended.
+PASSES = 50
 # Times that rows are timed before frames come.
 TIMED = 3
 # Residuals this many times the usual are no noise. So many sizes of the body from where its grasp
@@ -240,29 +244,50 @@ class Estimator:
 
     @one_blas_thread()
     def settle(self) -> Update | None:
-        """Pass the window again until the estimate stays, however long that takes.
+        """What all frames say together, however long that takes; for when they have ended.
 
-        For when frames have ended: what it comes to is the batch's answer, where the window holds
-        the whole recording. The update is that of the last frame, None where there was none.
+        Where the window holds the recording, that is the batch's run of it. Else, and where
+        markers were seen between samples, the window is passed again until the estimate stays. The
+        update is that of the last frame, with the distance of all markers where there was a run;
+        None where there was no frame.
         """
         began, notes = self.clock(), ["settled after the last frame"]
         if self.last is None or self.track is None:
             return self.last
-        hurried, self.budget_s, self.rows = (self.budget_s, self.rows), np.inf, None
-        try:
-            rows = self._pass_again(began, notes)
-        finally:
-            self.budget_s, self.rows = hurried
-        estimates, trust = self._known(self.last.t_s)
-        latency_s = self.clock() - began
+        last, found = self.last, self._run_of_all(self.track, notes)
+        if found is None:
+            rows = self._pass_to_the_end(began, notes)
+            estimates, trust = self._known(last.t_s)
+        else:
+            rows = len(found.solution.history) * len(self.log)
+            estimates = {name: found.estimates[name] for name in last.estimates}
+            left_out = Trust.of(data_concerns(Scatter(), self.counts, self.samples))
+            trust = found.trust.joined(left_out)
+            last = replace(last, marker_rms_m=found.solution.rms_m)
         return replace(
-            self.last,
+            last,
             estimates=estimates,
             trust=trust,
             notes=tuple(notes),
-            latency_s=latency_s,
+            latency_s=self.clock() - began,
             relinearised=rows,
         )
+
+    def _run_of_all(self, track: Track, notes: list[str]) -> Run | None:
+        """The batch's run, None where the window does not hold what it needs."""
+        whole = None if track.prior.rows else recording_of(self.model, self.intake, self.log)
+        try:
+            return None if whole is None else solved(self.problem, whole)
+        except InputError as error:
+            notes.append(f"the recording cannot be solved as a whole: {error.message}")
+            return None
+
+    def _pass_to_the_end(self, began: float, notes: list[str]) -> int:
+        hurried, self.rows = self.rows, PASSES * len(self.log)
+        try:
+            return self._pass_again(began, notes)
+        finally:
+            self.rows = hurried
 
     def _of_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
         """What of a frame can be read."""

@@ -9,6 +9,7 @@ its time or later is. Markers are read where their own times are.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -66,6 +67,14 @@ class Intake:
     def last_pose_s(self) -> float | None:
         """When the last pose was."""
         return self._poses[-1][0] if self._poses else None
+
+    def seen(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
+        """When markers were seen, in samples from the first row on, and where, (M, 3)."""
+        for number, row in enumerate(log):
+            for back, tracks_m in row.readings:
+                yield (number - back) / self.substeps, tracks_m
+        for t_s, tracks_m in self._waiting:
+            yield (t_s - (self.start_s or 0.0)) / self.interval_s, tracks_m
 
     def is_lost(self, t_s: float) -> bool:
         """Whether a time is so long after the last pose that nothing is known of the motion.

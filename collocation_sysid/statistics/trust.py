@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -83,6 +83,12 @@ class Trust:
         )
         verdict = "doubtful" if grave else "check" if light else "good"
         return cls(verdict, tuple(dict.fromkeys((*grave, *light))))
+
+    def joined(self, other: Trust) -> Trust:
+        """The graver of two verdicts, with the reasons of both."""
+        gravity = get_args(Verdict).index
+        light, grave = sorted((other, self), key=lambda each: gravity(each.verdict))
+        return Trust(grave.verdict, tuple(dict.fromkeys((*grave.reasons, *light.reasons))))
 
 
 def cause_concerns(causes: Iterable[Cause]) -> list[Concern]:

@@ -1,0 +1,61 @@
+"""What all frames say together: a recording that is solved as any other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..experiment.clock import STEP_TOLERANCE
+from ..experiment.experiment import Experiment
+from ..experiment.poses import PoseSequence
+from ..methods.reduced_space import ReducedSpace
+from ..problem import Problem
+from ..run import Run, run
+from .intake import Intake
+from .model import Model
+from .sweep import LoggedRow
+
+# A motion has no fewer samples.
+FEWEST = 3
+
+
+def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Experiment | None:
+    """The experiment with the poses and markers of all rows, from the first frame on.
+
+    None where there are too few, or where markers were seen between samples.
+    """
+    experiment, at_samples = model.experiment, log[:: model.substeps]
+    t_s = experiment.t_s[0] + model.interval_s * np.arange(len(at_samples))
+    tracks_m = np.full((len(t_s), len(experiment.markers.names), 3), np.nan)
+    for when, tracks in intake.seen(log):
+        if abs(when - round(when)) > STEP_TOLERANCE:
+            return None
+        if round(when) < len(t_s):
+            tracks_m[round(when)] = tracks
+    if len(t_s) < FEWEST or np.isnan(tracks_m).all():
+        return None
+    grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
+    for k, number in enumerate(model.moved_grasps):
+        matrices = np.tile(np.eye(4), (len(t_s), 1, 1))
+        for matrix, row in zip(matrices, at_samples, strict=True):
+            matrix[:3, :3], matrix[:3, 3] = row.poses[k]
+        smooth = grasps[number].poses.interpolation
+        poses = PoseSequence.from_matrices(t_s, matrices, smooth)
+        grasps[number] = replace(grasps[number], poses=poses)
+    markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
+    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers)
+
+
+def solved(problem: Problem, recording: Experiment) -> Run:
+    """The batch's run of a recording.
+
+    Raises
+    ------
+    InputError
+        Where it is refused, see `run`.
+    """
+    options = replace(problem.uncertainty, profile=())
+    whole = replace(problem, experiments=[recording], uncertainty=options)
+    return run(whole, problem.solver(ReducedSpace.name), seek_causes=False)
