@@ -16,7 +16,7 @@ from .nlp.schemes import as_scheme
 from .problem import Problem
 from .run import Run, solve
 from .statistics.estimates import Estimate
-from .statistics.numerical import Refinement, numerical_error
+from .statistics.numerical import Refinement, numerical_errors
 
 MOST_LEVELS = 3
 # Last step of the logarithms: far below any error bar.
@@ -25,7 +25,7 @@ TOLERANCE = 1e-6
 
 def finer_step(problem: Problem) -> Problem:
     """The problem with half the step."""
-    return replace(problem, substeps=2 * problem.substeps)
+    return replace(problem, substeps=2 * problem.first_substeps)
 
 
 def finer_mesh(problem: Problem) -> Problem:
@@ -41,7 +41,8 @@ FINER = {"step": finer_step, "mesh": finer_mesh}
 def refine(finished: Run, levels: int = 2, say: Callable[[str], None] | None = None) -> Run:
     """A converged run with its numerical error, see `refinement_of`."""
     answer = Earlier.of(finished.solution)
-    found = refinement_of(finished.problem, answer, finished.estimates, levels, say)
+    problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
+    found = refinement_of(problem, answer, finished.noise_estimates, levels, say)
     return replace(finished, refinement=found)
 
 
@@ -62,7 +63,7 @@ def refinement_of(
     problem : Problem
     answer : Earlier
     estimates : mapping of name to Estimate
-        The answer's.
+        The answer's, with the intervals for noise.
     levels : int
         2, or 3 to observe the orders.
     say : callable, optional
@@ -91,15 +92,9 @@ def refinement_of(
             solution = _solved(at, start, f"{kind} halved {level}×")
             start = Earlier.of(solution)
             found[kind].append(_level(kind, level, solution))
-    linear = {item.name for item in problem.parameters.items if item.scale == "linear"}
+    by_step, by_mesh = ([each["values"] for each in found[kind]] for kind in FINER)
     order = as_scheme(problem.scheme).order
-    errors = {}
-    for name, estimate in estimates.items():
-        by_step, by_mesh = ([each["values"][name] for each in found[kind]] for kind in FINER)
-        # What is fixed, or at its bound, stays.
-        if any(value != estimate.value for value in (*by_step, *by_mesh)):
-            is_linear = name in linear
-            errors[name] = numerical_error(name, estimate, by_step, by_mesh, order, is_linear)
+    errors = numerical_errors(estimates, by_step, by_mesh, order, problem.parameters.linear)
     return Refinement(errors, tuple(each for kind in FINER for each in found[kind]))
 
 

@@ -13,11 +13,16 @@ from .experiment import Experiment
 from .fem.batched import side_by_side
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution, wrench_rms
+from .nlp.schemes import MOST_STEPS, as_scheme
 from .nlp.segment import Segment
 from .nlp.simulation import Trajectory, simulate
 from .problem import Problem
+from .statistics.estimates import Estimate
 from .statistics.linearised import Derived, LinearisedFit
-from .statistics.numerical import changes_towards
+from .statistics.numerical import Refinement, changes_towards, numerical_errors
+
+# Grid steps over those of a roll-out that tells the step's error, with room for rounding.
+LEAST_FINER = 1.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +72,8 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
             segment.corrected(phi),
             experiment.body.theta(solution.parameters),
             integrator,
-            timestep_s=options.timestep_s,
-            substeps=problem.substeps,
+            timestep_s=_step_s(problem, segment),
+            substeps=segment.substeps,
         )
     except SimulationError as error:
         return str(error)
@@ -116,46 +121,56 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     return segment, alone.parameters_of(ReducedSpace()(alone).z) if alone.nphi else np.zeros(0)
 
 
-def step_changes(
+def step_error(
     problem: Problem,
     solution: Solution,
     fit: LinearisedFit,
     rollouts: Mapping[str, Rollout | str],
-) -> dict[str, float] | None:
-    """Change of every parameter and modulus that a finer step would bring, to first order.
+    estimates: Mapping[str, Estimate],
+) -> Refinement | None:
+    """What the step does to every parameter and modulus, to first order.
 
-    A Gauss–Newton step towards the roll-outs; None where these are missing or no finer, and where
-    all is static.
+    From a Gauss–Newton step towards the roll-outs; None where these are missing or no finer, and
+    where all is static.
     """
     apart: list[Array] = []
-    if all(segment.experiment.static for segment in solution.collocation.segments):
+    collocation = solution.collocation
+    if all(segment.experiment.static for segment in collocation.segments):
         return None
-    parts = zip(solution.collocation.segments, solution.readings_m, strict=True)
-    for segment, readings in parts:
+    for segment, readings in zip(collocation.segments, solution.readings_m, strict=True):
         experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)
-        if not isinstance(rollout, Rollout) or not _finer(problem, experiment):
+        share = _share(problem, segment)
+        if not isinstance(rollout, Rollout) or share is None:
             return None
-        way = rollout.trajectory.markers_m - readings
+        way = share * (rollout.trajectory.markers_m - readings)
         apart.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
         fitted = solution.wrenches.get(experiment.name, [])
         for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
-            way = np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
+            way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             apart.append(way.reshape(-1, 2, 3))
-    collocation = solution.collocation
-    q, change = solution.q, changes_towards(fit, apart)[: collocation.nq]
-    parameters = collocation.parameters
-    after, before = (parameters.values(q + way) for way in (change, 0 * change))
-    moduli = Derived.of((s.constants for s in collocation.segments), q).by_q
-    return {
-        **{name: after[name] - value for name, value in before.items() if after[name] != value},
-        **{name: float(slopes @ change) for name, slopes in moduli.items() if slopes.any()},
-    }
+    change = changes_towards(fit, apart)[: collocation.nq]
+    q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
+    moduli = Derived.of((s.constants for s in collocation.segments), q).values
+    halved = {**moduli, **collocation.parameters.values(q)}
+    linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
+    return Refinement(numerical_errors(estimates, [halved], [], order, linear))
 
 
-def _finer(problem: Problem, experiment: Experiment) -> bool:
-    """Whether roll-outs have at most half the step of the fit, or there is none."""
-    options, interval_s = problem.rollout, experiment.timestep_s
+def _share(problem: Problem, segment: Segment) -> float | None:
+    """Of the way to a roll-out, the part that half the step would go; None if it is no finer."""
+    experiment, options = segment.experiment, problem.rollout
     if experiment.static:
-        return True
-    step_s = options.timestep_s or interval_s / 4
-    return options.integrator == "newmark" and step_s <= 0.501 * interval_s / problem.substeps
+        return 1.0
+    steps = experiment.timestep_s / _step_s(problem, segment) / segment.substeps
+    if options.integrator != "newmark" or steps < LEAST_FINER:
+        return None
+    order = as_scheme(problem.scheme).order
+    # Newmark's own error is of second order: beside one of the first it is none.
+    left = steps**-order if order > 1 else 0.0
+    return (1 - 0.5**order) / (1 - left)
+
+
+def _step_s(problem: Problem, segment: Segment) -> float:
+    """Of the roll-outs: a quarter of the samples' distance at most, and half the grid's."""
+    count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
+    return problem.rollout.timestep_s or segment.experiment.timestep_s / count

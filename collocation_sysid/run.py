@@ -22,12 +22,13 @@ from .methods.method import Method, Watch
 from .methods.reduced_space import ReducedSpace
 from .methods.scan import Scan, rescue, started
 from .methods.solution import Solution, Status
-from .methods.start import placed_at_guess
+from .methods.start import marched, placed_at_guess
 from .methods.workers import Workers, workers_of
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameters
+from .nlp.schemes import as_scheme
 from .problem import Problem
-from .rollout import Rollout, roll_outs, step_changes
+from .rollout import Rollout, roll_outs, step_error
 from .second_start import USUAL, second_start
 from .statistics.cause import Cause
 from .statistics.causes import likely_causes
@@ -35,7 +36,7 @@ from .statistics.diagnostics import MarkerDiagnosis, diagnose
 from .statistics.estimates import Estimate
 from .statistics.identifiability import verdicts
 from .statistics.linearised import Derived, linearised_fit
-from .statistics.numerical import Refinement
+from .statistics.numerical import MOST_SUBSTEPS, Refinement
 from .statistics.places import Place, places_of
 from .statistics.pose_noise import pose_noise_draws
 from .statistics.profile import Profile
@@ -79,11 +80,9 @@ class Run:
         What went wrong after the solve.
     causes : tuple of Cause
         What is likely described wrongly, likeliest first.
-    step_changes : mapping of name to float, or None
-        What a finer step would change of parameters and moduli, to first order; None where the
-        roll-outs have no finer step.
     refinement : Refinement or None
-        The answer at finer discretisations, where it was asked for.
+        What the discretisation does: solved again where that was asked for, else what the step
+        does, to first order, from roll-outs with a finer one; None where these are missing.
     """
 
     problem: Problem
@@ -94,8 +93,10 @@ class Run:
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
-    step_changes: Mapping[str, float] | None = None
     refinement: Refinement | None = None
+
+    def __str__(self) -> str:
+        return self.table()
 
     def __repr__(self) -> str:
         solution = self.solution
@@ -123,7 +124,23 @@ class Run:
 
     @cached_property
     def estimates(self) -> dict[str, Estimate]:
-        """Parameters and derived moduli with their error bars, where there are any."""
+        """Parameters and derived moduli, with intervals for all that `interval_holds` names."""
+        errors = {} if self.refinement is None else self.refinement.errors
+        return {
+            name: replace(estimate, ci95=errors[name].ci95) if name in errors else estimate
+            for name, estimate in self.noise_estimates.items()
+        }
+
+    @property
+    def interval_holds(self) -> tuple[str, ...]:
+        """What the intervals hold: "noise", and of "step" and "mesh" what is known."""
+        if self.uncertainty is None:
+            return ()
+        return ("noise",) if self.refinement is None else self.refinement.holds
+
+    @cached_property
+    def noise_estimates(self) -> dict[str, Estimate]:
+        """The same with intervals for the noise alone."""
         found = self.uncertainty
         known = {} if found is None else {**found.estimates, **found.derived}
         values = self.parameters | self.derived
@@ -141,7 +158,7 @@ class Run:
         found = concerns(
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
-        numerical = numerical_concerns(self.estimates, self.step_changes, self.refinement)
+        numerical = numerical_concerns(self.estimates, self.refinement)
         return Trust.of((*cause_concerns(self.causes), *found, *numerical))
 
     @cached_property
@@ -156,6 +173,8 @@ class Run:
 
     def interval(self, name: str) -> tuple[float, float] | None:
         """95 % interval of a parameter or derived modulus; None where there is none.
+
+        It holds what `interval_holds` names.
 
         Raises
         ------
@@ -175,13 +194,15 @@ class Run:
         return self._estimate(name).std_error
 
     def table(self) -> str:
-        """The parameters with their error bars as the terminal shows them."""
-        from .terminal import parameter_table, plain_text  # how it looks is no part of a run
+        """Parameters, intervals, what these hold, and the verdict, as the terminal shows them."""
+        from .terminal import answer, plain_text  # how it looks is no part of a run
 
-        return plain_text(parameter_table(self))
+        return plain_text(answer(self))
 
     def to_frame(self) -> Any:
-        """The estimates as a pandas DataFrame: value, std_error, lower, upper, guess, unit.
+        """The estimates as a pandas DataFrame, a row each.
+
+        Columns value, std_error, lower, upper, interval_holds, verdict, guess, unit.
 
         Raises
         ------
@@ -202,6 +223,8 @@ class Run:
                 "std_error": np.nan if estimate.std_error is None else estimate.std_error,
                 "lower": lower,
                 "upper": upper,
+                "interval_holds": "" if estimate.ci95 is None else ", ".join(self.interval_holds),
+                "verdict": self.trust.verdict,
                 "guess": guesses.get(name, np.nan),
                 "unit": unit_of(name),
             }
@@ -269,7 +292,8 @@ class Run:
 
 def _with_error(estimate: Estimate) -> str:
     error = "" if estimate.std_error is None else f" ± {estimate.std_error:.2g}"
-    return f"{estimate.value:.5g}{error}"
+    interval = "" if estimate.ci95 is None else " [{:.5g}, {:.5g}]".format(*estimate.ci95)
+    return f"{estimate.value:.5g}{error}{interval}"
 
 
 def solve(
@@ -332,8 +356,7 @@ def _solved(
         if earlier is not None and not scan:
             collocation = earlier.placed(collocation)
             variables = earlier.variables(collocation)
-        if workers is not None and isinstance(solver, ReducedSpace):
-            solver = partial(solver, workers=workers)
+        solver = _shared(solver, workers)
         solution = _read_where_found(solver, collocation, watch, variables)
         if scan is None and solution.status in LOST:
             scan, solution = _again(solver, solution, watch)
@@ -347,6 +370,13 @@ def _solved(
     if scan is None:
         return solution
     return replace(solution, scan=scan, notes=(scan.sentence, *solution.notes))
+
+
+def _shared(solver: Method, workers: Workers | None) -> Method:
+    """The method with the workers that share its experiments, where there are any."""
+    if workers is None or not isinstance(solver, ReducedSpace):
+        return solver
+    return partial(solver, workers=workers)
 
 
 def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | None, Solution]:
@@ -421,16 +451,16 @@ def run(
         As `solve` does.
     """
     say = log or (lambda _: None)
-    solution = solve(problem, method, watch, start, scheduler)
-    say("checking the answer by a forward simulation")
-    rollouts = roll_outs(problem, solution)
-    found = _checked(problem, solution, rollouts, say)
-    turns = (t for e in problem.experiments for t in turning_warnings(e, problem.substeps))
-    found = replace(found, notes=(*turns, *found.notes))
+    found = _checked(problem, solve(problem, method, watch, start, scheduler), say)
+    if problem.substeps == "auto":
+        found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
+    substeps = found.solution.collocation.substeps
+    turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
+    found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
     if not seek_causes:
         return found
     say("looking for causes of the misfit")
-    found = replace(found, causes=likely_causes(solution))
+    found = replace(found, causes=likely_causes(found.solution))
     if problem.uncertainty.numerical and found.uncertainty is not None:
         from .refine import refine  # which solves, as this module does
 
@@ -438,10 +468,10 @@ def run(
     return found
 
 
-def _checked(
-    problem: Problem, solution: Solution, rollouts: Mapping[str, Rollout | str], say: Log
-) -> Run:
-    """A solution with its error bars, where there are any."""
+def _checked(problem: Problem, solution: Solution, say: Log) -> Run:
+    """A solution simulated forward, with its error bars, where there are any."""
+    say("checking the answer by a forward simulation")
+    rollouts = roll_outs(problem, solution)
     if not solution.status.converged:
         return Run(problem, solution, rollouts, None)
     say("finding the error bars")
@@ -451,29 +481,68 @@ def _checked(
         extra, noises = pose_noise_draws(solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",))
-    diagnoses = diagnose(fit, extra)
-    notes = tuple(noise.sentence for noise in noises)
+    found = Run(problem, solution, rollouts, None, diagnose(fit, extra))
     if not solution.collocation.nq:
-        return Run(problem, solution, rollouts, None, diagnoses)
+        return found
     options = problem.uncertainty
     try:
         uncertainty = uncertainty_of(
             fit, solution.collocation.parameters, solution.q, options.noise, options.errors, extra
         )
-        profiles = []
-        for name in options.profile:
-            say(f"profile likelihood of {name}")
-            profiles.append(profile_of(solution, fit, uncertainty, name))
     except InputError as error:
         raise error.located(problem.path) from error
-    changes = step_changes(problem, solution, fit, rollouts)
-    return Run(
-        problem,
-        solution,
-        rollouts,
-        uncertainty,
-        diagnoses,
-        tuple(profiles),
-        notes,
-        step_changes=changes,
+    found = replace(found, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
+    estimates = found.noise_estimates
+    return replace(found, refinement=step_error(problem, solution, fit, rollouts, estimates))
+
+
+def _profiles(found: Run, say: Log) -> tuple[Profile, ...]:
+    """The profile likelihoods that are asked for."""
+    asked, profiles = found.problem.uncertainty.profile, []
+    if found.uncertainty is None or not asked:
+        return ()
+    fit = linearised_fit(found.solution.collocation, found.solution.z)
+    for name in asked:
+        say(f"profile likelihood of {name}")
+        try:
+            profiles.append(profile_of(found.solution, fit, found.uncertainty, name))
+        except InputError as error:
+            raise error.located(found.problem.path) from error
+    return tuple(profiles)
+
+
+def _fine_enough(
+    coarse: Run, solver: Method, watch: Watch | None, say: Log, scheduler: str | None
+) -> Run:
+    """The run again from its answer, with as many substeps as its error bars ask for."""
+    if coarse.refinement is None:
+        return coarse
+    first, problem = coarse.solution, coarse.problem
+    moves = coarse.refinement.moves(coarse.noise_estimates)
+    substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
+    if substeps == 1:
+        return coarse
+    say(f"solving again with {substeps} steps a sample")
+    worst = max(moves, key=lambda name: abs(moves[name]))
+    why = (
+        f"with one step a sample, the step moves {worst} by {abs(moves[worst]):.2g} standard errors"
     )
+    again = replace(first.collocation, substeps=substeps)
+    p, _ = first.collocation.unpack(first.z)
+    try:
+        require_memory(problem, again, solver)
+        positions, failure = marched(again, p)
+        if failure is not None:
+            raise failure
+    except (InputError, SimulationError) as error:
+        return replace(
+            coarse, notes=(f"{why}; {substeps} are not possible: {error}", *coarse.notes)
+        )
+    with workers_of(scheduler) as workers:
+        finer = _read_where_found(_shared(solver, workers), again, watch, again.pack(p, positions))
+    if not finer.status.converged and finer.status is not Status.INTERRUPTED:
+        note = f"{why}; with {substeps} it was not solved ({finer.message})"
+        return replace(coarse, notes=(note, *coarse.notes))
+    most = ", the most that are chosen," if substeps == MOST_SUBSTEPS else ""
+    said = f"{why}; so it was solved again with {substeps}{most} in {finer.timing.total:.2g} s"
+    return _checked(problem, finer.after(first, said), say)

@@ -67,7 +67,7 @@ def write_data(
     for experiment in problem.experiments if frames else ():
         require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
     rng = np.random.default_rng(seed)
-    given, substeps = problem.parameters, problem.substeps
+    given, substeps = problem.parameters, problem.first_substeps
     simulated = [
         simulate(experiment, given, integrator, timestep_s, substeps, None, progress)
         for experiment in problem.experiments

@@ -135,22 +135,30 @@ def _cells(line: Iteration) -> list[str]:
 
 def summary(finished: Run, folder: Path) -> RenderableType:
     """The answer of a run on one screen."""
-    solution, trust = finished.solution, finished.trust
-    style = COLOURS[trust.verdict]
-    parts: list[RenderableType] = [Text(solution.message, style=style)]
-    parts.append(Text(f"Verdict: {trust.verdict}", style=f"bold {style}"))
-    parts += [Text(f"  {reason}", style=style) for reason in trust.reasons]
-    parts += _how_to(trust.reasons)
+    solution = finished.solution
+    parts: list[RenderableType] = [Text(solution.message, style=COLOURS[finished.trust.verdict])]
     if not solution.status.converged:
         parts.append(Text("Largest violations of the equations of motion:"))
         parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [parameter_table(finished), *_damping(finished), *_scale(finished)]
-    parts += _numerical(finished)
-    parts += [*_verdict(finished), *_nuisance(finished)]
+    parts += [answer(finished), *_damping(finished), *_scale(finished)]
+    parts += [*_fit(finished), *_nuisance(finished)]
     parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
     parts += _residuals(finished)
     parts.append(Text(f"written to {folder}"))
     return Group(*parts)
+
+
+def answer(finished: Run) -> RenderableType:
+    """Verdict, values, intervals and what these hold."""
+    trust = finished.trust
+    style = COLOURS[trust.verdict]
+    return Group(
+        Text(f"Verdict: {trust.verdict}", style=f"bold {style}"),
+        *(Text(f"  {reason}", style=style) for reason in trust.reasons),
+        *_how_to(trust.reasons),
+        parameter_table(finished),
+        *_numerical(finished),
+    )
 
 
 def _how_to(concerns: Sequence[str]) -> list[Text]:
@@ -186,7 +194,7 @@ def refinement_table(found: Refinement) -> Table:
         "half the edges",
         "order",
         "limit",
-        "95 % interval with it",
+        "95 % interval",
     )
     table = Table(*heads, box=None, pad_edge=False)
     for column in table.columns[1:]:
@@ -227,18 +235,26 @@ def _order(order: float | None) -> str:
 
 
 def _numerical(finished: Run) -> list[RenderableType]:
-    """What is known of the numerical error."""
-    if finished.refinement is not None:
-        return [refinement_table(finished.refinement)]
-    values, changes = finished.estimates, finished.step_changes
-    if not changes:
+    """What the intervals hold, and what is known of the numerical error."""
+    found, holds = finished.refinement, finished.interval_holds
+    if not holds:
         return []
-    said = [
-        f"{symbol_of(name)} {100 * change / values[name].value:+.2g} %"
-        for name, change in changes.items()
-        if values[name].value and not values[name].at_bound
+    segments = finished.solution.collocation.segments
+    possible = ["step", "mesh"] if any(not s.experiment.static for s in segments) else ["mesh"]
+    left = [f"the {kind}" for kind in possible if kind not in holds]
+    said = f"intervals hold {' and '.join(('the noise', *(f'the {kind}' for kind in holds[1:])))}"
+    said += f", not {' and '.join(left)}: see refine" if left else ""
+    if found is None:
+        return [Text(said)]
+    if found.levels:
+        return [Text(said), refinement_table(found)]
+    values = {name: finished.estimates[name].value for name in found.errors}
+    moved = [
+        f"{symbol_of(name)} {100 * (value - found.errors[name].extrapolated) / value:+.2g} %"
+        for name, value in values.items()
+        if value
     ]
-    return [Text(f"a finer step would change, to first order: {', '.join(said)}")]
+    return [Text(said), Text(f"the step moves, to first order: {', '.join(moved)}")]
 
 
 def _damping(finished: Run) -> list[Text]:
@@ -393,7 +409,8 @@ def _residuals(finished: Run) -> list[Text]:
     return [Text(f"residuals: {diagnosis.sentence}") for diagnosis in largest]
 
 
-def _verdict(finished: Run) -> list[Text]:
+def _fit(finished: Run) -> list[Text]:
+    """How well the markers and the equations are met, and how long that took."""
     solution = finished.solution
     violated = (
         f"dynamics violated by at most {solution.max_violation_n:.1e} N "

@@ -144,14 +144,14 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
 
 def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
     """How each body oscillates with the answer; a solve that failed has none worth the search."""
-    found = {}
+    found, substeps = {}, solution.collocation.substeps
     scheme = as_scheme(solution.collocation.scheme)
     moving = [experiment for experiment in problem.experiments if not experiment.static]
     for experiment in moving if solution.status.converged else ():
         theta = experiment.body.theta(solution.parameters)
         try:
             found[experiment.name] = motion_of(
-                experiment, scheme, experiment.timestep_s / problem.substeps, theta
+                experiment, scheme, experiment.timestep_s / substeps, theta
             )
         except SimulationError:
             continue

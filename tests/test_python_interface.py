@@ -152,7 +152,10 @@ def test_a_run_becomes_a_data_frame(monkeypatch):
     frame = SimpleNamespace(from_dict=lambda rows, orient: given.update(rows) or orient)
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=frame))
     assert identified().to_frame() == "index"
-    assert list(given["mu_pa"]) == ["value", "std_error", "lower", "upper", "guess", "unit"]
+    numbers, said = ["value", "std_error", "lower", "upper"], ["interval_holds", "verdict"]
+    assert list(given["mu_pa"]) == [*numbers, *said, "guess", "unit"]
+    assert (given["mu_pa"]["interval_holds"], given["mu_pa"]["verdict"]) == ("noise, step", "good")
+    assert given["lambda_pa"]["interval_holds"] == ""
     assert (given["mu_pa"]["guess"], given["mu_pa"]["unit"]) == (150.0, "Pa")
     assert np.isnan(given["lambda_pa"]["std_error"])
 
@@ -278,7 +281,7 @@ def test_a_function_is_a_method():
     def halving(collocation, watch=None, start=None):
         return replace(cs.ReducedSpace(ladder=(0.5, 1.0))(collocation, watch, start), method="mine")
 
-    problem = cs.Problem([measured(hung_cube())], UNKNOWN)
+    problem = cs.Problem([measured(hung_cube())], UNKNOWN, substeps=1)
     for run in (cs.run(problem, halving), cs.run(replace(problem, method=halving))):
         assert run.solution.method == "mine"
         assert run.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
@@ -295,7 +298,9 @@ def test_options_of_ones_own_are_a_method():
             rough = cs.ReducedSpace(tolerance=self.tolerance)(collocation, watch, start)
             return replace(cs.InteriorPoint()(collocation, watch, rough.z), method=self.name)
 
-    problem = cs.Problem([measured(hung_cube())], UNKNOWN, method=Polished(tolerance=1e-2))
+    problem = cs.Problem(
+        [measured(hung_cube())], UNKNOWN, substeps=1, method=Polished(tolerance=1e-2)
+    )
     run = cs.run(problem)
     assert run.solution.method == "polished"
     assert run.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-5)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import run_command, write_problem
+from problem_files import run_command, settings, write_problem
 from problems_small import GUESS, TRUTH, hung_cube, measured
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.problem import Problem
+from collocation_sysid.problem import Problem, RolloutOptions
 from collocation_sysid.refine import refine
 from collocation_sysid.run import Run, run
 from collocation_sysid.statistics.estimates import Estimate
@@ -85,7 +85,7 @@ def coarse() -> Problem:
     experiment = measured(hung_cube(16, divisions=(1, 1, 2)), substeps=4)
     sigma_m = np.full(len(experiment.markers.names), 1e-5)
     seen = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m))
-    return Problem([seen], Parameters(tuple(items)))
+    return Problem([seen], Parameters(tuple(items)), substeps=1)
 
 
 @pytest.fixture(scope="module")
@@ -122,30 +122,32 @@ def test_finer_answers_start_from_the_coarser(refined):
 
 
 def test_the_estimate_from_the_roll_out_is_that_of_half_the_step(answer, refined):
-    assert answer.step_changes is not None
+    assert answer.refinement is not None
     assert refined.refinement is not None
     for name in FREE:
         measured_change = refined.refinement.errors[name].step
-        # A quarter of the step leaves a sixteenth, half of it a quarter of the error.
-        assert answer.step_changes[name] == pytest.approx(measured_change * 15 / 12, rel=0.3)
+        assert answer.refinement.errors[name].step == pytest.approx(measured_change, rel=0.3)
 
 
 def test_roll_outs_that_are_no_finer_tell_nothing():
-    problem = replace(coarse(), substeps=4)
-    assert run(problem).step_changes is None
+    step_s = coarse().experiments[0].timestep_s
+    problem = replace(coarse(), rollout=RolloutOptions(timestep_s=step_s))
+    assert run(problem).refinement is None
 
 
 def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     assert any(reason.startswith("the step moves") for reason in answer.trust.reasons)
     estimates = {"mu_pa": Estimate(100.0, 1.0, (98, 102))}
-    assert numerical_concerns(estimates, {"mu_pa": 1.9}) == []
+
+    def concerns(half_step_pa: float) -> list:
+        error = numerical_error("mu_pa", estimates["mu_pa"], [half_step_pa], [])
+        return numerical_concerns(estimates, Refinement({"mu_pa": error}))
+
+    assert concerns(101.4) == []
     assert numerical_concerns(estimates, None) == []
-    ((said, strength),) = numerical_concerns(estimates, {"mu_pa": -3.0})
+    ((said, strength),) = concerns(97.77)
     assert strength == "check"
-    assert "mu_pa by -3 %, 3 standard errors" in said
-    measured_error = numerical_error("mu_pa", estimates["mu_pa"], [100.2], [100.1])
-    calm = Refinement({"mu_pa": measured_error}, ())
-    assert numerical_concerns(estimates, {"mu_pa": -3.0}, calm) == []
+    assert "mu_pa by +3 %, 3 standard errors" in said
 
 
 def test_other_numbers_of_levels_are_refused(answer):
@@ -156,8 +158,11 @@ def test_other_numbers_of_levels_are_refused(answer):
 def test_the_command_writes_into_the_run_folder(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
-    assert run_command("solve", problem, "--out", folder).code == 0
+    precise = settings("experiment.swing.markers.sigma_m=2e-4", "rollout.integrator=newmark")
+    ended = run_command("solve", problem, "--out", folder, "--method", "reduced-space", *precise)
+    assert ended.code == 0, ended
     before = json.loads((folder / "result.json").read_text())
+    assert before["problem"]["substeps"] == 2  # which the problem does not state
     ended = run_command("refine", folder)
     assert ended.code == 0, ended
     after = json.loads((folder / "result.json").read_text())
@@ -166,7 +171,12 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
         assert found["value"] == before["parameters"][name]["value"]
         if not found["fixed"] and not found["at_bound"]:
             assert found["numerical_error"] == kept["errors"][name]
-            assert "mesh" not in (before["parameters"][name]["numerical_error"] or {})
+            assert found["ci95"] == kept["errors"][name]["ci95"]
+            assert found["ci95_holds"] == ["noise", "step", "mesh"]
+            assert found["ci95_noise"] == before["parameters"][name]["ci95_noise"]
+            assert before["parameters"][name]["ci95_holds"] == ["noise", "step"]
+    rows = {level["halved"]: level["timesteps"] for level in kept["levels"]}
+    assert rows == {"step": 4 * 8 + 1, "mesh": 2 * 8 + 1}
     assert run_command("report", folder).code == 0
     assert "Numerical error" in Path(folder / "report.html").read_text()
 

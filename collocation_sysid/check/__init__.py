@@ -164,7 +164,7 @@ def check_problem(problem: Problem) -> Findings:
         warnings += motion_warnings(motion)
     warnings += [said for said, _ in stability_concerns(instabilities(collocation, z))]
     for experiment in problem.experiments:
-        warnings += turning_warnings(experiment, problem.substeps)
+        warnings += turning_warnings(experiment, problem.first_substeps)
     for recording in recordings:
         body = next(each for each in bodies if recording.experiment in each.experiments)
         warnings += recording_warnings(recording, body.edges_m[1], body.diagonal_m)

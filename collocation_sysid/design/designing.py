@@ -313,7 +313,7 @@ def _designed(judge: Judge, found: Found, add: bool) -> Design:
     after = _bars(judge, told)
     problem = recording.problem
     values = problem.parameters.values(judge.draws[0])
-    predicted = simulate(experiment, values, problem.scheme, substeps=problem.substeps)
+    predicted = simulate(experiment, values, problem.scheme, substeps=problem.first_substeps)
     return Design(
         recording,
         motion,

@@ -196,14 +196,14 @@ class Recording:
             Where it cannot be simulated to its end.
         """
         fit, x = self.fit(experiment, q)
-        positions = x[:: self.problem.substeps].reshape(len(experiment.t_s), -1, 3)
+        positions = x[:: self.problem.first_substeps].reshape(len(experiment.t_s), -1, 3)
         return Told(shared_information(fit), experiment.markers.observe(positions))
 
     def program(self, experiment: Experiment) -> Collocation:
         """The equations of motion of one experiment."""
         problem = self.problem
         fitted = replace(experiment, validation=False) if experiment.validation else experiment
-        return Collocation([fitted], problem.parameters, problem.scheme, problem.substeps)
+        return Collocation([fitted], problem.parameters, problem.scheme, problem.first_substeps)
 
     def fit(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
         """The experiment simulated at q, with the slopes of all residuals; and x (N, 3n) [m].

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 
@@ -91,6 +91,10 @@ class Timing:
     linear_algebra: float = 0.0
     total: float = 0.0
 
+    def __add__(self, other: Timing) -> Timing:
+        both = zip(astuple(self), astuple(other), strict=True)
+        return Timing(*(mine + its for mine, its in both))
+
     @classmethod
     def of(cls, watch: Stopwatch, began: float) -> Timing:
         """What a stopwatch has added up since `began`, a `time.perf_counter`."""
@@ -136,6 +140,23 @@ class Solution:
     notes: Sequence[str] = field(default=())
     evaluations: int = 0
     scan: Scan | None = None
+
+    def after(self, first: Solution, why: str) -> Solution:
+        """The answer with what the solve took that it started from, and why there was another."""
+        done, began_s = first.iterations, first.timing.total
+        own = [
+            replace(each, number=each.number + done, time_s=each.time_s + began_s)
+            for each in self.history
+        ]
+        return replace(
+            self,
+            iterations=self.iterations + done,
+            evaluations=self.evaluations + first.evaluations,
+            history=(*first.history, *own),
+            timing=self.timing + first.timing,
+            notes=(*first.notes, why, *self.notes),
+            scan=first.scan,
+        )
 
     @cached_property
     def multipliers(self) -> Array:

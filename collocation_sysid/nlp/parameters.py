@@ -271,6 +271,11 @@ class Parameters:
         return tuple(item for item in self.items if not item.fixed and item.tied is None)
 
     @property
+    def linear(self) -> frozenset[str]:
+        """Names of those that are not found by their logarithms."""
+        return frozenset(item.name for item in self.items if item.scale == "linear")
+
+    @property
     def unguessed(self) -> tuple[str, ...]:
         """Names of those that are estimated without a guess."""
         return tuple(item.name for item in self.free if item.guess is None)

@@ -23,7 +23,6 @@ from ..nlp.schemes import as_scheme
 from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run
-from ..statistics.estimates import Estimate
 from ..statistics.identifiability import verdicts
 from .fields import ElementFields
 from .replay import Replay
@@ -45,7 +44,7 @@ def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
         if origin is not None:
             (place / "problem.toml").write_text(origin.text, encoding="utf-8")
         (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
-        if finished.refinement is not None:
+        if finished.refinement is not None and finished.refinement.levels:
             text = as_json(finished.refinement.as_dict())
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
         seen = replays(finished)
@@ -206,6 +205,7 @@ def result(finished: Run) -> dict[str, Any]:
         "problem": {
             "nodes": sum(len(body.nodes_m) for body in problem.bodies),
             "elements": sum(len(body.cells) for body in problem.bodies),
+            "substeps": collocation.substeps,
             "timesteps": sum(segment.grid_rows for segment in collocation.segments),
             "variables": collocation.variables,
             "constraints": collocation.constraints,
@@ -268,22 +268,17 @@ def _parameters(finished: Run) -> dict[str, Any]:
 
 
 def _with_errors(finished: Run, name: str) -> dict[str, Any]:
-    changes, refined = finished.step_changes or {}, finished.refinement
-    measured = None if refined is None else refined.errors.get(name)
-    numerical = {"step": changes[name]} if name in changes else None
-    return {
-        **_with_error_bar(finished.estimates[name]),
-        "numerical_error": asdict(measured) if measured is not None else numerical,
-    }
-
-
-def _with_error_bar(estimate: Estimate) -> dict[str, Any]:
+    estimate, noise = finished.estimates[name], finished.noise_estimates[name].ci95
+    error = None if finished.refinement is None else finished.refinement.errors.get(name)
     return {
         "value": estimate.value,
         "std_error": estimate.std_error,
         "ci95": None if estimate.ci95 is None else list(estimate.ci95),
+        "ci95_holds": [] if estimate.ci95 is None else list(finished.interval_holds),
+        "ci95_noise": None if noise is None else list(noise),
         "at_bound": estimate.at_bound,
         "reason": estimate.reason,
+        "numerical_error": None if error is None else asdict(error),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -28,7 +28,7 @@ def refine_run(
     """Solve the problem of a run folder again at finer discretisations, and write what that tells.
 
     ``refinement.json`` is new; in ``result.json`` parameters and moduli get their
-    ``numerical_error``, and the verdict takes it into account.
+    ``numerical_error`` and intervals that hold it, and the verdict takes it into account.
 
     Returns
     -------
@@ -51,12 +51,15 @@ def refine_run(
         home = Path(problem_file).parent
         groups = [result[key] for key in ("parameters", "derived")]
         estimates = {name: _estimate(each) for group in groups for name, each in group.items()}
-        before = _trust(result["trust"])
+        before, substeps = _trust(result["trust"]), int(result["problem"]["substeps"])
     problem = Problem.read(file.parent / "problem.toml", allow_code=allow_code, folder=home)
+    problem = replace(problem, substeps=substeps)
     found = refinement_of(problem, answer, estimates, levels, say)
     for group in groups:
         for name in set(group) & set(found.errors):
-            group[name]["numerical_error"] = asdict(found.errors[name])
+            error = found.errors[name]
+            group[name] |= {"numerical_error": asdict(error), "ci95": error.ci95}
+            group[name]["ci95_holds"] = [] if error.ci95 is None else list(found.holds)
     result["trust"] = _judged(before, estimates, found)
     with whole_file(file.parent / REFINEMENT_FILE) as beside, whole_file(file) as draft:
         beside.write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
@@ -65,7 +68,7 @@ def refine_run(
 
 
 def _estimate(found: dict[str, Any]) -> Estimate:
-    interval = found["ci95"]
+    interval = found["ci95_noise"]
     return Estimate(
         found["value"],
         found["std_error"],
@@ -87,7 +90,7 @@ def _judged(
 ) -> dict[str, Any]:
     """The verdict with what was measured in place of what was estimated."""
     kept = [reason for reason in trust["reasons"] if not reason.startswith(STEP_MOVES)]
-    reasons = [*kept, *(said for said, _ in numerical_concerns(estimates, None, found))]
+    reasons = [*kept, *(said for said, _ in numerical_concerns(estimates, found))]
     verdict = trust["verdict"]
     if verdict != "doubtful":
         verdict = "check" if reasons else "good"

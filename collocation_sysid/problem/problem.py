@@ -89,8 +89,9 @@ class Problem:
         With names that differ; those for validation are predicted only. Their bodies may differ.
     parameters : Parameters, or mapping of name to Unknown, Tied or a fixed number
     scheme : str or Scheme, default "midpoint"
-    substeps : int, default 1
-        Grid steps between samples.
+    substeps : int or "auto"
+        Grid steps between samples. By default a run takes one, and if that moves a parameter by
+        more than half a standard error, solves again with as many as do not, 8 at most.
     explicit_grasps : bool, default False
         Grasped nodes as constraint rows instead of bounds.
     huber : float, optional
@@ -118,7 +119,7 @@ class Problem:
     experiments: tuple[Experiment, ...]
     parameters: Parameters
     scheme: str | Scheme
-    substeps: int
+    substeps: int | Literal["auto"]
     explicit_grasps: bool
     huber: float | None
     method: str | Method
@@ -135,7 +136,7 @@ class Problem:
         parameters: Parameters | Mapping[str, Unknown | Tied | float],
         *,
         scheme: str | Scheme = "midpoint",
-        substeps: int = 1,
+        substeps: int | Literal["auto"] = "auto",
         explicit_grasps: bool = False,
         huber: float | None = None,
         method: str | Method = "reduced-space",
@@ -217,13 +218,18 @@ class Problem:
         """The bodies of the experiments, each once."""
         return tuple({id(e.body): e.body for e in self.experiments}.values())
 
+    @property
+    def first_substeps(self) -> int:
+        """Grid steps between samples of the first solve, and of all that solves nothing."""
+        return 1 if self.substeps == "auto" else self.substeps
+
     def collocation(self) -> Collocation:
-        """The nonlinear program of the problem."""
+        """The nonlinear program of the problem, with the first number of substeps."""
         return Collocation(
             self.experiments,
             self.parameters,
             self.scheme,
-            self.substeps,
+            self.first_substeps,
             self.explicit_grasps,
             self.huber,
         )
@@ -250,7 +256,12 @@ class Problem:
             raise InputError("there is no experiment; expected at least one")
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise InputError(f"two experiments are named {repeated[0]!r}; names must differ")
-        if self.substeps != 1 and all(experiment.static for experiment in self.experiments):
+        if isinstance(self.substeps, str) and self.substeps != "auto":
+            raise InputError(
+                f"found {self.substeps!r}; expected a whole number or 'auto'",
+                where="transcription.substeps",
+            )
+        if self.first_substeps != 1 and all(each.static for each in self.experiments):
             raise InputError(
                 f"found {self.substeps}, but every experiment is static, and between equilibria "
                 "there are no steps; expected none",

@@ -228,8 +228,14 @@ class TranscriptionSection(Section):
     """How the equations of motion become constraints."""
 
     scheme: SchemeName = "midpoint"
-    substeps: Whole = Field(
-        default=1, ge=1, le=MOST_STEPS, description="Grid steps between samples."
+    substeps: Annotated[
+        Annotated[Literal["auto"], Tag("<auto>")]
+        | Annotated[Whole, Field(ge=1, le=MOST_STEPS), Tag("<number>")],
+        Discriminator(lambda value: "<auto>" if isinstance(value, str) else "<number>"),
+    ] = Field(
+        default="auto",
+        description="Grid steps between samples; auto: as many, up to 8, as move no parameter by "
+        "more than half a standard error.",
     )
     explicit_grasps: Flag = Field(
         default=False,

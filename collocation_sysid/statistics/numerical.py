@@ -18,13 +18,18 @@ they should: then the largest of them is taken. The ends of the interval of 95 %
 n being the half width for the noise and u what each Δ may be wrong by on that side.
 
 Cheaper is a Gauss–Newton step towards a finer simulation with the answer's parameters, d being what
-that changes of the residuals: −A⁻¹ Sᵀ d, see `information`, to first order.
+half the step changes of the residuals: −A⁻¹ Sᵀ d, see `information`, to first order. That takes the
+place of the change with half the step.
+
+From what one step a sample leaves follows how many leave little enough: an error of order p falls
+with the p-th power of their number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -39,6 +44,9 @@ OBSERVED = 1.25
 # Errors of smooth solutions fall with the square of linear elements' edges, and faster for
 # quadratic ones; where elements are too stiff or the body leaves its grasp they do not.
 MESH_ORDER, LEAST_ORDER = 2.0, 0.5
+# Standard errors that the step may move an estimate where its number is chosen, and how many steps
+# a sample are chosen at most.
+LITTLE, MOST_SUBSTEPS = 0.5, 8
 
 
 @dataclass(frozen=True)
@@ -67,18 +75,39 @@ class NumericalError:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Estimates at finer discretisations.
+    """What finer discretisations do to the estimates.
 
     Attributes
     ----------
     errors : mapping of parameter or derived modulus to NumericalError
     levels : tuple of dict
         Of each finer answer what was halved ("step" or "mesh") and how often, grid rows and nodes,
-        iterations, seconds, and the values by name.
+        iterations, seconds, and the values by name. Empty where the step's error was estimated
+        from a finer simulation, and nothing solved again.
     """
 
     errors: Mapping[str, NumericalError]
-    levels: tuple[dict[str, Any], ...]
+    levels: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """What its intervals hold: the noise, and of "step" and "mesh" what is known."""
+        of_step = any(error.step is not None for error in self.errors.values())
+        of_mesh = any(error.mesh is not None for error in self.errors.values())
+        return ("noise", *["step"] * of_step, *["mesh"] * of_mesh)
+
+    def moves(self, estimates: Mapping[str, Estimate]) -> dict[str, float]:
+        """How many standard errors discretisation moves the estimates, where they have any."""
+        return {
+            name: (estimates[name].value - error.extrapolated) / spread
+            for name, error in self.errors.items()
+            if (spread := estimates[name].std_error)
+        }
+
+    def substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
+        """How many steps keep every move small, if these are of one; not more than the most."""
+        worst = max(map(abs, self.moves(estimates).values()), default=0.0)
+        return max(1, ceil(min((worst / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
 
     def as_dict(self) -> dict[str, Any]:
         """For ``refinement.json``."""
@@ -161,6 +190,30 @@ def numerical_error(
         at.value(limit),
         interval,
     )
+
+
+def numerical_errors(
+    estimates: Mapping[str, Estimate],
+    by_step: Sequence[Mapping[str, float]],
+    by_mesh: Sequence[Mapping[str, float]],
+    step_order: float,
+    linear: Container[str],
+) -> dict[str, NumericalError]:
+    """Those of all estimates that change; what is fixed, or at its bound, stays.
+
+    Parameters
+    ----------
+    estimates : mapping of name to Estimate
+    by_step, by_mesh : sequences of mappings of name to value, see `numerical_error`
+    step_order : float
+    linear : names of the parameters that are their own coordinates
+    """
+    found = {}
+    for name, estimate in estimates.items():
+        steps, meshes = ([values[name] for values in level] for level in (by_step, by_mesh))
+        if any(value != estimate.value for value in (*steps, *meshes)):
+            found[name] = numerical_error(name, estimate, steps, meshes, step_order, name in linear)
+    return found
 
 
 @dataclass(frozen=True)

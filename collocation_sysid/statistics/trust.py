@@ -176,37 +176,21 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def numerical_concerns(
-    estimates: Mapping[str, Estimate],
-    step_changes: Mapping[str, float] | None,
-    refinement: Refinement | None = None,
+    estimates: Mapping[str, Estimate], refinement: Refinement | None
 ) -> list[Concern]:
-    """Where step or mesh matter more than the noise; what is unknown gives no concern.
-
-    Parameters
-    ----------
-    estimates : mapping of name to Estimate
-    step_changes : mapping of name to float, or None
-        What a finer step would change.
-    refinement : Refinement, optional
-        Takes their place.
-    """
-    if refinement is not None:
-        ways = {n: each.extrapolated - estimates[n].value for n, each in refinement.errors.items()}
-        what, remedy = STEP_MOVES[1], "its interval is that of refine"
-    else:
-        ways, what = step_changes or {}, STEP_MOVES[0]
-        remedy = "halve it (transcription.substeps), or see what refine says"
-    deviations = {
-        name: abs(way) / error
-        for name, way in ways.items()
-        if (error := estimates[name].std_error) is not None and error > 0
-    }
-    worst = max(deviations, key=deviations.__getitem__, default=None)
-    if worst is None or deviations[worst] <= MOVED:
+    """Where step or mesh matter more than the noise; what is unknown gives no concern."""
+    moves = {} if refinement is None else refinement.moves(estimates)
+    worst = max(moves, key=lambda name: abs(moves[name]), default=None)
+    if refinement is None or worst is None or abs(moves[worst]) <= MOVED:
         return []
-    value, many = estimates[worst].value, deviations[worst]
-    said = f"{what} {worst} by {100 * ways[worst] / value:+.2g} %, {many:.2g} standard errors"
-    return [(f"{said}: {remedy}", "check")]
+    if refinement.levels:
+        what, remedy = STEP_MOVES[1], ""
+    else:
+        what, remedy = STEP_MOVES[0], "; raise transcription.substeps, or see what refine says"
+    value = estimates[worst].value
+    share = (value - refinement.errors[worst].extrapolated) / abs(value)
+    said = f"{what} {worst} by {100 * share:+.2g} %, {abs(moves[worst]):.2g} standard errors"
+    return [(f"{said}: its interval allows for that{remedy}", "check")]
 
 
 def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:

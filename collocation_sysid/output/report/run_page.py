@@ -52,6 +52,7 @@ def run_page(run: str | Path) -> str:
     run = Path(run)
     result = read_json(run / RESULT_FILE, "a run folder")
     with reading_run(run):
+        parameters = _parameters(result)
         return rendered(
             "run.html",
             result=result,
@@ -62,7 +63,8 @@ def run_page(run: str | Path) -> str:
             numbers=_numbers(result),
             verdict=verdict(result),
             notes=_notes(result),
-            parameters=_parameters(result),
+            parameters=parameters,
+            holds=max((row["holds"] for row in parameters), key=len, default=[]),
             places=_places(result),
             nuisance=_nuisance(result),
             worst=_worst_errors(run),
@@ -158,6 +160,7 @@ def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
                     "guess": found.get("guess"),
                     "derived": group == "derived",
                     "numerical": _numerical(found.get("numerical_error")),
+                    "holds": found.get("ci95_holds") or [],
                 }
             )
     return rows
@@ -165,7 +168,7 @@ def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _numerical(found: dict[str, Any] | None) -> dict[str, Any] | None:
     """The numerical error, with gaps for what was not measured."""
-    keys = ("step", "step_order", "mesh", "mesh_order", "extrapolated", "ci95")
+    keys = ("step", "step_order", "mesh", "mesh_order", "extrapolated")
     return None if found is None else {key: found.get(key) for key in keys}
 
 

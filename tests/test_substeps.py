@@ -1,0 +1,181 @@
+"""How many steps a sample takes, and intervals that hold what the step still does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from problems_small import TRUTH, hung_cube
+
+import collocation_sysid as cs
+from collocation_sysid.live.model import Model
+from collocation_sysid.output.record import result
+from collocation_sysid.problem import Problem
+from collocation_sysid.refine import refine
+from collocation_sysid.run import Run, run
+from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.numerical import MOST_SUBSTEPS, Refinement, numerical_error
+
+SOFT = {"mu_pa": cs.Unknown(400.0), "gamma_r_s": cs.Unknown(0.005)}
+
+
+@cache
+def twin(noise_m: float, substeps: int | str = "auto") -> Problem:
+    """A cube that another integrator has simulated at a sixteenth of the samples' distance."""
+    cube = hung_cube(40, divisions=(1, 1, 2))
+    tracks_m = cs.simulate(cube, TRUTH, timestep_s=cube.timestep_s / 16).markers_m
+    tracks_m = tracks_m + np.random.default_rng(3).normal(scale=noise_m, size=tracks_m.shape)
+    sigma_m = np.full(len(cube.markers.names), noise_m)
+    seen = replace(cube, markers=replace(cube.markers, positions_m=tracks_m, sigma_m=sigma_m))
+    return Problem([seen], {**TRUTH, **SOFT}, substeps=substeps)  # type: ignore[arg-type]
+
+
+@cache
+def found(noise_m: float, substeps: int | str = "auto") -> Run:
+    return run(twin(noise_m, substeps))
+
+
+def holds(interval: tuple[float, float] | None, value: float) -> bool:
+    assert interval is not None
+    return interval[0] < value < interval[1]
+
+
+# Intervals
+
+
+def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
+    coarse = found(3e-4, 1)
+    noise = coarse.noise_estimates["mu_pa"]
+    assert not holds(noise.ci95, TRUTH["mu_pa"])
+    assert holds(coarse.interval("mu_pa"), TRUTH["mu_pa"])
+    assert holds(coarse.interval("young_pa"), 720.0)
+    assert coarse.interval_holds == ("noise", "step")
+
+
+def test_a_scheme_of_first_order_has_its_error_in_the_interval_too():
+    euler = run(replace(twin(3e-4, 4), scheme="backward-euler"))
+    noise = euler.noise_estimates["gamma_r_s"]
+    assert not holds(noise.ci95, TRUTH["gamma_r_s"])
+    assert holds(euler.interval("gamma_r_s"), TRUTH["gamma_r_s"])
+
+
+def test_what_was_not_estimated_is_not_said_to_be_held():
+    coarse = found(3e-4, 1)
+    blind = run(replace(coarse.problem, rollout=cs.RolloutOptions("scheme")))
+    assert blind.interval_holds == ("noise",)
+    assert blind.interval("mu_pa") == blind.noise_estimates["mu_pa"].ci95
+    assert "not the step and the mesh" in blind.table()
+
+
+# As many as the error bars ask for
+
+
+def test_as_many_steps_are_taken_as_leave_half_a_standard_error():
+    finer = found(3e-4)
+    left = finer.refinement
+    assert left is not None
+    assert finer.solution.collocation.substeps in range(3, MOST_SUBSTEPS)
+    assert max(map(abs, left.moves(finer.noise_estimates).values())) < 0.6
+    assert holds(finer.interval("mu_pa"), TRUTH["mu_pa"])
+    assert finer.trust.verdict == "good"
+
+
+def test_it_is_told_what_was_chosen_and_why():
+    finer = found(3e-4)
+    (said,) = [note for note in finer.solution.notes if "standard errors" in note]
+    many = finer.solution.collocation.substeps
+    assert said.startswith("with one step a sample, the step moves ")
+    assert f"solved again with {many} in" in said
+    assert result(finer)["problem"]["substeps"] == many
+    assert result(finer)["iterations"] > found(3e-4, many).solution.iterations
+
+
+def test_the_guess_and_the_way_from_it_are_kept():
+    finer = found(3e-4)
+    assert finer.started_from.guesses["mu_pa"] == pytest.approx(400.0)
+    numbers = [line.number for line in finer.solution.history]
+    assert numbers == sorted(numbers)
+    assert finer.solution.history[0].parameters["mu_pa"] == pytest.approx(400.0)
+
+
+def counting(solved: list[int]) -> cs.Method:
+    def method(collocation, watch=None, start=None):
+        solved.append(collocation.substeps)
+        return cs.ReducedSpace()(collocation, watch, start)
+
+    return method
+
+
+def test_nothing_is_solved_twice_where_one_step_is_enough():
+    solved: list[int] = []
+    assert run(twin(1e-2), counting(solved)).solution.collocation.substeps == 1
+    assert solved == [1]
+
+
+def test_a_number_that_is_stated_is_kept():
+    solved: list[int] = []
+    assert run(twin(3e-4, 2), counting(solved)).interval_holds == ("noise", "step")
+    assert solved == [2]
+
+
+def test_there_are_no_more_than_the_most():
+    estimates = {"mu_pa": Estimate(100.0, 0.1, (99.8, 100.2))}
+    for half, order, needed in ((100.01, 2, 1), (100.14, 2, 2), (100.14, 1, 6), (110.0, 2, 8)):
+        error = numerical_error("mu_pa", estimates["mu_pa"], [half], [], order)
+        assert Refinement({"mu_pa": error}).substeps(estimates, order) == needed
+    nothing = {"mu_pa": replace(estimates["mu_pa"], std_error=None)}
+    assert Refinement({"mu_pa": error}).substeps(nothing, order) == 1
+
+
+def test_the_first_answer_counts_where_the_finer_is_not_found():
+    def once(collocation, watch=None, start=None):
+        solution = cs.ReducedSpace()(collocation, watch, start)
+        lost = replace(solution, status=cs.Status.STALLED)
+        return solution if collocation.substeps == 1 else lost
+
+    kept = run(twin(3e-4), once)
+    assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
+    assert kept.solution.status.converged
+    assert any("it was not solved" in note for note in kept.notes)
+
+
+def test_live_estimates_take_one_step_where_none_are_stated():
+    assert Model.of(twin(3e-4)).substeps == 1
+    assert Model.of(twin(3e-4, 2)).substeps == 2
+
+
+@pytest.mark.parametrize("given", ["some", 0, -1])
+def test_other_numbers_are_refused(given):
+    with pytest.raises(cs.InputError, match="substeps"):
+        replace(twin(3e-4), substeps=given).collocation()
+
+
+def test_refine_goes_on_from_the_steps_that_were_chosen():
+    finer = found(3e-4)
+    refined = refine(finer).refinement
+    assert refined is not None
+    rows = {level["halved"]: level["timesteps"] for level in refined.levels}
+    many = finer.solution.collocation.substeps
+    assert rows == {"step": 40 * 2 * many + 1, "mesh": 40 * many + 1}
+    assert refined.holds == ("noise", "step", "mesh")
+
+
+# Value, interval, verdict and what the interval holds, together
+
+
+def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
+    coarse = found(3e-4, 1)
+    low, high = coarse.interval("mu_pa") or (0.0, 0.0)
+    for said in (str(coarse), coarse.table()):
+        assert f"{coarse.parameters['mu_pa']:.5g}" in said
+        assert f"{low:.5g} … {high:.5g}" in said
+        assert "Verdict: check" in said
+        assert "intervals hold the noise and the step, not the mesh" in said
+    found_mu = result(coarse)["parameters"]["mu_pa"]
+    assert found_mu["ci95"] == [low, high]
+    assert found_mu["ci95_holds"] == ["noise", "step"]
+    assert found_mu["ci95_noise"] == list(coarse.noise_estimates["mu_pa"].ci95 or ())
+    assert f"[{low:.5g}, {high:.5g}]" in repr(coarse)
+    assert ", check: " in repr(coarse)
