@@ -69,7 +69,7 @@ def fitted(measured: Experiment, law: str) -> str:
     """What comes out, in a line and the verdict's."""
     body = bar(law)
     markers = replace(measured.markers, placement=None)
-    found = run(Problem([replace(measured, body=body, markers=markers)], GUESS))
+    found = run(Problem([replace(measured, body=body, markers=markers)], GUESS, substeps=1))
     said = []
     for name, truth in TRUTH.items():
         estimate = found.estimates[name]

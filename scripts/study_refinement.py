@@ -42,9 +42,8 @@ def drawn(name: str, rng: np.random.Generator) -> dict[str, float]:
     return {"young_pa": young_pa, "poisson": float(rng.uniform(0.15, 0.4)), **damping}
 
 
-def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
-    """A coarse problem with data of a fine one, and what is true."""
-    rng = np.random.default_rng(seed)
+def still(name: str, rng: np.random.Generator) -> tuple[Problem, dict[str, float]]:
+    """A problem without data, and what is true."""
     size_m, divisions = BODIES[name]
     body = Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=ELEMENTS[name])
     t_s = STEP_S * np.arange(SAMPLES)
@@ -53,7 +52,7 @@ def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
     markers = Markers(t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, None, places)
     grasp = Grasp(held, random_poses(t_s, rng))
-    still = Experiment(body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none())
+    moved = Experiment(body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none())
     truth = drawn(name, rng)
     guess = {
         "young_pa": Unknown(truth["young_pa"], 10.0, 1e6),
@@ -61,11 +60,17 @@ def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
         "gamma_r_s": Unknown(truth["gamma_r_s"], 1e-6, 1.0),
         "gamma_m_1_s": truth["gamma_m_1_s"],
     }
-    coarse = Problem([still], guess)
+    return Problem([moved], guess), truth
+
+
+def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
+    """A coarse problem with data of a fine one, and what is true."""
+    rng = np.random.default_rng(seed)
+    coarse, truth = still(name, rng)
     (fine,) = finer_mesh(finer_mesh(coarse)).experiments
     tracks = simulate(fine, truth, "midpoint", substeps=4).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
-    return replace(coarse, experiments=[with_markers(still, tracks + noise)]), truth
+    return replace(coarse, experiments=[with_markers(coarse.experiments[0], tracks + noise)]), truth
 
 
 def main(twins: int = 20, first: int = 0) -> None:

@@ -354,7 +354,7 @@ def problem_of(case: Case, guess: NDArray[np.float64]) -> Problem:
         name: Unknown(float(value) if np.isfinite(value) else None)
         for name, value in zip(case.truth, guess, strict=True)
     }
-    return Problem([case.experiment], given, scheme=case.scheme)
+    return Problem([case.experiment], given, scheme=case.scheme, substeps=1)
 
 
 def parameters(values: NDArray[np.float64]) -> Parameters:

@@ -55,6 +55,11 @@ def about(findings: Findings, *words: str) -> str:
 
 
 @pytest.mark.long
+def test_where_no_substeps_are_stated_check_says_that_they_are_chosen(tiny: Path):
+    assert any("up to 8" in note for note in checked(tiny).notes)
+    assert not any("up to 8" in note for note in checked(tiny, "transcription.substeps=2").notes)
+
+
 def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_cure_it(tiny: Path):
     euler = (*SILICONE, "transcription.scheme=backward-euler")
     findings = checked(tiny, *euler)

@@ -211,7 +211,8 @@ def test_a_dry_run_only_lists_the_runs(tiny):
     assert not (tiny / "out").exists()
     listed = json.loads(compare("--starts", 2, "--dry-run", "--json").out)
     assert [run["start"] for run in listed] == [0, 1]
-    assert len(listed[1]["overrides"]) == 4
+    assert len(listed[1]["overrides"]) == 5
+    assert {run["overrides"][0] for run in listed} == {"transcription.substeps=1"}
     assert not listed[0]["finished"]
 
 

@@ -24,6 +24,7 @@ from ..nlp.sensor_rows import SensorRows
 from ..nlp.stability import instabilities
 from ..problem import Problem
 from ..statistics.cause import Cause
+from ..statistics.numerical import MOST_SUBSTEPS
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
 from ..statistics.trust import stability_concerns
@@ -53,6 +54,10 @@ __all__ = [
 
 # Agreement with fourth-order central differences that rounding allows.
 AGREEMENT = 1e-6
+CHOSEN = (
+    "numbers of steps hold for one a sample: solve takes as many as the error bars ask for, up to "
+    f"{MOST_SUBSTEPS}, where transcription.substeps states none"
+)
 
 
 @dataclass(frozen=True)
@@ -175,6 +180,7 @@ def check_problem(problem: Problem) -> Findings:
     for motion in motions:
         notes += motion_notes(motion)
     notes += cost_notes(chosen, found_costs) if chosen else []
+    notes += [CHOSEN] * (problem.substeps == "auto" and bool(motions))
     return Findings(
         bodies=bodies,
         experiments=len(problem.experiments),

@@ -91,7 +91,7 @@ def plan_comparison(
     truth: Mapping[str, float] | None = None,
     allow_code: bool = False,
 ) -> list[PlannedRun]:
-    """Every method from every start; all methods get the same starts.
+    """Every method from every start; all methods get the same starts, and the same time grid.
 
     Parameters
     ----------
@@ -116,6 +116,8 @@ def plan_comparison(
     """
     _refuse_options(starts, spread, seed)
     path = _path_of(problem)
+    if problem.substeps == "auto":  # or each method would choose for itself
+        overrides = [*overrides, f"transcription.substeps={problem.first_substeps}"]
     planned = []
     for start in range(starts):
         moved = list(overrides) + _start_overrides(problem, truth or {}, start, spread, seed)
