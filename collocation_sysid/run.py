@@ -518,15 +518,12 @@ def _fine_enough(
     if coarse.refinement is None:
         return coarse
     first, problem = coarse.solution, coarse.problem
-    moves = coarse.refinement.moves(coarse.noise_estimates)
     substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
     if substeps == 1:
         return coarse
     say(f"solving again with {substeps} steps a sample")
-    worst = max(moves, key=lambda name: abs(moves[name]))
-    why = (
-        f"with one step a sample, the step moves {worst} by {abs(moves[worst]):.2g} standard errors"
-    )
+    worst, many = coarse.refinement.worst(coarse.noise_estimates)
+    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
     try:

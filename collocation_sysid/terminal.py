@@ -248,11 +248,11 @@ def _numerical(finished: Run) -> list[RenderableType]:
         return [Text(said)]
     if found.levels:
         return [Text(said), refinement_table(found)]
-    values = {name: finished.estimates[name].value for name in found.errors}
+    known = ((name, finished.estimates[name]) for name in found.errors)
     moved = [
-        f"{symbol_of(name)} {100 * (value - found.errors[name].extrapolated) / value:+.2g} %"
-        for name, value in values.items()
-        if value
+        f"{symbol_of(name)} {100 * (1 - found.errors[name].extrapolated / each.value):+.2g} %"
+        for name, each in known
+        if each.value and each.std_error is not None
     ]
     return [Text(said), Text(f"the step moves, to first order: {', '.join(moved)}")]
 

@@ -11,7 +11,7 @@ from problems_small import IDEAL, box, measured_with, nodes_where, times, vertex
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.problem import Problem
+from collocation_sysid.problem import Problem, RolloutOptions
 from collocation_sysid.run import run
 
 TRUTH = {"lambda_pa": 6e3, "mu_pa": 9e3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
@@ -41,8 +41,10 @@ def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
     known = Parameter("gamma_m_1_s", 0.01, fixed=True)
     bounded = Parameter("gamma_m_1_s", 0.01, 0.01, 100.0)
     experiment = let_go(seed)
+    made = {"rollout": RolloutOptions("scheme")}  # by which the tracks are made
     wrong, found = (
-        run(Problem([experiment], Parameters((*free, last)))).estimates for last in (known, bounded)
+        run(Problem([experiment], Parameters((*free, last)), **made)).estimates
+        for last in (known, bounded)
     )
     assert found["gamma_m_1_s"].at_bound
     truth = TRUTH["gamma_r_s"]

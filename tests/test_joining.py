@@ -19,7 +19,7 @@ from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.nuisance import NuisanceMap
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.problem import Problem
+from collocation_sysid.problem import Problem, RolloutOptions
 from collocation_sysid.run import run, solve
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_of
@@ -143,7 +143,8 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
     for k, cube in enumerate(tracks):
         precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 2e-4))
         tracks[k] = with_noise(replace(cube, markers=precise), 1)
-    misled, right = (run(Problem([cube], GUESS), seek_causes=False) for cube in tracks)
+    made = {"rollout": RolloutOptions("scheme")}  # by which the tracks are made
+    misled, right = (run(Problem([cube], GUESS, **made), seek_causes=False) for cube in tracks)
     assert misled.interval("gamma_r_s")[1] < TRUTH["gamma_r_s"]
     assert misled.trust.verdict != "good"
     assert "residuals are not noise" in misled.trust.reasons[0]

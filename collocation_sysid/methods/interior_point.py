@@ -66,7 +66,8 @@ class InteriorPoint(Options):
     Attributes
     ----------
     hessian : {"exact", "gauss-newton", "limited-memory"}
-        Second derivatives of the Lagrangian: all of them, the loss's only, or IPOPT's own.
+        Second derivatives of the Lagrangian: all of them once parameters move by less than
+        `warm_up`, the loss's only, or IPOPT's own.
     warm_up : float
         While an iteration still changes a parameter by more than this share, an exact Hessian is
         replaced by Gauss–Newton's with Levenberg's damping, which keeps every parameter within

@@ -68,8 +68,9 @@ class ReducedSpace(Options):
         On them a prior of this standard deviation of the logarithm holds each parameter near its
         guess: a short horizon says nothing about some, and would let them run to their bounds.
     hessian : {"gauss-newton", "exact"}
-        Near the answer, what Gauss–Newton leaves out is learned from the steps, or computed
-        exactly from the Lagrangian: a second sweep an iteration, for large residuals.
+        Once a step moves no parameter by more than 10 %, what Gauss–Newton leaves out is learned
+        from the steps, or computed exactly from the Lagrangian: a second sweep an iteration, for
+        large residuals. Before, both are Gauss–Newton.
     factorisation : {"auto", "band", "sparse", "supernodal"}
         Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated
         to cost least.

@@ -96,18 +96,20 @@ class Refinement:
         of_mesh = any(error.mesh is not None for error in self.errors.values())
         return ("noise", *["step"] * of_step, *["mesh"] * of_mesh)
 
-    def moves(self, estimates: Mapping[str, Estimate]) -> dict[str, float]:
-        """How many standard errors discretisation moves the estimates, where they have any."""
-        return {
-            name: (estimates[name].value - error.extrapolated) / spread
+    def worst(self, estimates: Mapping[str, Estimate]) -> tuple[str, float]:
+        """The estimate that is moved by most of its standard errors, and by how many."""
+        moves = {
+            name: abs(estimates[name].value - error.extrapolated) / spread
             for name, error in self.errors.items()
             if (spread := estimates[name].std_error)
         }
+        # Moduli that move alike differ by rounding: the first is the parameter itself.
+        return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
     def substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
         """How many steps keep every move small, if these are of one; not more than the most."""
-        worst = max(map(abs, self.moves(estimates).values()), default=0.0)
-        return max(1, ceil(min((worst / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
+        many = self.worst(estimates)[1]
+        return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
 
     def as_dict(self) -> dict[str, Any]:
         """For ``refinement.json``."""

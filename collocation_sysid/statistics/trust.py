@@ -179,9 +179,8 @@ def numerical_concerns(
     estimates: Mapping[str, Estimate], refinement: Refinement | None
 ) -> list[Concern]:
     """Where step or mesh matter more than the noise; what is unknown gives no concern."""
-    moves = {} if refinement is None else refinement.moves(estimates)
-    worst = max(moves, key=lambda name: abs(moves[name]), default=None)
-    if refinement is None or worst is None or abs(moves[worst]) <= MOVED:
+    worst, many = ("", 0.0) if refinement is None else refinement.worst(estimates)
+    if refinement is None or many <= MOVED:
         return []
     if refinement.levels:
         what, remedy = STEP_MOVES[1], ""
@@ -189,7 +188,7 @@ def numerical_concerns(
         what, remedy = STEP_MOVES[0], "; raise transcription.substeps, or see what refine says"
     value = estimates[worst].value
     share = (value - refinement.errors[worst].extrapolated) / abs(value)
-    said = f"{what} {worst} by {100 * share:+.2g} %, {abs(moves[worst]):.2g} standard errors"
+    said = f"{what} {worst} by {100 * share:+.2g} %, {many:.2g} standard errors"
     return [(f"{said}: its interval allows for that{remedy}", "check")]
 
 
