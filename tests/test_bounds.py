@@ -41,9 +41,9 @@ def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
     known = Parameter("gamma_m_1_s", 0.01, fixed=True)
     bounded = Parameter("gamma_m_1_s", 0.01, 0.01, 100.0)
     experiment = let_go(seed)
-    made = {"rollout": RolloutOptions("scheme")}  # by which the tracks are made
+    made = RolloutOptions("scheme")  # by which the tracks are made
     wrong, found = (
-        run(Problem([experiment], Parameters((*free, last)), **made)).estimates
+        run(Problem([experiment], Parameters((*free, last)), rollout=made)).estimates
         for last in (known, bounded)
     )
     assert found["gamma_m_1_s"].at_bound

@@ -143,8 +143,9 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
     for k, cube in enumerate(tracks):
         precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 2e-4))
         tracks[k] = with_noise(replace(cube, markers=precise), 1)
-    made = {"rollout": RolloutOptions("scheme")}  # by which the tracks are made
-    misled, right = (run(Problem([cube], GUESS, **made), seek_causes=False) for cube in tracks)
+    made = RolloutOptions("scheme")  # by which the tracks are made
+    problems = [Problem([cube], GUESS, rollout=made) for cube in tracks]
+    misled, right = (run(problem, seek_causes=False) for problem in problems)
     assert misled.interval("gamma_r_s")[1] < TRUTH["gamma_r_s"]
     assert misled.trust.verdict != "good"
     assert "residuals are not noise" in misled.trust.reasons[0]

@@ -25,14 +25,14 @@ truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 
 places_m = [(0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (0.06, 0.06, 0.045), (0.0, 0.06, 0.09)]
 seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m)
 swing = cs.Experiment(block, t_s, [hand], seen, name="swing")
-clean_m = cs.simulate(swing, truth, "midpoint", substeps=2).markers_m
+clean_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 noise_m = np.random.default_rng(1).normal(scale=1e-3, size=clean_m.shape)
 recording = cs.with_markers(swing, clean_m + noise_m)
 
 # %%
 # Poisson's ratio is taken as known; the rest is found, without a guess.
 unknown = {"young_pa": cs.Unknown(), "gamma_r_s": cs.Unknown(), "gamma_m_1_s": cs.Unknown()}
-run = cs.run(cs.Problem([recording], {"poisson": 0.3, **unknown}, substeps=2))
+run = cs.run(cs.Problem([recording], {"poisson": 0.3, **unknown}))
 print(run.table(), run.trust.verdict, sep="\n")
 low, high = run.interval("young_pa")
 assert low < truth["young_pa"] < high

@@ -21,7 +21,7 @@ places_m = np.array([(0.0, 0.02, 0.01), (0.06, 0.03, 0.02), (0.03, 0.06, 0.05), 
 blank = np.zeros((len(t_s), 4, 3))
 seen = cs.Markers(t_s, blank, sigma_m=1e-3, places_m=places_m)
 swing = cs.Experiment(block, t_s, [hand], seen, name="swing")
-tracks_m = cs.simulate(swing, truth, "midpoint", substeps=2).markers_m
+tracks_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 tracks_m += np.random.default_rng(2).normal(scale=1e-3, size=tracks_m.shape)
 
 # %%
@@ -32,7 +32,7 @@ for label, known in (("known", places_m), ("not known", None)):
     recording = cs.Experiment(block, t_s, [hand], markers, name="swing")
     damping = {"gamma_r_s": cs.Unknown(), "gamma_m_1_s": cs.Unknown()}
     parameters = {"young_pa": cs.Unknown(), "poisson": 0.3, **damping}
-    runs[label] = cs.run(cs.Problem([recording], parameters, substeps=2))
+    runs[label] = cs.run(cs.Problem([recording], parameters))
 
 # %%
 # The markers on the block, whose volume changes with its stretch.

@@ -27,7 +27,7 @@ swing = cs.Experiment(block, t_s, [hand], seen, name="swing")
 # Tracks and forces of a simulation, both with noise.
 known = {"poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 truth = {"young_pa": 2e4, **known}
-simulated, rng = cs.simulate(swing, truth, "midpoint"), np.random.default_rng(4)
+simulated, rng = cs.simulate(swing, truth, timestep_s=0.001), np.random.default_rng(4)
 tracks_m = simulated.markers_m + rng.normal(scale=5e-4, size=simulated.markers_m.shape)
 (felt,) = simulated.wrenches
 felt = felt + rng.normal(size=felt.shape) * np.repeat([0.05, 0.005], 3)

@@ -29,7 +29,7 @@ def hand(late_s: float) -> cs.Grasp:
 places_m = [(0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (0.06, 0.06, 0.045), (0.0, 0.06, 0.09)]
 seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m)
 late = cs.Experiment(block, t_s, [hand(0.03)], seen, name="swing")
-tracks_m = cs.simulate(late, truth, "midpoint", substeps=2).markers_m
+tracks_m = cs.simulate(late, truth, timestep_s=0.001).markers_m
 tracks_m += np.random.default_rng(3).normal(scale=1e-3, size=tracks_m.shape)
 
 # %%
@@ -44,7 +44,7 @@ parameters = {
 runs = {}
 for label, prior_s in (("one clock", None), ("a clock of their own", 0.05)):
     told = replace(recording, nuisance=replace(recording.nuisance, time_shift_s=prior_s))
-    runs[label] = cs.run(cs.Problem([told], parameters, substeps=2))
+    runs[label] = cs.run(cs.Problem([told], parameters))
     trust = runs[label].trust
     print(label, "->", trust.verdict, *trust.reasons, sep="\n  ")
 

@@ -38,7 +38,7 @@ places_m = [(0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (0.06, 0.06, 0.045), (0.0, 0.06, 
 seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m)
 truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 swing = cs.Experiment(body, t_s, [hand], seen)
-tracks_m = cs.simulate(swing, truth, "midpoint", substeps=2).markers_m
+tracks_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 tracks_m += np.random.default_rng(5).normal(scale=1e-3, size=tracks_m.shape)
 columns = [f"{name}_{axis}" for name in ("tip_1", "tip_2", "low", "middle") for axis in "xyz"]
 np.savetxt(
@@ -62,9 +62,6 @@ young_pa = {}
 poisson = { fixed = 0.3 }
 gamma_r_s = {}
 gamma_m_1_s = {}
-
-[transcription]
-substeps = 2
 
 [[experiment]]
 name = "swing"

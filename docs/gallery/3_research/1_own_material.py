@@ -32,7 +32,7 @@ weight = cs.PointMass(cs.Box((-1, -1, -1), (1, 1, 0.001)), 0.02)
 swing = cs.Experiment(body, t_s, [hand], seen, name="swing", masses=[weight])
 known = {"lambda_pa": 800.0, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 truth = {"mu_pa": 600.0, "hardening": 0.5, **known}
-tracks_m = cs.simulate(swing, truth, "midpoint").markers_m
+tracks_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 tracks_m += np.random.default_rng(8).normal(scale=2e-4, size=tracks_m.shape)
 
 # %%

@@ -23,7 +23,7 @@ known = {"poisson": 0.3, "core.poisson": 0.3}
 damping = {f"{where}{name}": value for where in ("", "core.") for name, value in
            (("gamma_r_s", 0.003), ("gamma_m_1_s", 0.5))}  # fmt: skip
 truth = {"young_pa": 2e4, "core.young_pa": 8e4, **known, **damping}
-tracks_m = cs.simulate(swing, truth, "midpoint").markers_m
+tracks_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 tracks_m += np.random.default_rng(7).normal(scale=2e-4, size=tracks_m.shape)
 
 # %%

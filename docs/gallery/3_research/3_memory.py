@@ -30,7 +30,9 @@ def swung(body: cs.Body, tracks_m: np.ndarray) -> cs.Experiment:
 silicone = cs.Body(mesh, density_kg_m3=100.0, prony=["prony_1"])
 elastic = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.003, "gamma_m_1_s": 0.5}
 truth = {**elastic, "prony_1.share": 0.33, "prony_1.tau_s": 0.15}
-tracks_m = cs.simulate(swung(silicone, np.zeros((len(t_s), 4, 3))), truth, "midpoint").markers_m
+tracks_m = cs.simulate(
+    swung(silicone, np.zeros((len(t_s), 4, 3))), truth, timestep_s=0.001
+).markers_m
 tracks_m += np.random.default_rng(6).normal(scale=2e-4, size=tracks_m.shape)
 
 # %%

@@ -29,7 +29,9 @@ def bar(divisions: tuple[int, int, int], tracks_m: np.ndarray) -> cs.Experiment:
 # %%
 # Data from a fine mesh, fitted on a coarse one of linear tetrahedra, which bend too stiffly.
 blank = np.zeros((len(t_s), 4, 3))
-tracks_m = cs.simulate(bar((12, 4, 4), blank), {"young_pa": 2e4, **known}, "midpoint").markers_m
+tracks_m = cs.simulate(
+    bar((12, 4, 4), blank), {"young_pa": 2e4, **known}, timestep_s=0.001
+).markers_m
 tracks_m += np.random.default_rng(10).normal(scale=2e-4, size=tracks_m.shape)
 problem = cs.Problem([bar((6, 2, 2), tracks_m)], {"young_pa": cs.Unknown(1e4), **known})
 run = cs.refine(cs.run(problem))
@@ -39,8 +41,8 @@ run.plot(count=3)
 # %%
 # The interval of the noise alone misses the truth by far; the one that holds the discretisation
 # does not.
-error = run.refinement.errors["young_pa"]
-intervals = {"noise": run.interval("young_pa"), "noise, mesh and step": error.ci95}
+error, noise = run.refinement.errors["young_pa"], run.noise_estimates["young_pa"]
+intervals = {"noise": noise.ci95, "noise, mesh and step": run.interval("young_pa")}
 held = {label: low < 2e4 < high for label, (low, high) in intervals.items()}
 assert held == {"noise": False, "noise, mesh and step": True}
 for k, (label, (low, high)) in enumerate(intervals.items()):
