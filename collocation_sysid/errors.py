@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,6 +14,27 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     longer = [other for other in names if len(name) > 1 and other.startswith(name)]
     close = longer or difflib.get_close_matches(name, names, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
+
+
+# Marks in place of what would control a terminal or turn its text around.
+_MARKS = (
+    {code: 0x2400 + code for code in range(0x20) if code not in (0x09, 0x0A)}
+    | {0x7F: 0x2421}
+    | dict.fromkeys((*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)), 0xFFFD)
+)
+# Letters that a message may have, and what it quotes of a file.
+LONGEST, LONGEST_EXCERPT = 1500, 60
+_ENDLESS_WORD = re.compile(r"(\S{60})\S{340,}")
+
+
+def printable(text: str) -> str:
+    """A text with marks in place of what a terminal would obey."""
+    return text.translate(_MARKS)
+
+
+def excerpt(text: str, longest: int = LONGEST_EXCERPT) -> str:
+    """The text, or its beginning where it is long."""
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 class InputError(ValueError):
@@ -34,7 +56,8 @@ class InputError(ValueError):
         self.message = message
         self.source = source
         self.where = where
-        super().__init__(": ".join(str(part) for part in (source, where, message) if part))
+        said = ": ".join(str(part) for part in (source, where, message) if part)
+        super().__init__(excerpt(_ENDLESS_WORD.sub(r"\1…", printable(said)), LONGEST))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
         return type(self), (self.message, self.source, self.where)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import stat
 import zlib
@@ -122,6 +123,11 @@ def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
         raise
     except DAMAGE as error:
         raise InputError(f"{files} is damaged ({reason(error)}); {remedy}", folder) from error
+
+
+def safe_name(text: str) -> str:
+    """A file's name for a text, with underscores in place of what could lead elsewhere."""
+    return re.sub(r"[^\w.-]+", "_", text)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from rich.text import Text
 from .arrays import root_mean
 from .check import BodyFinding, Findings, Recording
 from .check.hold import hold_sentence
+from .console import PlainConsole
 from .export.target import Comparison
 from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
@@ -170,7 +171,7 @@ def _how_to(concerns: Sequence[str]) -> list[Text]:
 def plain_text(shown: RenderableType) -> str:
     """What a terminal would show, without colours and as wide as it needs."""
     file = StringIO()
-    Console(file=file, width=WIDE, highlight=False).print(shown)
+    PlainConsole(file=file, width=WIDE).print(shown)
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
 
 

@@ -154,6 +154,24 @@ def test_a_damaged_run_is_no_start(run: Path, damage: Damage):
     assert "damaged" in refused("solve", run / "problem.toml", "--start", run)
 
 
+@pytest.mark.parametrize("name", ["lambda_pa", "gamma_r_s"])
+def test_a_run_without_one_of_its_parameters_is_not_exported(run: Path, tmp_path: Path, name: str):
+    result = json.loads((run / "result.json").read_text())
+    del result["parameters"][name]
+    whole(json.dumps(result))(run)
+    assert "damaged" in refused("export", run, "--to", "json", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_film_lies_in_the_run_folder_whatever_the_experiment_is_called(run: Path):
+    text = (run / "result.json").read_text()
+    whole(text.replace('"swing"', '"../swing"'))(run)
+    outcome = run_command("animate", run, "--fps", "2", "-q")
+    assert outcome.code == 0, outcome
+    assert not list(run.parent.glob("*.gif"))
+    assert (run / ".._swing.gif").is_file()
+
+
 @pytest.mark.parametrize("command", ["report", "plot", "animate", "refine"])
 def test_a_file_is_no_run_folder(command: str, tmp_path: Path):
     (tmp_path / "run").write_text("no folder")

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 
-errors = Console(stderr=True, highlight=False)
+from ..console import PlainConsole
+
+errors = PlainConsole(stderr=True)
 
 ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")]
 Overrides = Annotated[
@@ -52,5 +54,5 @@ def examples(*commands: str) -> str:
 
 def show(content: RenderableType) -> None:
     """Print on stdout: on a terminal wrapped between words, in files with lines kept whole."""
-    console = Console(highlight=False)
+    console = PlainConsole()
     console.print(content, soft_wrap=not console.is_terminal)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
+from ..console import PlainConsole
 from .common import AsJson, errors, examples
 
 commands = typer.Typer()
@@ -40,7 +40,7 @@ def methods(
         listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
-        Console(highlight=False).print(options_table(name) if name else methods_table())
+        PlainConsole().print(options_table(name) if name else methods_table())
 
 
 @commands.command()

@@ -138,7 +138,8 @@ class Identified:
                 f"no experiment {experiment!r} was fitted; expected {', '.join(names)}", folder
             )
         segment = collocation.segments[names.index(experiment) if experiment else 0]
-        values = {item.name: answer.values[item.name] for item in problem.parameters.items}
+        with reading_run(folder):
+            values = {item.name: answer.values[item.name] for item in problem.parameters.items}
         phi = answer.nuisance_of(collocation)[0][segment.first.phi :][: segment.nuisance.size]
         with reading_run(folder):
             replay = Replay.from_arrays(segment.experiment.name, read_arrays(folder))

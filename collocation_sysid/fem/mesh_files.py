@@ -60,19 +60,22 @@ def read_tetrahedra(
         If the file cannot be read, holds no tetrahedra, or their sides are strongly curved.
     """
     metres = length_in_metres(length_unit)
-    data = _read(path)
+    with _reading(path) as data:
+        return _tetrahedra(data, metres)
+
+
+def _tetrahedra(
+    data: Any, metres: float
+) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
     blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
     if not blocks:
-        raise InputError(_explain_no_tetrahedra(counts), path)
+        raise InputError(_explain_no_tetrahedra(counts))
     notes = _note_left_out(counts)
     quadratic = [block.data for block in blocks if block.type == "tetra10"]
     if quadratic:
-        try:
-            notes += straightened(points_m, np.concatenate(quadratic))
-        except InputError as error:
-            raise error.located(path) from None
+        notes += straightened(points_m, np.concatenate(quadratic))
     # Where a cell is in several groups, the sets of a .msh file tell all, its tags only the first.
     groups = {**_physical_groups(data), **_cell_sets(data)}
     nodes = {name: _nodes_of(data, per_block) for name, per_block in groups.items()}
@@ -97,16 +100,16 @@ def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray
         If the file cannot be read or holds no triangles.
     """
     metres = length_in_metres(length_unit)
-    data = _read(path)
-    fans = [
-        _fan(np.asarray(block.data, dtype=np.int64))
-        for block in data.cells
-        if block.type in ("triangle", "quad", "polygon") and len(block.data)
-    ]
-    if not fans:
-        raise InputError(f"no triangles in this file, found {_listed(_cell_counts(data))}", path)
-    # An OBJ vertex may carry a colour after its coordinates.
-    return np.asarray(data.points, dtype=float)[:, :3] * metres, np.concatenate(fans)
+    with _reading(path) as data:
+        fans = [
+            _fan(np.asarray(block.data, dtype=np.int64))
+            for block in data.cells
+            if block.type in ("triangle", "quad", "polygon") and len(block.data)
+        ]
+        if not fans:
+            raise InputError(f"no triangles in this file, found {_listed(_cell_counts(data))}")
+        # An OBJ vertex may carry a colour after its coordinates.
+        return np.asarray(data.points, dtype=float)[:, :3] * metres, np.concatenate(fans)
 
 
 def write_tetrahedra(
@@ -131,13 +134,15 @@ def _numbers(values: np.ndarray) -> np.ndarray:
     return values.astype(np.uint8) if values.dtype == bool else values
 
 
-def _read(path: str | Path) -> Any:
+@contextlib.contextmanager
+def _reading(path: str | Path) -> Iterator[Any]:
+    """What meshio reads; a damaged file may also fail where that is taken apart."""
     import meshio  # slow to import
 
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
     with _one_error(path, "read"):
-        return meshio.read(path)
+        yield meshio.read(path)
 
 
 @contextlib.contextmanager
@@ -153,6 +158,8 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
         ):
             warnings.simplefilter("ignore")
             yield
+    except InputError as error:
+        raise error.located(path) from None
     except (Exception, SystemExit) as error:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise

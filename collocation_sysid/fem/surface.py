@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
-import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -15,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from ..apart import Failed, computed_apart
 from ..errors import InputError
 from ..files import whole_file
 from .mesh_checks import cleaned
@@ -29,15 +27,14 @@ _RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}"
 
 MOST_ELEMENTS = 2_000_000
 
-# A process of its own: fTetWild leaves a file in its working directory and cannot be interrupted.
+# fTetWild leaves a file in its working directory and cannot be interrupted.
 _WORKER = """
-import sys, numpy, pytetwild
-surface = numpy.load("surface.npz")
+import pytetwild
 points, tetrahedra = pytetwild.tetrahedralize(
-    surface["points_m"], surface["triangles"], edge_length_abs=float(sys.argv[1]),
+    given["points_m"], given["triangles"], edge_length_abs=float(sys.argv[1]),
     epsilon=float(sys.argv[2]), coarsen=True, vtk_ordering=True, quiet=True,
 )
-numpy.savez("mesh.npz", points_m=points, tetrahedra=tetrahedra)
+found = {"points_m": points, "tetrahedra": tetrahedra}
 """
 
 
@@ -167,18 +164,11 @@ def _run_ftetwild(
 ) -> tuple[np.ndarray, np.ndarray]:
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
     lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
-    with tempfile.TemporaryDirectory() as folder:
-        np.savez(Path(folder) / "surface.npz", points_m=points, triangles=triangles.astype("i4"))
-        done = subprocess.run(
-            [sys.executable, "-c", _WORKER, *(repr(float(length)) for length in lengths)],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-        )
-        if done.returncode:
-            said = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            raise InputError(f"pytetwild could not fill the surface ({said})")
-        with np.load(Path(folder) / "mesh.npz") as mesh:
-            if not len(mesh["tetrahedra"]):
-                raise InputError("pytetwild found no inside: the surface encloses no volume")
-            return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)
+    words = [repr(float(length)) for length in lengths]
+    try:
+        mesh = computed_apart(_WORKER, *words, points_m=points, triangles=triangles.astype("i4"))
+    except Failed as error:
+        raise InputError(f"pytetwild could not fill the surface ({error})") from error
+    if not len(mesh["tetrahedra"]):
+        raise InputError("pytetwild found no inside: the surface encloses no volume")
+    return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)

@@ -8,6 +8,7 @@ by in a step. Parameters have the names of the model's constants, or of moduli t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -232,8 +233,8 @@ class Parameters:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "items", tuple(self.items))
-        for name in self.names:
-            if self.names.count(name) > 1:
+        for name, count in Counter(self.names).items():
+            if count > 1:
                 raise InputError("given twice, expected one value", None, name)
         rooted = [item.name for item in self.items if item.tied is None]
         for item in self.items:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError
-from ..files import whole_file
+from ..files import safe_name, whole_file
 from .pictures.camera import Camera
 from .pictures.scene import (
     Drawn,
@@ -80,7 +80,7 @@ def animate(
             raise InputError(f"found {value:g}; expected a number above 0", None, name)
     _, replays = read_run(run)
     replay = chosen(replays, experiment, run)
-    file = Path(to) if to is not None else Path(run) / f"{replay.name}.gif"
+    file = Path(to) if to is not None else Path(run) / f"{safe_name(replay.name)}.gif"
     if file.suffix.lower() not in PIXELS_WIDE:
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from ..checked import expected as wanted
-from ..errors import InputError, hint_at
+from ..errors import InputError, excerpt, hint_at
 from .schema import ProblemFile, completed
 
 Part = str | int
@@ -48,7 +48,9 @@ def explain(
 
 def _key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     """The key at fault: without the union's tags, and without places in an array of numbers."""
-    parts = [p for p in fault["loc"] if not (isinstance(p, str) and p.startswith("<"))]
+    loc = fault["loc"]
+    own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
+    parts = [p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")]
     field, depth = _field(parts, root)
     if field is not None and _model_in(field.annotation) is None:
         while len(parts) > depth and isinstance(parts[-1], int):
@@ -70,7 +72,7 @@ def _message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> st
     in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
     if kind == "missing" and not in_array:
         return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
-    found = f"found {short(_value_at(key, content))}"
+    found = f"found {short(_value_at(key, content) if in_array else fault['input'])}"
     if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
         return f"{found}; expected {expected}"
     if kind in ("model_type", "model_attributes_type") and model is not None:
@@ -170,7 +172,6 @@ def short(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     try:
-        text = repr(value)
+        return excerpt(repr(value))
     except (ValueError, RecursionError):  # beyond Python's limits of digits and of depth
         return f"a {type(value).__name__} too large to show"
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -11,13 +11,17 @@ from typing import Any
 import tomli_w
 from pydantic import ValidationError
 
-from ..errors import InputError
+from ..errors import InputError, excerpt
 from ..files import require_regular
 from .explaining import explain
 from .schema import ProblemFile
 
 # Levels of tables and lists that a problem file may have: it needs seven.
 DEEPEST = 20
+# A dotted key of more parts, 100 at least; no part is looked at twice.
+_ENDLESS_KEY = re.compile(
+    r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){100}"""
+)
 # What the TOML parser says where people see something simpler.
 _PLAINER = {
     "Cannot overwrite a value": "this key is given twice",
@@ -66,6 +70,8 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         Where it is none, with the line where there is one.
     """
     try:
+        if _ENDLESS_KEY.search(text) is not None:  # on which the parser would spend minutes
+            raise RecursionError
         content = tomllib.loads(text)
         if _depth(content) > DEEPEST:
             raise RecursionError
@@ -120,7 +126,7 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
     if found is None:
         return InputError(f"not valid TOML: {reason or complaint}, at its end", path)
     number = int(found[1])
-    line = text.splitlines()[number - 1].strip()
+    line = excerpt(text.splitlines()[number - 1].strip())
     return InputError(f"not valid TOML: {reason} in: {line}", path, f"line {number}")
 
 
@@ -180,7 +186,7 @@ def _index(items: list[Any], part: str, key: str) -> int:
     names = [item.get("name") if isinstance(item, dict) else None for item in items]
     if part in names:
         return names.index(part)
-    if part.isdecimal() and int(part) < len(items):
+    if part.isascii() and part.isdecimal() and int(part) < len(items):
         return int(part)
     known = "".join(f" or {name}" for name in names if name)
     raise InputError(

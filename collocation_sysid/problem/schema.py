@@ -206,9 +206,9 @@ def _flat(given: Any, *, front: str = "") -> Any:
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
         whole = f"{front}{name}"
         inner = _flat(value, front=f"{whole}.") if nested and value else {whole: value}
-        if twice := set(inner) & set(flat):
-            raise ValueError(f"{twice.pop()!r} is given twice; expected one value")
-        flat |= inner
+        if twice := [key for key in inner if key in flat]:
+            raise ValueError(f"{twice[0]!r} is given twice; expected one value")
+        flat.update(inner)
     return flat
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -14,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
+from ..apart import killed_by
 from .store import CRASHED, ERROR, STOPPED, TIMEOUT, Record
 
 COMMAND = (sys.executable, "-m", "collocation_sysid.study.worker")
@@ -129,10 +129,7 @@ def _watch(
 
 def _last_words(code: int, said: IO[bytes]) -> str:
     """How a process died, with the last line it wrote."""
-    how = f"its process ended with code {code}"
-    if code < 0:
-        with contextlib.suppress(ValueError):
-            how = f"its process was killed by {signal.Signals(-code).name}"
+    how = killed_by(code) or f"its process ended with code {code}"
     said.seek(0)
     lines = said.read()[-2000:].decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")

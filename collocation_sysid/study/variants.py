@@ -72,7 +72,7 @@ def parse_branches(text: str) -> tuple[int, ...]:
         For anything but whole numbers from 0 on.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
-    counts = [int(item) for item in items if item.isdecimal() and len(item) < 3]
+    counts = [int(item) for item in items if item.isascii() and item.isdecimal() and len(item) < 3]
     if not items or len(counts) < len(items) or max(counts) > MOST_BRANCHES:
         expected = f"whole numbers up to {MOST_BRANCHES}, such as 0,1,2"
         raise InputError(f"found {text!r}; expected {expected}", None, "--prony")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import struct
+from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+from numpy.typing import NDArray
 
+from ...apart import Failed, computed_apart
 from ...errors import InputError
 from .tracks import Choose, RawTracks
 from .units import stated_unit
@@ -17,6 +18,15 @@ _KEY = 0x50
 _BLOCK = 512
 _DEC, _SGI = 85, 86  # processor types whose numbers are not as Intel's
 _COUNTER_LIMIT = 65535
+# On damaged files ezc3d may crash, which a process of its own survives.
+_WORKER = r"""
+import re, ezc3d
+file = ezc3d.c3d(sys.argv[1])
+of_points = file["parameters"]["POINT"]
+kept = [key for key in of_points if re.fullmatch(r"(LABELS[0-9]{0,3}|UNITS|RATE)", key)]
+found = {key: numpy.array(of_points[key]["value"]) for key in kept}
+found["points"] = numpy.asarray(file["data"]["points"], dtype=float)[:3]
+"""
 
 
 def recognises(content: bytes) -> bool:
@@ -26,26 +36,21 @@ def recognises(content: bytes) -> bool:
 
 def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     """Read a C3D file; ezc3d gives NaN for points with a negative residual."""
-    try:
-        import ezc3d
-    except ImportError as error:
-        raise InputError(
-            "reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'", path
-        ) from error
+    if find_spec("ezc3d") is None:
+        raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'", path)
     points_stated, frames_stated = _stated_counts(path, content)
     try:
-        file = ezc3d.c3d(str(path))
-    except Exception as error:  # whatever C++ throws at a damaged file
+        read = computed_apart(_WORKER, str(Path(path).resolve()))
+    except Failed as error:
         raise InputError(f"is a damaged C3D file: ezc3d says '{error}'", path) from error
-    points = np.asarray(file["data"]["points"], dtype=np.float64)[:3]  # (3, points, frames)
+    points = read.pop("points")  # (3, points, frames)
     for what, stated, found in (
         ("points", points_stated, points.shape[1]),
         ("frames", frames_stated, points.shape[2]),
     ):
         if stated is not None and found != stated:
             raise InputError(f"the header states {stated} {what}, but {found} are there", path)
-    parameters = file["parameters"]["POINT"]
-    labels = _labels(parameters)
+    labels = _labels(read)
     if len(labels) != points.shape[1]:
         raise InputError(
             f"{len(labels)} labels, but {points.shape[1]} points in every frame; "
@@ -54,8 +59,8 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
             "POINT:LABELS",
         )
     chosen = choose(labels)
-    units = "".join(map(str, _values(parameters, "UNITS")[:1]))
-    rates = [float(rate) for rate in _values(parameters, "RATE")[:1]]
+    units = "".join(map(str, read.get("UNITS", [])[:1]))
+    rates = [float(rate) for rate in read.get("RATE", [])[:1]]
     return RawTracks(
         labels=[labels[k] for k in chosen],
         coordinates=points[:, chosen].transpose(2, 1, 0),
@@ -96,12 +101,8 @@ def _stated_counts(path: str | Path, content: bytes) -> tuple[int, int | None]:
     return points, frames
 
 
-def _labels(parameters: Any) -> list[str]:
+def _labels(found: Mapping[str, NDArray]) -> list[str]:
     """Labels of the points; those beyond the 255th stand in LABELS2, LABELS3 …"""
-    keys = [key for key in parameters if re.fullmatch(r"LABELS\d*", key)]
+    keys = [key for key in found if key.startswith("LABELS")]
     ordered = sorted(keys, key=lambda key: int(key.removeprefix("LABELS") or 1))
-    return [str(label).strip() for key in ordered for label in _values(parameters, key)]
-
-
-def _values(parameters: Any, key: str) -> list[Any]:
-    return list(parameters[key]["value"]) if key in parameters else []
+    return [str(label).strip() for key in ordered for label in found[key]]

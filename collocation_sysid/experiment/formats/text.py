@@ -13,13 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError
+from ...errors import InputError, excerpt
 from ...files import require_regular
 
 # Nothing measured is larger, and products of two such numbers are still numbers.
 LARGEST = 1e100
-# Letters of a cell that a message quotes.
-LONGEST = 60
 _ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
 _CONTROL, _SEPARATOR = re.compile("[\x01-\x08\x0e-\x1f]"), re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
@@ -176,9 +174,9 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
                 value = math.inf
             if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
                 or_blank = " or a blank cell" if blank_allowed else ""
-                found = cell if len(cell) <= LONGEST else f"{cell[:LONGEST]}…"
                 raise InputError(
-                    f"column {grid.columns[column]} holds '{found}'; expected a number{or_blank}",
+                    f"column {grid.columns[column]} holds '{excerpt(cell)}'; expected a "
+                    f"number{or_blank}",
                     grid.path,
                     f"line {row.line}",
                 )
@@ -198,8 +196,8 @@ def is_number(cell: str) -> bool:
 
 
 def written_number(text: str) -> float:
-    """A number as files write it; a `ValueError` for 1_000, which is one in Python only."""
-    if "_" in text:
+    """A number as files write it; a `ValueError` for 1_000 and ١, which are so in Python only."""
+    if "_" in text or not text.isascii():
         raise ValueError(f"found {text!r}")
     return float(text)
 

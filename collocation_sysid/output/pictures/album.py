@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...arrays import Array
-from ...files import whole_file
+from ...files import safe_name, whole_file
 from ...methods.solution import Iteration
 from ..replay import Replay
 from ..style import RESOLUTION_DPI
@@ -116,8 +115,7 @@ def save_pictures(folder: str | Path, pictures: Mapping[str, Figure]) -> list[Pa
     """
     files = []
     for name, figure in pictures.items():
-        safe = re.sub(r"[^\w.-]+", "_", name)
-        file = Path(folder) / f"{safe}.png"
+        file = Path(folder) / f"{safe_name(name)}.png"
         # Harder compression takes longer than drawing, for a tenth of the size.
         with whole_file(file) as draft:
             figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
