@@ -100,6 +100,20 @@ def test_strain_and_stress_become_what_a_specimen_of_that_size_does(written):
     np.testing.assert_allclose(values[:, 2], [0, 2.0, 5.0])
 
 
+def test_rows_without_times_are_equilibria_of_a_body_without_memory(tmp_path):
+    file = block_problem(tmp_path)
+    untimed = re.sub("^[^,]*,", "", PLAIN, flags=re.MULTILINE)
+    for name in ("first", "second"):
+        (tmp_path / f"{name}.csv").write_text(untimed)
+    np.testing.assert_array_equal(Problem.read(file).experiments[1].t_s, [0, 1, 2])
+    memory = '[[object.prony]]\nname = "prony_1"\n\n[parameters]\nprony_1.share = 0.1\n'
+    file.write_text(SHARED.replace("[parameters]", memory + "prony_1.tau_s = 1.0"))
+    with pytest.raises(
+        InputError, match=r"line 1: the columns are .*; expected t_s and any of x_m"
+    ):
+        Problem.read(file)
+
+
 def test_columns_are_named_where_they_are_not_recognised(written):
     file = written("Takt [s],Kanal 1 (mm),Kanal 2,rest\n0,0,0,5\n1,2,3,5\n")
     moved = read_displacement(file, {"t": "Takt [s]", "displacement": "Kanal 1 (mm)"})

@@ -66,6 +66,17 @@ def test_commands_of_a_page_run(page: Path, checkout: Path):
             words = shlex.split(line)
             outcome = run_command(*words, *SHORT.get(words[0], []))
             assert outcome.code == 0, f"{line}: {outcome.err}"
+            said = re.findall(r"^written to .*$", block, re.MULTILINE)
+            assert said == [each for each in said if each in outcome.out], outcome.out
+
+
+def test_pages_agree_on_how_often_the_verdict_is_right():
+    pages = [ROOT / name for name in ("README.md", "docs/howto/verdict.md", "docs/studies.md")]
+    counts = [
+        re.search(r"(\d+) (?:faultless|were called good).*?none of (\d+)", each.read_text(), re.S)
+        for each in pages
+    ]
+    assert [found and found.groups() for found in counts] == [("201", "211")] * 3
 
 
 def in_a_problem(code: str) -> dict[str, Any]:

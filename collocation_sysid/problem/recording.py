@@ -278,8 +278,8 @@ class RecordingReader:
 
     @property
     def _timed(self) -> bool:
-        """Whether files must tell times: of equilibria rows are enough."""
-        return self.section.kind != "static"
+        """Whether files must tell times: of equilibria without memory rows are enough."""
+        return self.section.kind != "static" or self.body.remembers
 
     def _read_wrench(self, section: WrenchSection, key: str) -> tuple[Array, Array]:
         file, layout = self._file(section, f"{key}.file"), section.layout

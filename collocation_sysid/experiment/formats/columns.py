@@ -89,14 +89,11 @@ class Columns:
     t_s : (T,) array
     values : dict
         (T,) array by the key of each quantity that is there, NaN where missing.
-    notes : tuple of str
-        What was assumed.
     """
 
     grid: Grid
     t_s: Array
     values: Mapping[str, Array]
-    notes: tuple[str, ...] = ()
 
 
 def read_columns(
@@ -138,7 +135,7 @@ def read_columns(
         raise _other_columns(grid, wanted, all_of)
     values = {key: _values(grid, column, blank_allowed) for key, column in found.items()}
     if t is None:
-        return Columns(grid, np.arange(float(len(grid.rows))), values, ("rows count as seconds",))
+        return Columns(grid, np.arange(float(len(grid.rows))), values)
     t_s = _values(grid, t, False)
     if fault := first_time_fault(t_s):
         raise InputError(fault[1], path, f"line {grid.lines[fault[0]]}")
