@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from collocation_sysid.export import TARGETS, Identified, export_run, verify_exp
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.problem import Problem
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -90,6 +92,17 @@ def test_the_json_holds_what_was_identified(run_folder, tmp_path):
     np.testing.assert_allclose(held[:, 2], 0.09)
     poses = np.loadtxt(tmp_path / "out" / "poses_1.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(poses[:, 0], found["grasps"][0]["pose_t_s"])
+
+
+def test_a_run_without_a_guess_is_exported_too(run_folder, tmp_path):
+    folder = Path(shutil.copytree(run_folder, tmp_path / "run"))
+    problem = folder / "problem.toml"
+    problem.write_text(re.sub(r"(?m)^mu_pa .*", "mu_pa = {}", problem.read_text()))
+    assert Problem.read(problem, folder=run_folder.parent).parameters.unguessed == ("mu_pa",)
+    assert run_command("export", folder, "--to", "json", "--out", tmp_path / "out").code == 0
+    (region,) = json.loads((tmp_path / "out" / "identified.json").read_text())["regions"]
+    result = json.loads((folder / "result.json").read_text())
+    assert region["constants"]["mu_pa"] == result["parameters"]["mu_pa"]["value"]
 
 
 def test_mujoco_gets_nodes_cells_and_the_flex(run_folder, tmp_path):

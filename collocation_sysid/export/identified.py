@@ -131,6 +131,8 @@ class Identified:
             parameters, trust = result["parameters"], result["trust"]
             warnings = _warnings(result)
         problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
+        if problem.parameters.free:
+            problem = answer.started(problem)  # which may state no guess itself
         collocation = problem.collocation()
         names = [segment.experiment.name for segment in collocation.segments]
         if experiment is not None and experiment not in names:
