@@ -443,7 +443,7 @@ def run(
     log : callable, optional
         Called with what is being done now, a text.
     seek_causes : bool
-        Whether a misfit's cause is looked for, in 150 sweeps over 100 samples at most.
+        Whether a misfit's cause is looked for, see `likely_causes`.
 
     Raises
     ------

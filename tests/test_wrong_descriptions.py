@@ -19,6 +19,8 @@ from collocation_sysid.experiment import Grasp
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.plausible import odd_material, oddities
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.problem import Problem
 from collocation_sysid.run import run, solve
 from collocation_sysid.statistics.causes import likely_causes
@@ -90,6 +92,66 @@ def test_the_sentence_says_by_how_much_and_which_key(rng):
     (first, *_) = description_causes(FAULTS["poses in mm"](soft("block"), rng))
     assert "0.001 times as large" in first.sentence
     assert 'grasp.length_unit = "mm"' in first.sentence
+
+
+# Names exchanged for a while ----------------------------------------------------------------------
+
+
+def exchanged(problem: Problem, rows: slice, gap: int = 0) -> Problem:
+    """With the names of the first two markers exchanged in some samples, unseen just before."""
+    (experiment,) = problem.experiments
+    tracks = np.array(experiment.markers.positions_m)
+    tracks[rows, :2] = tracks[rows, 1::-1]
+    tracks[rows.start - gap : rows.start, :2] = np.nan
+    return replace(problem, experiments=[with_markers(experiment, tracks)])
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("gap", [0, 5])
+def test_names_exchanged_midway_are_told_with_their_time(name: str, gap: int):
+    given = soft(name)
+    (experiment,) = given.experiments
+    half, names = len(experiment.t_s) // 2, experiment.markers.names
+    (first, *_) = description_causes(exchanged(given, slice(half, None), gap))
+    assert first.cause == "markers-exchanged"
+    assert f"from t = {experiment.t_s[half]:.4g} s on" in first.sentence
+    assert f": {names[0]} is {names[1]}, {names[1]} is {names[0]};" in first.sentence
+
+
+def test_names_exchanged_and_back_are_told_with_both_times():
+    given = soft("bar")
+    t_s = given.experiments[0].t_s
+    (first, *_) = description_causes(exchanged(given, slice(20, 30)))
+    assert f"from t = {t_s[20]:.4g} s to {t_s[29]:.4g} s:" in first.sentence
+
+
+def test_a_short_exchange_is_left_to_hubers_loss():
+    brief = exchanged(soft("bar"), slice(20, 24))
+    assert description_causes(brief)[0].cause == "markers-exchanged"
+    assert description_causes(replace(brief, huber=3.0)) == ()
+
+
+def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
+    solution = solve(exchanged(soft("bar"), slice(20, None)))
+    monkeypatch.setattr("collocation_sysid.statistics.causes.ReducedSpace", None)
+    assert [cause.cause for cause in likely_causes(solution)] == ["markers-exchanged"]
+
+
+def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng):
+    solution, sweeps = solve(FAULTS["marker slips"](soft("block"), rng)), []
+
+    class Counted(ReducedSpace):
+        def __call__(self, *given, **options):
+            found = super().__call__(*given, **options)
+            sweeps.append(found.iterations)
+            return found
+
+    monkeypatch.setattr("collocation_sysid.statistics.causes.ReducedSpace", Counted)
+    monkeypatch.setattr("collocation_sysid.statistics.causes.doubts", lambda *_: ())
+    assert likely_causes(solution)[0].cause == "marker-slip"
+    assert len(sweeps) > 1
+    assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done
+    assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
 
 
 # Sizes and densities ------------------------------------------------------------------------------

@@ -25,5 +25,5 @@ def description_causes(problem: Problem) -> tuple[Cause, ...]:
         for body in problem.bodies
         for oddity in oddities(body)
     ]
-    doubtful = (cause for e in problem.experiments for cause in doubts(e, constants))
+    doubtful = (cause for e in problem.experiments for cause in doubts(e, constants, problem.huber))
     return (*odd, *ranked(doubtful))

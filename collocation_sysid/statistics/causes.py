@@ -23,7 +23,6 @@ from ..experiment.poses import PoseSequence
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..nlp.any_stiffness import Described
-from ..nlp.collocation import Collocation
 from .cause import Cause, ranked
 from .description import Comparison, doubts
 from .mistakes import gravity_mistakes
@@ -38,9 +37,13 @@ NOISE = 1.15
 BETTER = 1.5
 # A marker slips if two means, before and after, explain its residuals so much better than one.
 SLIP = 2.0
-MOST_SAMPLES, MOST_SWEEPS, CLOCK_REFITS = 100, 40, 4
-# Sweeps of all refits together, and the last step of a parameter's logarithm in each.
+MOST_SAMPLES, CLOCK_REFITS = 100, 4
+# A refit may take as many sweeps as the fit took iterations, within these, and all refits together
+# so many times the work of the fit; its last step of a parameter's logarithm may be so long.
+FEWEST_SWEEPS, MOST_SWEEPS, EFFORT = 15, 40, 3
 BUDGET, TOLERANCE = 150, 1e-2
+# A cause without which the misfit falls so much is certain: no other is looked for.
+CERTAIN = 4.0
 SAME_LAG_S = 5e-4
 # Samples before and after a slip at least.
 SHORTEST = 4
@@ -53,14 +56,15 @@ class _Trial:
     experiment: Experiment
 
 
-def likely_causes(found: Run | Solution, budget: int = BUDGET) -> tuple[Cause, ...]:
+def likely_causes(found: Run | Solution, budget: int | None = None) -> tuple[Cause, ...]:
     """What is likely described wrongly, likeliest first; empty where the residuals are noise.
 
     Parameters
     ----------
     found : Run or Solution
-    budget : int
-        Sweeps over the recording's first samples that all refits together may take.
+    budget : int, optional
+        Sweeps over the recording's first samples that all refits together may take; by default
+        three times the work of the fit, 150 at most.
 
     Returns
     -------
@@ -76,15 +80,17 @@ def likely_causes(found: Run | Solution, budget: int = BUDGET) -> tuple[Cause, .
         causes += wrench_causes(solution)
         if max(misfits) <= NOISE:
             return ranked(causes)
-        causes += doubts(worst, solution.parameters)
-        causes += _refitted(_Alone(solution.collocation, budget), worst, solution.parameters)
+        causes += doubts(worst, solution.parameters, solution.collocation.huber)
+        if max((each.strength for each in causes), default=0.0) < CERTAIN:
+            causes += _refitted(solution, worst, budget)
     return ranked(causes)
 
 
-def _refitted(alone: _Alone, experiment: Experiment, constants: Mapping[str, float]) -> list[Cause]:
+def _refitted(solution: Solution, experiment: Experiment, budget: int | None) -> list[Cause]:
     """Causes without which the experiment fits far better."""
-    given = _first_samples(experiment)
-    base = alone.fit(given)
+    given, constants = _first_samples(experiment), solution.parameters
+    alone = _Alone(solution, given, budget)
+    base = solution.readings_m[0] if alone.is_whole else alone.fit(given)
     if base is None:
         return []
     misfit = _misfit(given, base)
@@ -156,17 +162,25 @@ def _step(residual: Array) -> tuple[float, int]:
 
 
 class _Alone:
-    """Fits of one experiment at a time, from the problem's guess, as long as sweeps are left."""
+    """Fits of one experiment at a time, from the problem's guess, as long as sweeps are left.
 
-    def __init__(self, collocation: Collocation, sweeps: int) -> None:
-        self.collocation = collocation
-        self.sweeps = sweeps
+    What the fit itself took bounds them: a mistake undone is no harder to fit than made.
+    """
+
+    def __init__(self, solution: Solution, given: Experiment, sweeps: int | None) -> None:
+        self.collocation = solution.collocation
+        fitted = [segment.experiment for segment in self.collocation.segments]
+        rows = sum(len(experiment.t_s) for experiment in fitted)
+        self.is_whole = len(fitted) == 1 and len(given.t_s) == rows
+        self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
+        work = EFFORT * self.each * rows // len(given.t_s)
+        self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
 
     def fit(self, experiment: Experiment) -> Array | None:
         """Fitted markers (T, M, 3); None where there is no fit."""
         if self.sweeps <= 0:
             return None
-        method = ReducedSpace(max_iterations=min(MOST_SWEEPS, self.sweeps), tolerance=TOLERANCE)
+        method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
         try:
             found = method(replace(self.collocation, experiments=(experiment,)))
         except (InputError, SimulationError):

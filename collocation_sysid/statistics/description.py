@@ -20,6 +20,7 @@ from ..errors import SimulationError
 from ..experiment.experiment import Experiment
 from ..nlp.any_stiffness import Described, Sway
 from .cause import Cause, ranked
+from .exchanges import exchanges
 from .mistakes import mistakes
 from .steps import steps
 
@@ -47,7 +48,9 @@ class Doubt:
     handicap: float = 1.0
 
 
-def doubts(experiment: Experiment, constants: Mapping[str, float]) -> tuple[Cause, ...]:
+def doubts(
+    experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
+) -> tuple[Cause, ...]:
     """What is likely wrong with a recording's description, likeliest first; mostly nothing.
 
     Parameters
@@ -55,12 +58,15 @@ def doubts(experiment: Experiment, constants: Mapping[str, float]) -> tuple[Caus
     experiment : Experiment
     constants : mapping of name to value
         Of the body, any that keep the ratios of stiffness within it.
+    huber : float, optional
+        Of the loss, where it is Huber's.
     """
     if experiment.static or not experiment.markers.names:
         return ()
+    sudden = (*exchanges(experiment, huber), *steps(experiment))
     comparison = Comparison.of(experiment, constants)
     if comparison is None:
-        return steps(experiment)
+        return sudden
     base = comparison.misfit_m(comparison.given)
     found = []
     for doubt in comparison.doubts():
@@ -68,7 +74,7 @@ def doubts(experiment: Experiment, constants: Mapping[str, float]) -> tuple[Caus
         if strength > FAR_BETTER:
             sentence = f"'{experiment.name}': {doubt.said} ({strength:.2g} times nearer)"
             found.append(Cause(doubt.cause, sentence, strength))
-    return ranked([*found, *steps(experiment)])
+    return ranked([*found, *sudden])
 
 
 class Comparison:
