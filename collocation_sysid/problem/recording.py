@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from ..experiment import (
     Grasp,
     Markers,
     MarkerTable,
-    Nuisance,
     PointMass,
     PoseSequence,
     Pressure,
@@ -44,6 +43,7 @@ from ..files import require_regular
 from ..methods.scan import usual_constants
 from ..nlp.parameters import Parameters
 from ..statistics.description import doubts
+from .nuisance_schema import nuisance_of
 from .recording_schema import (
     ExperimentSection,
     ForceSection,
@@ -51,7 +51,6 @@ from .recording_schema import (
     MarkersSection,
     MassSection,
     NodesSection,
-    NuisanceSection,
     PressureSection,
     TableSection,
     TendonSection,
@@ -66,27 +65,6 @@ TIMES = get_args(Change)
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
-
-
-# Fields of `Nuisance`, with the key of their prior, by the keys of the file.
-NUISANCES = {
-    "marker_offsets": {"marker_offset_m": "prior_m"},
-    "time_shift": {"time_shift_s": "prior_s"},
-    "gravity": {"gravity_rad": "prior_rad"},
-    "hand_eye": {"hand_eye_m": "prior_m", "hand_eye_rad": "prior_rad"},
-    "joining": {"joining_s": "prior_s"},
-    "pose": {"pose_shift_m": "prior_m", "pose_turn_rad": "prior_rad"},
-    "displacement_zero": {"displacement_zero_m": "prior_m"},
-    "camera_offsets": {"camera_offset_m": "prior_m"},
-    "tare": {"tare": "prior_sigmas"},
-    "sensor_time": {"sensor_time_s": "prior_s"},
-    "sensor_lag": {"sensor_lag_s": "prior_s"},
-    "tool": {"tool_kg": "prior_kg", "tool_m": "prior_m"},
-    "tension_factor": {"tension_factor": "prior"},
-    "tension_lost": {"tension_lost_n": "prior_n"},
-    "pressure_factor": {"pressure_factor": "prior"},
-    "pressure_lost": {"pressure_lost_pa": "prior_pa"},
-}
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
@@ -179,7 +157,7 @@ class RecordingReader:
                 forces=forces,
                 tendons=tendons,
                 pressures=pressures,
-                nuisance=_nuisance(section.nuisance),
+                nuisance=nuisance_of(section.nuisance),
             )
 
         n = len(self.body.nodes_m)
@@ -466,20 +444,6 @@ class RecordingReader:
         if not self.simulation:
             refuse_other_scale(experiment, usual_constants(self.parameters))
         return experiment
-
-
-def _nuisance(section: NuisanceSection | Literal["none"]) -> Nuisance:
-    """The defaults, with what the table says otherwise."""
-    if section == "none":
-        return Nuisance.none()
-    found: dict[str, float | None] = {}
-    for key, fields in NUISANCES.items():
-        given = getattr(section, key)
-        if given == "none":
-            found |= dict.fromkeys(fields)
-        elif given is not None:
-            found |= {field: getattr(given, prior) for field, prior in fields.items()}
-    return Nuisance(**found)
 
 
 def _among(at_s: Array, t_s: Array) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array
 from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text, Whole
 from ..experiment.poses import QUATERNION_NORM_TOLERANCE
+from .nuisance_schema import NuisanceOrNone, NuisanceSection
 from .section import Corner, Section, Unit, Vector, given_keys, require_one
 
 
@@ -434,195 +435,6 @@ class PressureSection(Section):
         return self
 
 
-class LengthPrior(Section):
-    """How well a length is known."""
-
-    prior_m: Positive = Field(description="Standard deviation [m].")
-
-
-class TimePrior(Section):
-    """How well a time is known."""
-
-    prior_s: Positive = Field(description="Standard deviation [s].")
-
-
-class AnglePrior(Section):
-    """How well a direction is known."""
-
-    prior_rad: Positive = Field(description="Standard deviation [rad].")
-
-
-class TarePrior(Section):
-    """How well the zero of a sensor is known."""
-
-    prior_sigmas: Positive = Field(description="Standard deviation, in sigma_n and sigma_nm.")
-
-
-class ToolPrior(Section):
-    """How well it is known what a sensor carries beside the body."""
-
-    prior_kg: Positive = Field(description="Standard deviation of its mass, about zero [kg].")
-    prior_m: Positive = Field(
-        0.05, description="Standard deviation of each coordinate of its centre [m]."
-    )
-
-
-class SharePrior(Section):
-    """How well a factor near one is known."""
-
-    prior: Positive = Field(description="Standard deviation, such as 0.05.")
-
-
-class TensionPrior(Section):
-    """How well it is known what friction takes of a tension."""
-
-    prior_n: Positive = Field(description="Standard deviation [N].")
-
-
-class PressurePrior(Section):
-    """How well the zero of a pressure is known."""
-
-    prior_pa: Positive = Field(description="Standard deviation [Pa].")
-
-
-class PosePrior(Section):
-    """How well a pose is known; what is left out is taken as exact."""
-
-    prior_rad: Positive | None = Field(None, description="Standard deviation of a turn [rad].")
-    prior_m: Positive | None = Field(None, description="Standard deviation of a shift [m].")
-
-    @model_validator(mode="after")
-    def _some(self) -> PosePrior:
-        if not given_keys(self, "prior_rad", "prior_m"):
-            raise ValueError("found neither prior_rad nor prior_m; expected one or both")
-        return self
-
-
-def _nuisance_form(value: Any) -> str:
-    return "<none>" if isinstance(value, str) else "<table>"
-
-
-OffOrLength = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[LengthPrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrTime = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[TimePrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrAngle = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[AnglePrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrPose = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[PosePrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-
-
-OffOrTare = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[TarePrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrTool = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[ToolPrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrShare = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[SharePrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrTension = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[TensionPrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-OffOrPressure = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[PressurePrior, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-
-
-class NuisanceSection(Section):
-    """What is estimated of this recording alone, each with a prior around zero.
-
-    The first five are estimated unless they are "none", and where a wrench is measured tare and
-    sensor_time.
-    """
-
-    marker_offsets: OffOrLength | None = Field(
-        None,
-        description="Errors of the places given in reference_m, which turn with the body: prior_m, "
-        "1 mm by default.",
-    )
-    time_shift: OffOrTime | None = Field(
-        None,
-        description="How much later than their times say markers were seen, on the grasps' clock: "
-        "prior_s, 5 ms by default.",
-    )
-    gravity: OffOrAngle | None = Field(
-        None, description="A tilt of the direction of gravity: prior_rad, 1 degree by default."
-    )
-    hand_eye: OffOrPose | None = Field(
-        None,
-        description="A constant motion of the body in its grasps: prior_rad, prior_m; 0.5 degrees "
-        "and 1 mm by default.",
-    )
-    joining: OffOrTime | None = Field(
-        None,
-        description="How much later than stated each point mass or force joins or leaves, where it "
-        "does so within the recording: prior_s, 10 ms by default.",
-    )
-    pose: OffOrPose | None = Field(
-        None,
-        description="A constant rigid correction of grasps and body in the cameras' frame: "
-        "prior_rad, prior_m.",
-    )
-    displacement_zero: OffOrLength | None = Field(
-        None,
-        description="A constant offset of each displacement along each of its axes: prior_m, "
-        "0.1 mm by default.",
-    )
-    camera_offsets: OffOrLength | None = Field(
-        None, description="A constant offset of every marker in the cameras' frame: prior_m."
-    )
-    tare: OffOrTare | None = Field(
-        None,
-        description="A constant offset of every component of a wrench: prior_sigmas, 10 by "
-        "default.",
-    )
-    sensor_time: OffOrTime | None = Field(
-        None,
-        description="How much later than their times say wrenches were measured: prior_s, 5 ms by "
-        "default.",
-    )
-    sensor_lag: OffOrTime | None = Field(
-        None, description="Time constant of a first-order low-pass in the sensor: prior_s."
-    )
-    tool: OffOrTool | None = Field(
-        None,
-        description="A mass between sensor and body, and its centre about point_m: prior_kg, "
-        "prior_m.",
-    )
-    tension_factor: OffOrShare | None = Field(
-        None, description="A factor on the tension of each tendon, about one: prior."
-    )
-    tension_lost: OffOrTension | None = Field(
-        None, description="Tension of each tendon that friction takes: prior_n."
-    )
-    pressure_factor: OffOrShare | None = Field(
-        None, description="A factor on each pressure, about one: prior."
-    )
-    pressure_lost: OffOrPressure | None = Field(
-        None, description="An offset that each pressure lacks: prior_pa."
-    )
-
-
-NuisanceOrNone = Annotated[
-    Annotated[Literal["none"], Tag("<none>")] | Annotated[NuisanceSection, Tag("<table>")],
-    Discriminator(_nuisance_form),
-]
-
-
 def _grasp_form(value: Any) -> str:
     return "<several>" if isinstance(value, list) else "<one>"
 
@@ -720,9 +532,8 @@ class ExperimentSection(Section):
         if self.kind == "dynamic":
             return self
         moving = [key for key in ("start", "start_rule", "resample_hz") if self._differs(key)]
-        if isinstance(self.nuisance, NuisanceSection) and isinstance(
-            self.nuisance.time_shift, TimePrior
-        ):
+        shift = getattr(self.nuisance, "time_shift", None)
+        if isinstance(shift, Section):
             moving.append("nuisance.time_shift")
         if moving:
             raise ValueError(
