@@ -454,6 +454,8 @@ def run(
     found = _checked(problem, solve(problem, method, watch, start, scheduler), say)
     if problem.substeps == "auto":
         found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
+        if found.solution.status is Status.INTERRUPTED:
+            return found
     substeps = found.solution.collocation.substeps
     turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
     found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
@@ -526,20 +528,29 @@ def _fine_enough(
     why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
+    status, message = Status.INTERRUPTED, "it was interrupted"
     try:
         require_memory(problem, again, solver)
         positions, failure = marched(again, p)
         if failure is not None:
             raise failure
+        with workers_of(scheduler) as workers:
+            shared = _shared(solver, workers)
+            finer = _read_where_found(shared, again, watch, again.pack(p, positions))
+        status, message = finer.status, finer.message
     except (InputError, SimulationError) as error:
-        return replace(
-            coarse, notes=(f"{why}; {substeps} are not possible: {error}", *coarse.notes)
-        )
-    with workers_of(scheduler) as workers:
-        finer = _read_where_found(_shared(solver, workers), again, watch, again.pack(p, positions))
-    if not finer.status.converged and finer.status is not Status.INTERRUPTED:
-        note = f"{why}; with {substeps} it was not solved ({finer.message})"
-        return replace(coarse, notes=(note, *coarse.notes))
+        status, message = Status.NOT_SIMULABLE, str(error)
+    except KeyboardInterrupt:
+        pass  # the first answer is whole
+    if not status.converged:
+        note = f"{why}; with {substeps} it was not solved: {message}"
+        coarse = replace(coarse, notes=(note, *coarse.notes))
+        if status is Status.INTERRUPTED:
+            said = (
+                f"Interrupted while {substeps} steps a sample were tried: this is what one finds."
+            )
+            first = replace(first, status=status, message=said)
+        return replace(coarse, solution=first)
     most = ", the most that are chosen," if substeps == MOST_SUBSTEPS else ""
     said = f"{why}; so it was solved again with {substeps}{most} in {finer.timing.total:.2g} s"
     return _checked(problem, finer.after(first, said), say)

@@ -130,16 +130,33 @@ def test_there_are_no_more_than_the_most():
     assert Refinement({"mu_pa": error}).substeps(nothing, order) == 1
 
 
-def test_the_first_answer_counts_where_the_finer_is_not_found():
-    def once(collocation, watch=None, start=None):
+def fails_at_finer_steps(how: BaseException | cs.Status) -> Method:
+    def method(collocation, watch=None, start=None):
         solution = cs.ReducedSpace()(collocation, watch, start)
-        lost = replace(solution, status=cs.Status.STALLED)
-        return solution if collocation.substeps == 1 else lost
+        if collocation.substeps == 1:
+            return solution
+        if isinstance(how, cs.Status):
+            return replace(solution, status=how)
+        raise how
 
-    kept = run(twin(3e-4), once)
+    return method
+
+
+@pytest.mark.parametrize("how", [cs.Status.STALLED, cs.SimulationError("it burst", 0.1)])
+def test_the_first_answer_counts_where_the_finer_is_not_found(how):
+    kept = run(twin(3e-4), fails_at_finer_steps(how), seek_causes=False)
     assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
     assert kept.solution.status.converged
     assert any("it was not solved" in note for note in kept.notes)
+
+
+@pytest.mark.parametrize("how", [cs.Status.INTERRUPTED, KeyboardInterrupt()])
+def test_an_interrupt_at_finer_steps_leaves_the_first_answer_and_says_so(how):
+    kept = run(twin(3e-4), fails_at_finer_steps(how))
+    assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
+    assert kept.solution.status is cs.Status.INTERRUPTED
+    assert "what one finds" in kept.solution.message
+    assert holds(kept.interval("mu_pa"), TRUTH["mu_pa"])
 
 
 def test_live_estimates_take_one_step_where_none_are_stated():

@@ -96,7 +96,7 @@ sigma_m = 0.001                # standard deviation of a coordinate
 
 [transcription]
 scheme = "midpoint"            # or "bdf2", "backward-euler"
-# substeps = 2                 # grid steps between samples; as many as the error bars ask for
+# substeps = 2                 # grid steps between samples; by default what error bars ask for
 
 [solver]
 method = "reduced-space"       # or "interior-point", "shooting", ...

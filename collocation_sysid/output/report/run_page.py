@@ -32,7 +32,7 @@ CAPTIONS = {
     "wrench": "Wrench of a grasp: measured, fitted and rolled out.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
-    "confidence": "95 % confidence ellipses of pairs of parameters.",
+    "confidence": "95 % confidence ellipses of pairs of parameters, for the noise.",
     "correlation": "Correlation of the estimates.",
     "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
     "scan": "Scan of the stiffness for a start: misfit of the first part of the recordings.",
