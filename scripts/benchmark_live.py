@@ -22,7 +22,7 @@ import numpy as np
 from twins import SOFT, twin
 
 from collocation_sysid.live import Estimator, Frame, LiveOptions
-from collocation_sysid.live.sources import recorded
+from collocation_sysid.live.sources import collected_before, recorded
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
@@ -75,12 +75,13 @@ def _noisy(name: str) -> Problem:
 
 def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame]) -> None:
     took, again = [], []
-    for frame in frames:
-        update = live.take(frame)
-        took.append(update.latency_s)
-        again.append(update.relinearised)
-        if abs(frame.t_s - EARLY_S) < 1e-6:
-            early = update
+    with collected_before():
+        for frame in frames:
+            update = live.take(frame)
+            took.append(update.latency_s)
+            again.append(update.relinearised)
+            if abs(frame.t_s - EARLY_S) < 1e-6:
+                early = update
     settled, row_s = live.settle() or update, _row_s(problem)
     median, late = 1e3 * np.percentile(took, [50, 99])
     print(f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again")

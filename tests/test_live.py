@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import socket
@@ -220,6 +221,29 @@ def test_rows_are_begun_that_end_in_time():
         pace.forget()
     assert pace.rows(4.1) == 3
     assert Pace().rows(1e-3) == 1
+
+
+def test_rows_leave_time_for_what_follows_them():
+    pace = Pace.of(one_s=2.0, many_s=9.0, many=8)
+    pace.ended(1.0)
+    pace.ended(0.2)
+    assert [pace.rows(left_s) for left_s in (0.9, 2.9, 3.1, 5.1)] == [0, 0, 1, 3]
+    for _ in range(60):
+        pace.ended(0.0)
+    assert pace.rows(2.5) == 1
+
+
+def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
+    frozen, take = [], Estimator.take
+
+    def counted(live: Estimator, frame: Frame) -> Update:
+        frozen.append(gc.get_freeze_count())
+        return take(live, frame)
+
+    monkeypatch.setattr(Estimator, "take", counted)
+    assert run_command("replay", "problem.toml", "--rate", 0, "--json").code == 0
+    assert min(frozen) > 10_000
+    assert gc.get_freeze_count() == 0
 
 
 def test_an_update_of_the_triangle_is_the_sum_of_the_normal_equations(rng):

@@ -58,7 +58,7 @@ def live(
     out, and the exit code is 2 then. An empty datagram ends.
     """
     from ..live.frames import FrameReader
-    from ..live.sources import as_json, as_text, datagrams
+    from ..live.sources import as_json, as_text, collected_before, datagrams
 
     estimator = _estimator(problem, set_, allow_code, budget_ms, window_s)
 
@@ -70,15 +70,16 @@ def live(
         lines, source = datagrams(udp, opened), f"UDP port {udp}"
     reader = FrameReader(estimator.model.moved_grasps + 1, estimator.names, source)
     bad = 0
-    for line in lines:
-        try:
-            frame = reader.read(line)
-        except InputError as error:
-            bad += 1
-            errors.print(Text(f"error: {error}"), soft_wrap=True)
-            continue
-        if frame is not None:
-            typer.echo(as_json(estimator.take(frame)))
+    with collected_before():
+        for line in lines:
+            try:
+                frame = reader.read(line)
+            except InputError as error:
+                bad += 1
+                errors.print(Text(f"error: {error}"), soft_wrap=True)
+                continue
+            if frame is not None:
+                typer.echo(as_json(estimator.take(frame)))
     if (settled := estimator.settle()) is not None:
         typer.echo(as_json(settled))
     if bad:
@@ -117,7 +118,7 @@ def replay(
 
     from ..live import view
     from ..live.sources import as_json as json_line
-    from ..live.sources import paced, recorded
+    from ..live.sources import collected_before, paced, recorded
 
     if rate is not None and not 0 <= rate < float("inf"):
         raise InputError(f"found {rate:g}; expected a number, 0 or more", None, "--rate")
@@ -131,7 +132,7 @@ def replay(
     updates = []
     watched = errors.is_terminal and not quiet and not as_json
     shown = Live(console=errors, refresh_per_second=10)
-    with shown if watched else nullcontext():
+    with collected_before(), shown if watched else nullcontext():
         for frame in paced(frames, pace) if pace else frames:
             updates.append(estimator.take(frame))
             if as_json:

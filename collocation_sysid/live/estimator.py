@@ -20,7 +20,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..checked import AtLeastOne, Positive
@@ -155,9 +154,9 @@ class Estimator:
         self.problem, self.options, self.clock = problem, options, clock
         self.model = Model.of(problem)
         model, self.names = self.model, self.model.experiment.markers.names
-        self._reach_m = FAR * model.size_m
-        around = model.samples_around
-        self.intake = Intake(model.interval_s, model.substeps, around, self._reach_m)
+        far_m, around = FAR * model.size_m, model.samples_around
+        self._reach_m = far_m + float(np.linalg.norm(model.segment.body.nodes_m.mean(axis=0)))
+        self.intake = Intake(model.interval_s, model.substeps, around, far_m)
         self.counts, self.samples = self.intake.counts, 0
         self.budget_s = options.budget_s or SHARE * model.interval_s
         self.rows = options.rows
@@ -169,7 +168,7 @@ class Estimator:
         self.prior = Information.none(model.size)
         self.track: Track | None = None
         self._newest = Newest(self.prior, [], [])
-        self._carried_m = np.full((1, 3), np.nan)
+        self._held_m = np.full((1, 3), np.nan)
         self.again: Track | None = None
         self.log: list[LoggedRow] = []
         self.search = self._search() if problem.parameters.unguessed else None
@@ -234,10 +233,12 @@ class Estimator:
             self._turn(self.track, self.track, began, TURN_FIRST)
         self.pace.frame_s = self.clock() - before
         done = self._pass_again(began, notes, caught)
+        before = self.clock()
         self._shorten()
         near = np.concatenate([*squares, np.zeros(0)])
         rms_m = float(np.sqrt(near.mean())) if len(near) else float("nan")
         estimates, trust = self._known(frame.t_s)
+        self.pace.ended(self.clock() - before)
         latency_s = self.clock() - began
         self.last = Update(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
         return self.last
@@ -297,10 +298,8 @@ class Estimator:
             if self.counts["with a wrench"] == 1:
                 notes.append("wrenches are not read: live takes poses and markers")
         if frame.pose is not None:
-            positions_m, quaternions = frame.pose
-            middle_m = self.model.segment.body.nodes_m.mean(axis=0)
-            self._carried_m = Rotation.from_quat(quaternions).apply(middle_m) + positions_m
-        away_m = np.linalg.norm(frame.tracks_m[:, None] - self._carried_m, axis=2)
+            self._held_m = frame.pose[0]
+        away_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
         nowhere = (away_m > self._reach_m).all(axis=1)
         if nowhere.any():

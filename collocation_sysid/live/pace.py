@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 # What is left after a frame of the longest delay: rows are not begun that might not end within the
-# budget, and one that took long by chance is forgotten.
-FADING = 0.85
+# budget, and one that took long by chance is forgotten. What some frames take only, later.
+FADING, SELDOM = 0.85, 0.97
 
 
 @dataclass
@@ -23,6 +23,8 @@ class Pace:
         Of a pass to turn to another p.
     frame_s : float
         Of the last frame without rows that are passed again; its user sets it.
+    after_s : float
+        Of what follows the rows of a frame.
     """
 
     first_s: float = 0.0
@@ -30,6 +32,7 @@ class Pace:
     delay: float = 1.0
     turn_s: float = 0.0
     frame_s: float = 0.0
+    after_s: float = 0.0
 
     @classmethod
     def of(cls, one_s: float, many_s: float, many: int) -> Pace:
@@ -39,6 +42,7 @@ class Pace:
 
     def rows(self, left_s: float) -> int:
         """How many there is time for."""
+        left_s -= self.after_s
         spare_s = left_s / self.delay - self.first_s
         if left_s <= 0 or spare_s < 0:
             return 0
@@ -53,6 +57,10 @@ class Pace:
     def turned(self, took_s: float) -> None:
         """Note how long a turn took."""
         self.turn_s = max(self.turn_s, took_s)
+
+    def ended(self, took_s: float) -> None:
+        """Note how long what followed the rows took; not every frame has all of it."""
+        self.after_s = max(SELDOM * self.after_s, took_s)
 
     def forget(self) -> None:
         """Begin another frame."""

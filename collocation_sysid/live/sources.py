@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +96,20 @@ def paced(
         if left_s > 0:
             wait(left_s)
         yield frame
+
+
+@contextmanager
+def collected_before() -> Iterator[None]:
+    """Nothing that is there before frames come is looked through for garbage while they do.
+
+    A collection of all objects takes longer than some frames.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def as_json(update: Update) -> str:
