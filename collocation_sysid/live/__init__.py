@@ -2,5 +2,6 @@
 
 from .estimator import Estimator, LiveOptions, Update
 from .frames import Frame, FrameReader
+from .sources import collected_before
 
-__all__ = ["Estimator", "Frame", "FrameReader", "LiveOptions", "Update"]
+__all__ = ["Estimator", "Frame", "FrameReader", "LiveOptions", "Update", "collected_before"]
