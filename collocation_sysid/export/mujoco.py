@@ -69,10 +69,10 @@ def _limits(body: Identified) -> list[str]:
                 f"{region.name}: a flex is St. Venant and Kirchhoff's; {region.material} has "
                 "the same E and ν at small strain, another stress from its second order on"
             )
-        if region.damping == "rayleigh" and region.gamma_r_s:
+        if region.gamma_r_s:
             said.append(
-                f"{region.name}: the damping of a flex is Kelvin and Voigt's, here Rayleigh's: the "
-                "same at small strain and slow turns"
+                f"{region.name}: the damping of a flex is γ_r times the rate of its second "
+                f"Piola–Kirchhoff stress, which is that of {region.damping} at small strain"
             )
         if region.gamma_m_1_s:
             said.append(

@@ -167,11 +167,11 @@ def _form(value: Any) -> str:
 
 
 @cache
-def _prior(*keys: str) -> type[Section]:
-    if len(keys) > 1:
-        return ToolPrior if "prior_kg" in keys else PosePrior
-    name, known, what = PRIORS[keys[0]]
-    fields: dict[str, Any] = {keys[0]: (Positive, Field(description=what))}
+def _prior(key: str, *others: str) -> type[Section]:
+    if others:
+        return ToolPrior if key == "prior_kg" else PosePrior
+    name, known, what = PRIORS[key]
+    fields: dict[str, Any] = {key: (Positive, Field(description=what))}
     return create_model(f"{name}Prior", __base__=Section, __doc__=f"How well {known}.", **fields)
 
 
