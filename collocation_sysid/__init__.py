@@ -6,9 +6,11 @@
 >>> run.parameters, run.interval("mu_pa")             # doctest: +SKIP
 """
 
+from . import starting as _starting  # noqa: F401  (before all that takes time to import)
+
+# isort: split
 from importlib.metadata import version
 
-from . import starting as _starting  # noqa: F401  (before all that takes time to import)
 from .errors import InputError, SimulationError
 from .experiment import (
     Experiment,

@@ -100,7 +100,7 @@ def refinement_of(
 
 def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
     solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
-    if not solution.status.converged:
+    if not solution.unless_interrupted().status.converged:
         raise InputError(
             f"the problem with the {what} was not solved ({solution.status.value}: "
             f"{solution.message}); solve it by itself to see why"

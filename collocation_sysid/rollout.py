@@ -55,10 +55,7 @@ class Rollout:
 def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
     """Those of all experiments by their names, see `roll_out`."""
     threads = solution.collocation.threads
-    try:
-        found = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
-    except KeyboardInterrupt:  # the answer itself is there, and worth writing
-        found = ["interrupted"] * len(problem.experiments)
+    found = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
     return {e.name: each for e, each in zip(problem.experiments, found, strict=True)}
 
 
@@ -118,7 +115,9 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     )
     (segment,) = alone.segments
     # All that is left to estimate is φ.
-    return segment, alone.parameters_of(ReducedSpace()(alone).z) if alone.nphi else np.zeros(0)
+    if not alone.nphi:
+        return segment, np.zeros(0)
+    return segment, alone.parameters_of(ReducedSpace()(alone).unless_interrupted().z)
 
 
 def step_error(

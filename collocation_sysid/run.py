@@ -83,6 +83,8 @@ class Run:
     refinement : Refinement or None
         What the discretisation does: solved again where that was asked for, else what the step
         does, to first order, from roll-outs with a finer one; None where these are missing.
+    missing : str
+        What Ctrl-C left out after there was an answer.
     """
 
     problem: Problem
@@ -94,6 +96,7 @@ class Run:
     notes: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
     refinement: Refinement | None = None
+    missing: str = ""
 
     def __str__(self) -> str:
         return self.table()
@@ -159,7 +162,10 @@ class Run:
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
         numerical = numerical_concerns(self.estimates, self.refinement)
-        return Trust.of((*cause_concerns(self.causes), *found, *numerical))
+        if not self.missing:
+            return Trust.of((*cause_concerns(self.causes), *found, *numerical))
+        interrupted = (f"interrupted: {self.missing}", "doubtful")
+        return Trust.of((interrupted, *(found if self.uncertainty is not None else ())))
 
     @cached_property
     def motions(self) -> dict[str, Motion]:
@@ -388,7 +394,8 @@ def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | 
         return None, lost
     again = placed_at_guess(replace(lost.collocation, parameters=scan.parameters))
     found = _read_where_found(solver, again, watch)
-    return (scan, found) if found.status.converged else (None, lost)
+    ended = found.status.converged or found.status is Status.INTERRUPTED
+    return (scan, found) if ended else (None, lost)
 
 
 def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Solution:
@@ -399,6 +406,8 @@ def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Sol
     again = placed_at_guess(replace(first.collocation, parameters=other))
     second = _read_where_found(solver, again, watch)
     gain = first.history[-1].loss - second.history[-1].loss
+    if second.status is Status.INTERRUPTED:
+        return replace(first, status=second.status, message=second.message)
     if not second.status.converged or gain <= NOTICEABLE:
         return first
     note = (
@@ -435,6 +444,8 @@ def run(
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
 
+    Once there is an answer, Ctrl-C ends what comes after it: `Run.missing` says what is left out.
+
     Parameters
     ----------
     problem : Problem
@@ -451,23 +462,30 @@ def run(
         As `solve` does.
     """
     say = log or (lambda _: None)
-    found = _checked(problem, solve(problem, method, watch, start, scheduler), say)
-    if problem.substeps == "auto":
-        found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
-        if found.solution.status is Status.INTERRUPTED:
+    found = Run(problem, solve(problem, method, watch, start, scheduler), {}, None)
+    missing = "no forward simulation has checked the answer, and there are no error bars"
+    try:
+        found = _checked(problem, found.solution, say)
+        missing = "what comes after the error bars is left out, such as causes of the misfit"
+        if problem.substeps == "auto":
+            found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
+            if found.solution.status is Status.INTERRUPTED:
+                return found
+        substeps = found.solution.collocation.substeps
+        turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
+        found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
+        if not seek_causes:
             return found
-    substeps = found.solution.collocation.substeps
-    turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
-    found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
-    if not seek_causes:
-        return found
-    say("looking for causes of the misfit")
-    found = replace(found, causes=likely_causes(found.solution))
-    if problem.uncertainty.numerical and found.uncertainty is not None:
-        from .refine import refine  # which solves, as this module does
+        say("looking for causes of the misfit")
+        found = replace(found, causes=likely_causes(found.solution))
+        if problem.uncertainty.numerical and found.uncertainty is not None:
+            from .refine import refine  # which solves, as this module does
 
-        return refine(found, say=say)
-    return found
+            return refine(found, say=say)
+        return found
+    except KeyboardInterrupt:
+        unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
+        return replace(found, rollouts=unsimulated | dict(found.rollouts), missing=missing)
 
 
 def _checked(problem: Problem, solution: Solution, say: Log) -> Run:

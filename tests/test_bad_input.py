@@ -78,6 +78,24 @@ def raised_markers(folder: Path) -> None:
     np.savetxt(folder / MARKERS, table, delimiter=",", header=head, comments="")
 
 
+def cut_start(file: str, count: int) -> Edit:
+    def edit(folder: Path) -> None:
+        head, *rows = (folder / file).read_text().splitlines()
+        (folder / file).write_text("\n".join([head, *rows[count:]]))
+
+    return edit
+
+
+def times_1000(file: str) -> Edit:
+    def edit(folder: Path) -> None:
+        head, *rows = (folder / file).read_text().splitlines()
+        cells = [row.partition(",") for row in rows]
+        scaled = [f"{1000 * float(t):g},{rest}" for t, _, rest in cells]
+        (folder / file).write_text("\n".join([head, *scaled]))
+
+    return edit
+
+
 def blank_markers(folder: Path) -> None:
     head, *rows = (folder / MARKERS).read_text().splitlines()
     blank = [row.split(",")[0] + "," * head.count(",") for row in rows]
@@ -363,6 +381,27 @@ POSE_FILES = [
     bad(
         "quaternion-not-unit", f"{POSES}: line 5", "t_s = 0.03", "norm 0.5", "x, y, z, w",
         edit=replace_cell(POSES, 5, 7, "0.5"),
+    ),
+    bad(
+        "one-pose-of-a-motion", f"{POSES}: holds one pose", "0 s to 0.08 s", "the same pose at",
+        edit=keep_lines(POSES, 2),
+    ),
+    bad(
+        "poses-over-half-the-recording", f"{POSES}: the poses run from 0 s to 0.03 s",
+        "the recording lasts from 0 s to 0.08 s", "add rows", "window_s = [0, 0.03]",
+        edit=keep_lines(POSES, 5),
+    ),
+    bad(
+        "poses-that-begin-late", f"{POSES}: the poses run from 0.03 s", "window_s = [0.03, 0.08]",
+        edit=cut_start(POSES, 3),
+    ),
+    bad(
+        "poses-in-milliseconds", f"{POSES}: the poses move and are 10 s apart", "milliseconds",
+        edit=times_1000(POSES),
+    ),
+    bad(
+        "a-recording-in-milliseconds", f"{POSES}: the poses move and are 10 s apart",
+        edit=both(times_1000(POSES), times_1000(MARKERS)),
     ),
     bad(
         "time-runs-backwards", f"{POSES}: line 5", "0.01 follows 0.02", "increase",

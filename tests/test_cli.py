@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +38,7 @@ from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 
-ROLLOUT = import_module("collocation_sysid.rollout")
+ROLLOUT, RUN = (import_module(f"collocation_sysid.{name}") for name in ("rollout", "run"))
 RESULT_KEYS = {
     "schema": set(),
     "status": set(),
@@ -241,10 +242,46 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
 
     monkeypatch.setattr(ROLLOUT, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
-    assert "roll-out 'swing': failed: interrupted" in outcome.out
+    assert outcome.code == 130
+    assert "Verdict: doubtful\n  interrupted: no forward simulation has checked" in outcome.out
     result = result_in(tiny / "run")
     assert result["status"] == "converged"
     assert result["rollout"]["rms_m"] is None
+    assert "no error bars" in result["missing"]
+
+
+@pytest.mark.parametrize("late", ["likely_causes", "_profiles"])
+def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
+    def interrupt(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(RUN, late, interrupt)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 130
+    assert "interrupted: what comes after the error bars is left out" in outcome.out
+    result = result_in(tiny / "run")
+    assert result["trust"]["verdict"] == "doubtful"
+    assert result["rollout"]["rms_m"] is not None
+    assert run_command("report", "run").code == 0
+
+
+def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch):
+    found = []
+
+    def solved(solver, collocation, watch, start=None):
+        solution = RUN.ReducedSpace()(collocation, watch, start)
+        status = solution.status if not found else RUN.Status.INTERRUPTED
+        found.append(replace(solution, status=status))
+        return found[-1]
+
+    monkeypatch.setattr(RUN, "_read_where_found", solved)
+    monkeypatch.setattr(RUN, "second_start", lambda first: first.collocation.parameters)
+    method = settings("solver.method=reduced-space")
+    outcome = run_command("solve", "problem.toml", *method, "--out", "run")
+    assert (outcome.code, len(found)) == (130, 2)
+    result = result_in(tiny / "run")
+    assert result["status"] == "interrupted"
+    assert result["parameters"]["mu_pa"]["value"] == found[0].parameters["mu_pa"]
 
 
 def test_a_real_process_keeps_its_streams_apart(tiny):
@@ -488,7 +525,7 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
     for live, lines in ((True, 4), (False, 1)):
         file = io.StringIO()
         shown = Console(file=file, force_terminal=live, width=40, color_system=None)
-        monkeypatch.setattr(common, "Console", lambda shown=shown, **_: shown)
+        monkeypatch.setattr(common, "PlainConsole", lambda shown=shown, **_: shown)
         common.show(Text(words))
         found = file.getvalue().splitlines()
         assert len(found) == lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -157,18 +158,75 @@ import os, signal, sys
 sys.argv = ["collocation-sysid"]
 class Interrupting:
     def find_spec(self, name, path=None, target=None):
-        if name == "casadi":
+        if name == {name!r}:
             os.kill(os.getpid(), signal.SIGINT)
+for name in [each for each in sys.modules if each.startswith("importlib.metadata")]:
+    del sys.modules[name]
 sys.meta_path.insert(0, Interrupting())
 import collocation_sysid
 """
+COMMANDED = """
+import os, signal, sys
+from collocation_sysid import cli
+def interrupted(app):
+    os.kill(os.getpid(), signal.SIGINT)
+cli.get_command = interrupted
+cli.main()
+"""
+# As a factorisation would that takes minutes, this solver hears of no signal.
+DEAF = """
+import os, signal, sys, threading, time
+from collocation_sysid import cli
+from collocation_sysid.methods import nlpsol
+from collocation_sysid.output import record
+record._write_pictures = lambda *_: None
+sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
+def end():
+    for _ in range({times}):
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.{name})
+def deaf(**_):
+    threading.Thread(target=end).start()
+    time.sleep(600)
+nlpsol._nlpsol = lambda *_: deaf
+nlpsol.GRACE_S = 0.2 if {times} == 1 else 600
+cli.main()
+"""
+
+
+def ended(program: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
+    )
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_an_interrupt_while_modules_are_imported_says_nothing():
-    done = subprocess.run([sys.executable, "-c", STARTED], capture_output=True, text=True)
+@pytest.mark.parametrize("name", ["importlib.metadata", "casadi"])
+def test_an_interrupt_while_modules_are_imported_says_nothing(name: str):
+    done = ended(STARTED.format(name=name))
     assert done.returncode == -signal.SIGINT
     assert done.stderr == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_nor_does_one_while_the_commands_are_built():
+    done = ended(COMMANDED)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_solver_that_hears_no_signal_is_left_behind(tiny: Path):
+    done = ended(DEAF.format(name="SIGTERM", times=1))
+    assert (done.returncode, done.stderr) == (130, "")
+    result = json.loads((tiny / "run" / "result.json").read_text())
+    assert result["status"] == "interrupted"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_two_signals_end_it_at_once(tiny: Path):
+    done = ended(DEAF.format(name="SIGINT", times=2))
+    assert (done.returncode, done.stderr) == (130, "")
+    assert not (tiny / "run").exists()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

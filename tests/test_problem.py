@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -323,13 +324,55 @@ def test_resampling_above_the_measured_rate_is_noted(tiny):
     assert "resample_hz is above the markers' own rate" in above
 
 
-def test_a_recording_is_cut_to_what_its_poses_cover_and_says_so(tiny):
+def test_the_window_that_a_message_gives_cuts_a_recording_to_its_poses(tiny):
     keep_lines(POSES, 7)(tiny)
-    problem = load(tiny)
+    with pytest.raises(InputError, match=r"run from 0 s to 0\.05 s") as caught:
+        load(tiny)
+    (window,) = re.findall(r"window_s = (\[.*\])", str(caught.value))
+    problem = load(tiny, f"experiment.0.window_s={window}")
     np.testing.assert_allclose(problem.experiments[0].t_s, 0.01 * np.arange(6))
-    (note,) = problem.notes
-    assert note.startswith("experiment 'swing': the markers were cut to the time of the poses by")
-    assert "0.03 s at the end, 3 of 9 samples" in note
+    assert problem.notes == ()
+
+
+def test_poses_that_lack_one_sample_at_the_end_are_told(tiny):
+    keep_lines(POSES, 9)(tiny)
+    (note,) = load(tiny).notes
+    assert "the markers were cut to the time of the poses by 0.01 s at the end" in note
+
+
+def test_a_grasp_that_stands_still_needs_two_poses(tiny):
+    rows = (tiny / POSES).read_text().splitlines()
+    last = "0.08," + rows[1].partition(",")[2]
+    (tiny / POSES).write_text("\n".join([*rows[:2], last]))
+    x, _ = load(tiny).experiments[0].grasps[0].poses.at([0.0, 0.04, 0.08])
+    np.testing.assert_allclose(x, x[[0, 0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+def test_sparse_poses_are_taken_where_it_is_said_how_the_grasp_moves(tiny, interpolation):
+    slower(tiny, 300.0)
+    keep = (tiny / POSES).read_text().splitlines()
+    (tiny / POSES).write_text("\n".join([keep[0], keep[1], keep[-1]]))
+    with pytest.raises(InputError, match="24 s apart"):
+        load(tiny)
+    load(tiny, f"experiment.0.grasp.interpolation={interpolation}")
+
+
+def test_equilibria_may_have_sparse_poses_or_one(tiny):
+    slower(tiny, 300.0)
+    static = ["experiment.0.kind=static", "parameters.gamma_r_s=0.0", "parameters.gamma_m_1_s=0.0"]
+    load(tiny, *static)
+    keep_lines(POSES, 2)(tiny)
+    load(tiny, *static)
+
+
+def slower(folder: Path, factor: float) -> None:
+    """Stretch the time of the recording and of its poses."""
+    for file in (POSES, MARKERS):
+        head, *rows = (folder / file).read_text().splitlines()
+        cells = [row.partition(",") for row in rows]
+        stretched = [f"{factor * float(t):.9g},{rest}" for t, _, rest in cells]
+        (folder / file).write_text("\n".join([head, *stretched]) + "\n")
 
 
 def test_poses_of_another_rate_need_no_resampling(tiny):

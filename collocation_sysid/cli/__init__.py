@@ -16,9 +16,9 @@ from rich.text import Text
 from typer.main import get_command
 
 from ..errors import InputError, SimulationError
-from ..starting import heed_interrupts
+from ..starting import heed_interrupts, leave
 from . import designs, problems, runs, streams, studies, texts
-from .common import EXIT_BAD_INPUT, EXIT_NOT_CONVERGED, errors
+from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors
 
 app = typer.Typer(
     name="collocation-sysid",
@@ -63,14 +63,23 @@ def _commands() -> Callable[..., Any]:
 
 def main() -> None:
     """Entry point: turns errors into one message and an exit code."""
+    try:
+        _run()
+    except KeyboardInterrupt:  # before or after the command itself
+        leave(EXIT_INTERRUPTED)
+    except SystemExit as ended:
+        leave(ended.code or 0)
+
+
+def _run() -> None:
     restore = heed_interrupts()
     try:
         _commands()(prog_name="collocation-sysid")
     except InputError as error:
         _refuse("error", error, EXIT_BAD_INPUT)
     except OSError as error:
-        reason = InputError(error.strerror or str(error), error.filename)
-        _refuse("error", reason, EXIT_BAD_INPUT)
+        where = error.filename or "standard output, or a temporary file"
+        _refuse("error", InputError(error.strerror or str(error), where), EXIT_BAD_INPUT)
     except SimulationError as error:
         _refuse("simulation failed", error, EXIT_NOT_CONVERGED)
     finally:

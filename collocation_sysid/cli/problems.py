@@ -89,7 +89,7 @@ def solve(
     else:
         show(summary(finished, folder))
     status = finished.solution.status
-    if status is Status.INTERRUPTED:
+    if status is Status.INTERRUPTED or finished.missing:
         raise typer.Exit(EXIT_INTERRUPTED)
     if strict and finished.trust.verdict == "doubtful":
         raise typer.Exit(EXIT_DOUBTFUL)

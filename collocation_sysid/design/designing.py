@@ -13,7 +13,6 @@ from ..checked import AboveOne, AtLeastOne, Count
 from ..errors import InputError, SimulationError
 from ..experiment import Experiment, PoseSequence
 from ..methods.options import Options
-from ..methods.solution import Status
 from ..nlp.parameters import ThetaMap
 from ..nlp.simulation import Trajectory, simulate, with_markers
 from ..problem import Problem
@@ -354,8 +353,7 @@ def _bars(judge: Judge, told: list[Told]) -> Bars:
 def _from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
     """Draws of q about the answer, and the information of the recordings."""
     solution = solve(problem)
-    if solution.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
+    solution.unless_interrupted()
     if not solution.status.converged:
         raise InputError(
             f"the recordings there are could not be fitted ({solution.status.value}), so that "

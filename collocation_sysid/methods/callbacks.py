@@ -57,6 +57,8 @@ class TimedFunction(ca.Callback):
     def eval_buffer(self, arguments, results) -> int:
         began = time.perf_counter()
         self.calls += 1
+        if self._errors:
+            return 1
         try:
             self._evaluate(
                 [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
@@ -256,6 +258,8 @@ class Monitor(ca.Callback):
 
     def eval(self, arguments):
         began = time.perf_counter()
+        if self.errors:
+            return [1]
         try:
             self._follow(arguments)
         except BaseException as error:

@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
+from contextvars import copy_context
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,12 +19,15 @@ from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
 from ..nlp.explicit import carried_over, made_explicit
+from ..starting import LEFT
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .recorder import Recorder
 from .solution import Status
 
 Settings = Callable[[NlpFunctions], Mapping[str, Any]]
 
+# How long a solver may take to end by itself, and how often that is looked at.
+GRACE_S, LOOK_EVERY_S = 2.0, 0.05
 _COMMON = {
     "print_time": False,
     "error_on_fail": False,
@@ -62,7 +66,7 @@ def solve(
     settings: Settings,
     statuses: Mapping[str, Status],
 ) -> Outcome:
-    """Solve the recorder's collocation; Ctrl-C ends it after the iteration.
+    """Solve the recorder's collocation; Ctrl-C ends it after the iteration, or after 2 s.
 
     The solver gets the program with the memory of bodies as variables, see `explicit`.
 
@@ -94,7 +98,7 @@ def solve(
         solver = _nlpsol(plugin, functions, given)
     began = carried_over(start, collocation, program)
     z, multipliers, said, count = _run(solver, program.bounds(), began, monitor)
-    if errors:
+    if errors and not isinstance(errors[0], _LeftBehind):
         raise errors[0]
     watch.evaluations = functions.seconds
     # What is neither set-up nor callback.
@@ -127,20 +131,50 @@ def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> c
         raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
 
 
+class _LeftBehind(Exception):
+    """The solver was given up; from now on its callbacks fail."""
+
+
 def _run(
     solver: ca.Function, bounds: tuple[Array, Array], start: Array, monitor: Monitor
 ) -> tuple[Array, Array, str, int]:
     """Variables, multipliers, what the solver said, and its iterations."""
     lower, upper = bounds
-    try:
-        with _interruptible(monitor):
+    found: list[tuple[Array, Array, str, int]] = []
+
+    def search() -> None:
+        try:
             answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
-        stats = solver.stats()
-    except RuntimeError as error:  # of its own, or what a callback's failure makes of it
-        said = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
-        return np.full(len(start), np.nan), np.zeros(0), said, 0
-    z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
-    return z, multipliers, str(stats["return_status"]), int(stats.get("iter_count") or 0)
+            stats = solver.stats()
+        except RuntimeError as error:  # of its own, or what a callback's failure makes of it
+            said = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
+            found.append((np.full(len(start), np.nan), np.zeros(0), said, 0))
+            return
+        z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
+        count = int(stats.get("iter_count") or 0)
+        found.append((z, multipliers, str(stats["return_status"]), count))
+
+    if threading.current_thread() is threading.main_thread():
+        _on_a_thread(search, monitor)
+    else:
+        search()
+    return found[0] if found else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
+
+
+def _on_a_thread(search: Callable[[], None], monitor: Monitor) -> None:
+    """Let the main thread hear signals, which it does not within a factorisation of minutes."""
+    thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
+    with _interruptible(monitor):
+        thread.start()
+        try:
+            left_s = GRACE_S
+            while thread.is_alive() and left_s > 0:
+                thread.join(LOOK_EVERY_S)
+                left_s -= LOOK_EVERY_S if monitor.stop else 0.0
+        finally:
+            if thread.is_alive():
+                thread.name = LEFT
+                monitor.errors.append(_LeftBehind())
 
 
 @contextmanager
@@ -149,9 +183,6 @@ def _interruptible(monitor: Monitor) -> Iterator[None]:
 
     So does SIGTERM where it is heeded as Ctrl-C is.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if handlers[signal.SIGTERM] is not signal.default_int_handler:
         del handlers[signal.SIGTERM]

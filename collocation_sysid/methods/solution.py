@@ -141,6 +141,18 @@ class Solution:
     evaluations: int = 0
     scan: Scan | None = None
 
+    def unless_interrupted(self) -> Solution:
+        """The solution of a part of some work, which ends by Ctrl-C as that does.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If it was interrupted.
+        """
+        if self.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        return self
+
     def after(self, first: Solution, why: str) -> Solution:
         """The answer with what the solve took that it started from, and why there was another."""
         done, began_s = first.iterations, first.timing.total

@@ -161,6 +161,7 @@ def result(finished: Run) -> dict[str, Any]:
         "status": solution.status.value,
         "converged": solution.status.converged,
         "message": solution.message,
+        "missing": finished.missing,
         "trust": {"verdict": finished.trust.verdict, "reasons": list(finished.trust.reasons)},
         "method": solution.method,
         "title": problem.title,

@@ -35,6 +35,7 @@ from ..experiment import (
     read_wrench,
 )
 from ..experiment.clock import TIME_TOLERANCE_S
+from ..experiment.coverage import refuse_untold
 from ..experiment.loads import Change
 from ..experiment.wrench_files import within
 from ..fem.body import Body
@@ -401,6 +402,8 @@ class RecordingReader:
             (-np.inf if g.from_s is None else g.from_s, np.inf if g.until_s is None else g.until_s)
             for g in section.grasps
         ]
+        if section.kind != "static":
+            self._refuse_untold(poses, table.t_s, held_s)
         try:
             aligned = align(
                 poses,
@@ -412,8 +415,7 @@ class RecordingReader:
                 section.kind == "static",
             )
         except InputError as error:
-            moved = (g.poses or section.file_of(g.displacement) for g in section.grasps)
-            files = [*moved, section.markers.file]
+            files = [*self._moved, section.markers.file]
             named = " and ".join(dict.fromkeys(name for name in files if name))
             raise InputError(error.message, None, named) from error
         self._note(*aligned.notes)
@@ -423,6 +425,23 @@ class RecordingReader:
                 "measured, so error bars come out too small"
             )
         return aligned.t_s, aligned.poses, aligned.table
+
+    @property
+    def _moved(self) -> list[str | None]:
+        """The file of each grasp that tells how it moves, where it has one."""
+        return [
+            grasp.poses or self.section.file_of(grasp.displacement) for grasp in self.section.grasps
+        ]
+
+    def _refuse_untold(
+        self, poses: list[PoseSequence], t_s: Array, held_s: Sequence[tuple[float, float]]
+    ) -> None:
+        """Refuse files of poses that do not tell the motion over the recording."""
+        first_s, last_s = self.section.window_s or (-np.inf, np.inf)
+        t_s = t_s[(t_s >= first_s - TIME_TOLERANCE_S) & (t_s <= last_s + TIME_TOLERANCE_S)]
+        for name, sequence, held in zip(self._moved, poses, held_s, strict=True):
+            if name is not None and len(t_s):
+                refuse_untold(sequence, t_s, held, self.folder / name)
 
     def _place(self, t_s: Array, table: MarkerTable, build: Build) -> Experiment:
         """Attach the markers where references are given; the others' places are unknown."""

@@ -8,7 +8,6 @@ one that is tried.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -75,14 +74,12 @@ def likely_causes(found: Run | Solution, budget: int | None = None) -> tuple[Cau
     fitted = [segment.experiment for segment in solution.collocation.segments]
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
     causes, worst = [], fitted[int(np.argmax(misfits))]
-    # The answer itself is there, and worth writing when somebody interrupts.
-    with contextlib.suppress(KeyboardInterrupt):
-        causes += wrench_causes(solution)
-        if max(misfits) <= NOISE:
-            return ranked(causes)
-        causes += doubts(worst, solution.parameters, solution.collocation.huber)
-        if max((each.strength for each in causes), default=0.0) < CERTAIN:
-            causes += _refitted(solution, worst, budget)
+    causes += wrench_causes(solution)
+    if max(misfits) <= NOISE:
+        return ranked(causes)
+    causes += doubts(worst, solution.parameters, solution.collocation.huber)
+    if max((each.strength for each in causes), default=0.0) < CERTAIN:
+        causes += _refitted(solution, worst, budget)
     return ranked(causes)
 
 
@@ -186,8 +183,7 @@ class _Alone:
         except (InputError, SimulationError):
             return None
         self.sweeps -= found.iterations
-        if found.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
+        found.unless_interrupted()
         ended = found.status.converged or found.status is Status.ITERATION_LIMIT
         return found.readings_m[0] if ended else None
 

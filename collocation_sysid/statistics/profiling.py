@@ -59,7 +59,7 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
     held = started.with_fixed({item.name: value})
-    found = ReducedSpace()(replace(before, parameters=held))
+    found = ReducedSpace()(replace(before, parameters=held)).unless_interrupted()
     if not found.status.converged:
         return float("inf")
     prior = 0.0

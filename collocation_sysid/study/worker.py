@@ -23,7 +23,7 @@ from ..output.record import as_json, result
 from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run, run
-from ..starting import heed_interrupts
+from ..starting import heed_interrupts, leave
 from .prediction import model_record
 from .store import ERROR, FINISHED
 
@@ -34,6 +34,7 @@ def main() -> None:
     planned = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     write_whole(Path(sys.argv[1]), as_json(attempt(planned)))
+    leave(0)
 
 
 def attempt(planned: dict[str, Any]) -> dict[str, Any]:
