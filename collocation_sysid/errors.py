@@ -37,6 +37,12 @@ def excerpt(text: str, longest: int = LONGEST_EXCERPT) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
+def listed(names: Iterable[str]) -> str:
+    """Names in a sentence: "a, b and c"."""
+    *others, last = [*names] or [""]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 class InputError(ValueError):
     """Something the user gave cannot be used; the message says what, where and what was expected.
 

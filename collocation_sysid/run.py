@@ -569,6 +569,6 @@ def _fine_enough(
             )
             first = replace(first, status=status, message=said)
         return replace(coarse, solution=first)
-    most = ", the most that are chosen," if substeps == MOST_SUBSTEPS else ""
-    said = f"{why}; so it was solved again with {substeps}{most} in {finer.timing.total:.2g} s"
+    most = ", the most that are chosen" if substeps == MOST_SUBSTEPS else ""
+    said = f"{why}; so it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, said), say)

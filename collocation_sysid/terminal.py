@@ -17,6 +17,7 @@ from .arrays import root_mean
 from .check import BodyFinding, Findings, Recording
 from .check.hold import hold_sentence
 from .console import PlainConsole
+from .errors import listed
 from .export.target import Comparison
 from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .methods.solution import Iteration
@@ -243,8 +244,8 @@ def _numerical(finished: Run) -> list[RenderableType]:
     segments = finished.solution.collocation.segments
     possible = ["step", "mesh"] if any(not s.experiment.static for s in segments) else ["mesh"]
     left = [f"the {kind}" for kind in possible if kind not in holds]
-    said = f"intervals hold {' and '.join(('the noise', *(f'the {kind}' for kind in holds[1:])))}"
-    said += f", not {' and '.join(left)}: see refine" if left else ""
+    said = f"intervals hold {listed(f'the {kind}' for kind in holds)}"
+    said += f", not {listed(left)}: see refine" if left else ""
     if found is None:
         return [Text(said)]
     if found.levels:

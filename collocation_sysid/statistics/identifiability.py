@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..errors import listed
 from ..fem.constants import bare
 from ..fem.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
@@ -46,7 +47,7 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
     }
     well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
     badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]
-    parts = [_listed(part) for part in (well, badly) if part]
+    parts = [listed(part) for part in (well, badly) if part]
     return [f"the data fix {'; '.join(parts)} (95 %)"] if parts else []
 
 
@@ -85,11 +86,11 @@ def _combination(
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
     if any(uncertainty.estimates[name].value <= 0 for name in names):  # no powers of these
-        return f"{_listed(names)} are confounded{how}: these data fix one combination of them"
+        return f"{listed(names)} are confounded{how}: these data fix one combination of them"
     return (
-        f"{_listed(names)} are confounded{how}: only their combination "
+        f"{listed(names)} are confounded{how}: only their combination "
         f"{_product(names, weights / weights[largest])} is fixed, to {_spread(float(fixed))}, "
-        f"each alone only to {_listed(alone)} (95 %)"
+        f"each alone only to {listed(alone)} (95 %)"
     )
 
 
@@ -101,7 +102,7 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
         factor = _factor(estimate)
         if factor is not None:
             parts.append(f"{name} {'only ' if factor > WELL_FIXED else ''}to {_spread(factor)}")
-    return [f"in the other elastic pair: they fix {_listed(parts)} (95 %)"] if parts else []
+    return [f"in the other elastic pair: they fix {listed(parts)} (95 %)"] if parts else []
 
 
 def _factor(estimate: Estimate) -> float | None:
@@ -123,9 +124,3 @@ def _product(names: Sequence[str], powers: Array) -> str:
     for name, power in zip(names, powers, strict=True):
         parts.append(name if abs(power - 1) < 5e-3 else f"{name}^{power:.2g}")
     return " · ".join(parts)
-
-
-def _listed(parts: Sequence[str]) -> str:
-    if len(parts) < 2:
-        return "".join(parts)
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..arrays import Array
+from ..errors import listed
 from ..experiment.experiment import Experiment
 from ..fem.body import Body
 from ..fem.constants import DENSITY, bare, is_density, is_modulus, symbol_of
@@ -46,7 +47,7 @@ def scale_concern(experiments: Iterable[Experiment], parameters: Parameters) -> 
     if not names:
         return None
     return (
-        f"only the ratios of {_listed(names)} can be told (E/ρ): no known force or mass sets their "
+        f"only the ratios of {listed(names)} can be told (E/ρ): no known force or mass sets their "
         "scale"
     )
 
@@ -57,9 +58,7 @@ def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters)
     if not names or open_scale(experiments, parameters):
         return None
     verb, symbols = "is" if len(names) == 1 else "are", [symbol_of(name) for name in names]
-    return (
-        f"no known force sets the scale: {_listed(symbols)} {verb} relative to the stated density"
-    )
+    return f"no known force sets the scale: {listed(symbols)} {verb} relative to the stated density"
 
 
 def _moved(
@@ -105,8 +104,3 @@ def _multiplied(body: Body, theta: Array, slope: Array, stated: bool) -> Array |
         for place, name in enumerate(body.constants)
     ]
     return np.where(scaled, theta, 0.0)
-
-
-def _listed(names: Iterable[str]) -> str:
-    *most, last = names
-    return f"{', '.join(most)} and {last}" if most else last

@@ -14,6 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..arrays import Array
+from ..errors import listed
 from ..nlp.stability import Instability
 from .cause import Cause
 from .diagnostics import MOST_WILD, MarkerDiagnosis
@@ -139,7 +140,7 @@ def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     if scatter is None or not scatter.disagreeing.any():
         return []
     which = [uncertainty.names[k] for k in np.flatnonzero(scatter.disagreeing)]
-    said = f"the recordings disagree on {_listed(which)}: model error decides, not noise"
+    said = f"the recordings disagree on {listed(which)}: model error decides, not noise"
     return [(said, "check")]
 
 
@@ -164,13 +165,11 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     vague = [n for n, found in estimates.items() if not found.at_bound and found.std_error is None]
     concerns: list[Concern] = []
     if bounded:
-        ended = (
-            f"{_listed(bounded)} ended at {'its bound' if len(bounded) == 1 else 'their bounds'}"
-        )
+        ended = f"{listed(bounded)} ended at {'its bound' if len(bounded) == 1 else 'their bounds'}"
         concerns.append((ended, "doubtful" if len(bounded) > 1 else "check"))
     if vague:
         none = len(vague) == len(estimates)
-        said = f"these data do not tell {_listed(vague)}"
+        said = f"these data do not tell {listed(vague)}"
         concerns.append((said, "doubtful" if none else "check"))
     return concerns
 
@@ -297,7 +296,3 @@ def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:
     total = float(samples.sum())
     left = max(0.0, 1 - fitted / (3 * total))
     return float(np.sqrt(3 * left * (samples @ sigma_m**2) / total))
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
