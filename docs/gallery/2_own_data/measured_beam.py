@@ -7,6 +7,7 @@ Robotics Lab, ETH Zurich). One material with a branch of memory fits the three r
 are fetched by ``python scripts/get_srl_beam.py``.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/measured_beam.png'
 from pathlib import Path
 
 import matplotlib.pyplot as plt

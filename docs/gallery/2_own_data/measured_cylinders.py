@@ -7,6 +7,7 @@ al. 2026). No camera: the load alone tells the material. The data are fetched by
 ``python scripts/get_phantom_compression.py``.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/measured_cylinders.png'
 from pathlib import Path
 
 import matplotlib.pyplot as plt
