@@ -47,6 +47,7 @@ sphinx_gallery_conf = {
 }
 html_math_renderer = "mathml"  # which browsers draw themselves, without a network
 html_title = f"collocation_sysid {release}"
+html_show_copyright = False
 
 autosummary_generate = True
 autosummary_filename_map = {"collocation_sysid.Run": "collocation_sysid.run-class"}  # beside `run`
