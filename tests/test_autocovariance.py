@@ -61,6 +61,19 @@ def test_lags_explain_the_expected_products_of_residuals(name):
     np.testing.assert_allclose(explained, expected, rtol=1e-9)
 
 
+def test_experiments_have_lags_of_their_own():
+    of, lags = PROBLEMS["two"], (1, 3)
+    fit = some_fit(of)
+    found = lagged_products(fit, information(fit), lags)
+    first, second = found.autocovariances()
+    assert (len(first), len(second)) == (2, 4)
+    np.testing.assert_allclose(found.expected @ [*first, *second], found.products, atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate(found.split(np.arange(6.0))), np.arange(6))
+    beyond = np.arange(6.0)
+    less = np.concatenate(found.autocovariances(beyond))
+    np.testing.assert_allclose(found.expected @ less, found.products - beyond, atol=1e-9)
+
+
 def test_the_size_of_errors_is_found_where_offsets_hide_their_mean():
     of, variances, lag1 = problem((60,), markers=4), [], []
     for seed in range(60):

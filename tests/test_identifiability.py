@@ -106,14 +106,28 @@ def test_parameters_known_very_well_keep_their_error_though_confounded():
     assert any("confounded" in sentence for sentence in verdicts(found))
 
 
-def test_three_parameters_can_be_confounded_without_any_two_being_so():
+def three_confounded(deviation: float) -> Uncertainty:
+    """Three parameters of which no two are confounded, the first two of this deviation."""
     basis = np.array([[1.0, 0, 0], [0, 1.0, 0], [1, 1, 0.1]])
     covariance = np.zeros((4, 4))
-    covariance[:3, :3] = 0.01 * basis @ basis.T
+    covariance[:3, :3] = deviation**2 * basis @ basis.T
     covariance[3, 3] = 1e-4
-    found = uncertainty(covariance)
-    (sentence,) = [s for s in verdicts(found) if "confounded" in s]
+    return uncertainty(covariance)
+
+
+def test_three_parameters_can_be_confounded_without_any_two_being_so():
+    (sentence,) = [s for s in verdicts(three_confounded(0.1)) if "confounded" in s]
     assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded: only")
+
+
+# The third's deviation is √2 times as large, and an interval of 25 % is still well fixed.
+WELL = np.log(1.25) / (Z95 * np.sqrt(2.01))
+
+
+@pytest.mark.parametrize(("deviation", "told"), [(0.01, 0), (0.99 * WELL, 0), (1.01 * WELL, 1)])
+def test_of_three_that_are_known_well_each_no_combination_is_told(deviation, told):
+    sentences = [s for s in verdicts(three_confounded(deviation)) if "confounded" in s]
+    assert len(sentences) == told
 
 
 def test_the_other_elastic_pair_is_told_where_it_is_known_better():
