@@ -71,6 +71,14 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
     assert high > 132
 
 
+@pytest.mark.parametrize(("value", "half_step"), [(-0.1, -0.11), (0.01, -0.01)])
+def test_a_poisson_ratio_below_zero_has_an_interval(value, half_step):
+    estimate = Estimate(value, 0.02, (value - 0.04, value + 0.04))
+    low, high = numerical_error("poisson", estimate, [half_step], []).ci95 or (0, 0)
+    assert low < value + 4 / 3 * (half_step - value) < high
+    assert high - low == pytest.approx(0.08, rel=0.1)
+
+
 def test_an_estimate_without_an_interval_gets_none():
     assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).ci95 is None
 

@@ -174,7 +174,8 @@ def numerical_error(
     linear : bool
         Whether the parameter is its own coordinate.
     """
-    at = _Coordinate(name, linear)
+    lowest = min(estimate.value, *(estimate.ci95 or ()), *by_step, *by_mesh, np.inf)
+    at = _Coordinate(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
     x = at.of(estimate.value)
     step = _Limit.of([x, *map(at.of, by_step)], step_order, step_order / 2)
     mesh = _Limit.of([x, *map(at.of, by_mesh)], MESH_ORDER, LEAST_ORDER)
@@ -220,19 +221,19 @@ def numerical_errors(
 
 @dataclass(frozen=True)
 class _Coordinate:
-    """In which an estimate's interval is symmetric, see `estimates`."""
+    """In which an interval is symmetric, see `estimates`; what may be negative is its own."""
 
-    name: str
+    odds: bool
     linear: bool
 
     def of(self, value: float) -> float:
         with np.errstate(divide="ignore", invalid="ignore"):
-            if bare(self.name) == "poisson":
+            if self.odds:
                 return float(np.log(value / (0.5 - value)))
             return value if self.linear else float(np.log(value))
 
     def value(self, x: float) -> float:
-        if bare(self.name) == "poisson":
+        if self.odds:
             return float(0.5 / (1 + np.exp(-x)))
         return x if self.linear else float(np.exp(x))
 
