@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +52,8 @@ def refinement_of(
     estimates: Mapping[str, Estimate],
     levels: int = 2,
     say: Callable[[str], None] | None = None,
+    known: Sequence[Mapping[str, Any]] = (),
+    keep: Callable[[Refinement], None] | None = None,
 ) -> Refinement:
     """Solve again at finer discretisations, each from the answer before.
 
@@ -68,34 +70,52 @@ def refinement_of(
         2, or 3 to observe the orders.
     say : callable, optional
         Called with what is being done now.
+    known : sequence of dict
+        Levels that were solved before, as in `Refinement.levels`.
+    keep : callable, optional
+        Called after each level with what is found so far.
 
     Raises
     ------
     InputError
         For another number of levels, or where a finer problem is not solved.
+    KeyboardInterrupt
+        Where a solve was interrupted; what `keep` was given stays.
     """
     if not 2 <= levels <= MOST_LEVELS:
         raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
     fitted = [experiment for experiment in problem.experiments if not experiment.validation]
     coarse = replace(problem, experiments=fitted, notes=())
-    found: dict[str, list[dict[str, Any]]] = {}
     moving = any(not experiment.static for experiment in fitted)
+    solved = {(each["halved"], each["times"]): dict(each) for each in known}
+    found: list[dict[str, Any]] = []
     for kind, finer in FINER.items():
-        if kind == "step" and not moving:  # equilibria have none
-            found[kind] = []
-            continue
-        at, start, found[kind] = coarse, answer, []
-        for level in range(1, levels):
+        at, start = coarse, answer
+        for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
             at = finer(at)
+            if (kind, level) in solved:
+                found.append(solved[kind, level])
+                start = replace(answer, values={**answer.values, **found[-1]["values"]})
+                continue
             if say is not None:
                 say(f"solving again: {kind} halved {level}×")
             solution = _solved(at, start, f"{kind} halved {level}×")
             start = Earlier.of(solution)
-            found[kind].append(_level(kind, level, solution))
-    by_step, by_mesh = ([each["values"] for each in found[kind]] for kind in FINER)
+            found.append(_level(kind, level, solution))
+            if keep is not None:
+                keep(_of_levels(found, problem, estimates))
+    return _of_levels(found, problem, estimates)
+
+
+def _of_levels(
+    levels: Sequence[dict[str, Any]], problem: Problem, estimates: Mapping[str, Estimate]
+) -> Refinement:
+    by_step, by_mesh = (
+        [each["values"] for each in levels if each["halved"] == kind] for kind in FINER
+    )
     order = as_scheme(problem.scheme).order
     errors = numerical_errors(estimates, by_step, by_mesh, order, problem.parameters.linear)
-    return Refinement(errors, tuple(each for kind in FINER for each in found[kind]))
+    return Refinement(errors, tuple(levels))
 
 
 def _solved(problem: Problem, start: Earlier, what: str) -> Solution:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from problem_files import run_command, settings, write_problem
 from problems_small import GUESS, TRUTH, hung_cube, measured
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.methods.solution import Status
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.problem import Problem, RolloutOptions
 from collocation_sysid.refine import refine
@@ -187,6 +189,37 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
     assert rows == {"step": 4 * 8 + 1, "mesh": 2 * 8 + 1}
     assert run_command("report", folder).code == 0
     assert "Numerical error" in Path(folder / "report.html").read_text()
+
+
+def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeypatch):
+    problem = write_problem(tmp_path, {"swing": 8})
+    folder = tmp_path / "run"
+    assert run_command("solve", problem, "--out", folder, "--method", "reduced-space").code == 0
+    refining = import_module("collocation_sysid.refine")  # its name is the function's too
+    solved, whole = [], refining.solve
+
+    def interrupted_at_the_mesh(problem, *arguments, **options):
+        solved.append(problem)
+        found = whole(problem, *arguments, **options)
+        return replace(found, status=Status.INTERRUPTED) if len(solved) == 2 else found
+
+    monkeypatch.setattr(refining, "solve", interrupted_at_the_mesh)
+    stopped = run_command("refine", folder)
+    assert stopped.code == 130
+    assert "kept" in stopped.err
+    assert "collocation-sysid refine" in stopped.err
+    kept = json.loads((folder / "refinement.json").read_text())
+    assert [level["halved"] for level in kept["levels"]] == ["step"]
+    part = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
+    assert part["numerical_error"]["step"] is not None
+    assert part["numerical_error"]["mesh"] is None
+    assert run_command("refine", folder).code == 0
+    assert len(solved) == 3
+    both = json.loads((folder / "refinement.json").read_text())
+    assert both["levels"][0] == kept["levels"][0]
+    assert [level["halved"] for level in both["levels"]] == ["step", "mesh"]
+    told = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
+    assert told["ci95_holds"] == ["noise", "step", "mesh"]
 
 
 def test_a_problem_may_ask_for_it(tmp_path):

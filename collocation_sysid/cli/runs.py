@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +14,18 @@ from rich.text import Text
 
 from ..files import write_whole
 from ..folders import require_possible
-from .common import AllowCode, AsJson, OneExperiment, Out, Quiet, RunFolder, errors, examples, show
+from .common import (
+    EXIT_INTERRUPTED,
+    AllowCode,
+    AsJson,
+    OneExperiment,
+    Out,
+    Quiet,
+    RunFolder,
+    errors,
+    examples,
+    show,
+)
 
 commands = typer.Typer()
 
@@ -28,7 +41,8 @@ def refine(
     """Solve again with half the step and a finer mesh: the numerical error.
 
     Each starts from the run's answer. The folder gets refinement.json, and result.json the
-    numerical error of each parameter, with an interval for noise and discretisation.
+    numerical error of each parameter, with an interval for noise and discretisation. What was
+    solved before, as of a call that was interrupted, is not solved again.
     """
     from ..output.record import as_json as json_text
     from ..output.refined import refine_run
@@ -38,7 +52,13 @@ def refine(
         if not quiet:
             errors.print(Text(what, style="dim"), soft_wrap=True)
 
-    found, result = refine_run(run_folder, levels, allow_code, say)
+    try:
+        found, result = refine_run(run_folder, levels, allow_code, say)
+    except KeyboardInterrupt:
+        again = shlex.join(["collocation-sysid", *sys.argv[1:]])
+        said = f"interrupted: what was solved is kept in {run_folder}; go on with: {again}"
+        errors.print(Text(said), soft_wrap=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
     if as_json:
         typer.echo(json_text({**found.as_dict(), "trust": result["trust"]}))
     else:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from ..earlier import Earlier
 from ..errors import InputError
-from ..files import RESULT_FILE, read_json, whole_file
+from ..files import RESULT_FILE, read_json, require_own, whole_file
 from ..problem import Problem
 from ..refine import refinement_of
 from ..statistics.estimates import Estimate
@@ -27,8 +28,9 @@ def refine_run(
 ) -> tuple[Refinement, dict[str, Any]]:
     """Solve the problem of a run folder again at finer discretisations, and write what that tells.
 
-    ``refinement.json`` is new; in ``result.json`` parameters and moduli get their
-    ``numerical_error`` and intervals that hold it, and the verdict takes it into account.
+    ``refinement.json`` holds the levels, and those that it holds already are not solved again; in
+    ``result.json`` parameters and moduli get their ``numerical_error`` and intervals that hold it,
+    and the verdict takes it into account.
 
     Returns
     -------
@@ -38,6 +40,8 @@ def refine_run(
     ------
     InputError
         If the folder holds no converged run of a problem file, or its files are gone.
+    KeyboardInterrupt
+        Where it was interrupted: the levels that were finished are in the folder.
     """
     file = Path(folder) / RESULT_FILE
     answer = Earlier.read(folder)
@@ -52,19 +56,36 @@ def refine_run(
         groups = [result[key] for key in ("parameters", "derived")]
         estimates = {name: _estimate(each) for group in groups for name, each in group.items()}
         before, substeps = _trust(result["trust"]), int(result["problem"]["substeps"])
+        known = _known_levels(file.parent, list(estimates))
     problem = Problem.read(file.parent / "problem.toml", allow_code=allow_code, folder=home)
     problem = replace(problem, substeps=substeps)
-    found = refinement_of(problem, answer, estimates, levels, say)
-    for group in groups:
-        for name in set(group) & set(found.errors):
-            error = found.errors[name]
-            group[name] |= {"numerical_error": asdict(error), "ci95": error.ci95}
-            group[name]["ci95_holds"] = [] if error.ci95 is None else list(found.holds)
-    result["trust"] = _judged(before, estimates, found)
-    with whole_file(file.parent / REFINEMENT_FILE) as beside, whole_file(file) as draft:
-        beside.write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
-        draft.write_text(as_json(result) + "\n", encoding="utf-8")
+
+    def keep(found: Refinement) -> None:
+        for group in groups:
+            for name in set(group) & set(found.errors):
+                error = found.errors[name]
+                group[name] |= {"numerical_error": asdict(error), "ci95": error.ci95}
+                group[name]["ci95_holds"] = [] if error.ci95 is None else list(found.holds)
+        result["trust"] = _judged(before, estimates, found)
+        with whole_file(file.parent / REFINEMENT_FILE) as beside, whole_file(file) as draft:
+            beside.write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
+            draft.write_text(as_json(result) + "\n", encoding="utf-8")
+
+    found = refinement_of(problem, answer, estimates, levels, say, known, keep)
+    keep(found)
     return found, result
+
+
+def _known_levels(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
+    """The levels that an earlier call has finished."""
+    file = folder / REFINEMENT_FILE
+    if not file.is_file():
+        return []
+    require_own(file)
+    levels = json.loads(file.read_text(encoding="utf-8"))["levels"]
+    return [
+        {**each, "values": {name: float(each["values"][name]) for name in names}} for each in levels
+    ]
 
 
 def _estimate(found: dict[str, Any]) -> Estimate:
