@@ -20,7 +20,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.output import animation
 from collocation_sysid.output.animation import Film, animate, film_samples
 from collocation_sysid.output.page import surface_strain
-from collocation_sysid.output.replay import read_run
+from collocation_sysid.output.replay import headline, read_run
 from collocation_sysid.output.view import frame_files, view
 
 NODES = 36
@@ -168,10 +168,43 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
         np.testing.assert_allclose(shapes, positions[:, outer], atol=1e-6)
     faces = np.frombuffer(b64decode(data["faces"]), "<i4").reshape(-1, 3)
     np.testing.assert_array_equal(outer[faces], swing.surface)
-    strains = np.frombuffer(b64decode(data["strains"]["fitted"]), "u1").reshape(9, -1)
+    strains = np.frombuffer(b64decode(data["shares"]["fitted"]), "u1").reshape(9, -1)
     assert strains.shape[1] == len(faces)
     assert strains.max() == 255
     assert strains[data["opening"]].mean() == strains.mean(axis=1).max() > 0
+
+
+def test_a_page_is_coloured_by_the_field_asked_for(run, tmp_path):
+    page = tmp_path / "page.html"
+    assert run_command("view", run, "--html", page, "--field", "displacement_m").code == 0
+    data, swing = content(page), read_run(run)[1][0]
+    assert (data["quantity"], list(data["shapes"])) == ("displacement_m", ["fitted"])
+    moved_m = (swing.positions_m - swing.undeformed_m)[:, swing.surface].mean(axis=2)
+    far_m = np.linalg.norm(moved_m, axis=2)
+    shares = np.frombuffer(b64decode(data["shares"]["fitted"]), "u1").reshape(far_m.shape)
+    expected = (far_m - far_m.min()) / np.ptp(far_m)
+    np.testing.assert_allclose(shares / 255, expected, atol=0.003)
+    assert data["ends"] == [f"{far_m.min():.3g}", f"{far_m.max():.3g} displacement_m"]
+    assert run_command("view", run, "--html", page, "--field", "von_mises_pa").code == 0
+    assert content(page)["quantity"] == "von_mises_pa"
+    refused = run_command("view", run, "--html", page, "--field", "stress")
+    assert refused.code == 2
+    assert "found 'stress'; expected one of det_f" in refused.err
+
+
+def test_page_and_film_say_what_was_found(run, tmp_path):
+    result, (swing, _) = read_run(run)
+    assert headline(result).startswith("E = ")
+    assert headline(result).endswith(f"verdict: {result['trust']['verdict']}")
+    found = {"value": 1543.21, "std_error": 123.4}
+    one = {"derived": {"core.young_pa": found}, "parameters": {}, "trust": {"verdict": "check"}}
+    assert headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
+    run_command("view", run, "--html", tmp_path / "page.html")
+    assert headline(result) in (tmp_path / "page.html").read_text(encoding="utf-8")
+    texts = [
+        text.get_text() for text in Film(swing, headline=headline(result)).figure.axes[0].texts
+    ]
+    assert headline(result) in texts
 
 
 def test_turning_is_no_strain_and_stretching_is(run):

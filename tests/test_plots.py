@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -557,3 +560,26 @@ def test_grasped_nodes_on_the_sides_are_marked():
     marked = len(drawn.grasped.get_xdata())
     faces = camera.faces(body.nodes_m, seen.surface)[2]
     assert marked == len(np.unique(seen.surface_nodes[faces])) > len(np.unique(seen.surface[faces]))
+
+
+def test_letters_that_the_font_lacks_are_no_news(tmp_path):
+    figure, axes = sheet(40.0, 20.0)
+    axes.text(5, 5, "手 tip")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure.savefig(tmp_path / "named.png")
+    assert (tmp_path / "named.png").stat().st_size > 0
+
+
+def test_commands_say_nothing_of_matplotlibs_own_files(tmp_path):
+    code = "from collocation_sysid.cli import main; main()"
+    beside = {
+        "MPLCONFIGDIR": str(tmp_path / "a_file"),
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+    }
+    (tmp_path / "a_file").touch()
+    command = [sys.executable, "-c", code, "plot", str(tmp_path)]
+    done = subprocess.run(command, env=os.environ | beside, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "not a run folder" in done.stderr

@@ -6,6 +6,7 @@ Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -73,6 +74,8 @@ def main() -> None:
 
 def _run() -> None:
     restore = heed_interrupts()
+    # That it builds its cache of fonts, or where, is no news to who solves a problem.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         _commands()(prog_name="collocation-sysid")
     except InputError as error:

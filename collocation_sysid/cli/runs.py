@@ -185,8 +185,11 @@ def animate(
 def view(
     run_folder: RunFolder,
     field: Annotated[
-        str, typer.Option(help="Field of the frames that colours the body.")
-    ] = "von_mises_pa",
+        str | None,
+        typer.Option(
+            help="Field of the frames that colours the body: von_mises_pa; on a page, strain."
+        ),
+    ] = None,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a web page, open no window.")
     ] = None,
@@ -196,11 +199,11 @@ def view(
 
     In a window (needs pyvista), or as a web page that needs nothing.
     """
-    from ..output.view import export_page
+    from ..output.view import FIELD, export_page
     from ..output.view import view as show
 
     if html is None:
-        show(run_folder, field, experiment)
+        show(run_folder, field or FIELD, experiment)
         return
     require_possible(html.parent)
-    typer.echo(export_page(run_folder, html, experiment))
+    typer.echo(export_page(run_folder, html, experiment, field))

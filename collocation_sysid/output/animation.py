@@ -28,13 +28,13 @@ from .pictures.scene import (
     sheet,
     width_over_height,
 )
-from .replay import Replay, read_run
+from .replay import Replay, headline, read_run, reading_run
 from .style import TEXT_PT
 
 WIDTH_MM, TALLEST_MM, LOWEST_MM = 160.0, 110.0, 30.0
 # GIF packs badly. H.264 wants even numbers of pixels either way, see `_even`.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
-HEAD_MM, FOOT_MM = 12.0, 12.0
+HEAD_MM, FOOT_MM, LINE_MM = 12.0, 12.0, 5.0
 MOST_FRAMES = 3000
 # Of a static experiment, however long it took.
 STATES_A_SECOND = 8
@@ -78,14 +78,16 @@ def animate(
     for name, value in (("--fps", fps), ("--slow", slow)):
         if not 0 < value < np.inf:
             raise InputError(f"found {value:g}; expected a number above 0", None, name)
-    _, replays = read_run(run)
+    result, replays = read_run(run)
     replay = chosen(replays, experiment, run)
+    with reading_run(Path(run)):
+        said = headline(result)
     file = Path(to) if to is not None else Path(run) / f"{safe_name(replay.name)}.gif"
     if file.suffix.lower() not in PIXELS_WIDE:
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
-    return film(replay, file, fps, slow, progress)
+    return film(replay, file, fps, slow, progress, headline=said)
 
 
 def film(
@@ -95,9 +97,10 @@ def film(
     slow: float = 1.0,
     progress: Progress | None = None,
     names: tuple[str, str] = NAMES,
+    headline: str = "",
 ) -> Path:
-    """Film one experiment, the body by its two `names`; see `animate`."""
-    picture = Film(replay, names)
+    """Film one experiment, the body by its two `names` below a headline; see `animate`."""
+    picture = Film(replay, names, headline)
     t_s = replay.t_s
     if replay.static:  # which may take a second or a day
         t_s = np.arange(len(t_s)) / STATES_A_SECOND
@@ -171,7 +174,7 @@ class Film:
 
     figure: Figure
 
-    def __init__(self, replay: Replay, names: tuple[str, str] = NAMES) -> None:
+    def __init__(self, replay: Replay, names: tuple[str, str] = NAMES, headline: str = "") -> None:
         self.replay = replay
         trajectories = (
             (names[0], replay.positions_m, replay.markers_m),
@@ -186,14 +189,17 @@ class Film:
         width = WIDTH_MM / len(there)
         aspect = width_over_height(camera, everything)
         height = float(np.clip((width - 8) / aspect, LOWEST_MM, TALLEST_MM))
-        total = _even(HEAD_MM + height + FOOT_MM)
+        head = HEAD_MM + (LINE_MM if headline else 0.0)
+        total = _even(head + height + FOOT_MM)
         self.figure, axes = sheet(WIDTH_MM, total)
         self.figure.set_facecolor("white")
+        axes.text(WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
         self.panels = []
         for k, (name, positions, markers) in enumerate(there):
             corner = (k * width + 4, FOOT_MM)
             view = View.fitting(camera, everything, (width - 8, height), corner)
-            title = axes.text(corner[0], total - 3, "", va="top", fontsize=TEXT_PT, zorder=6)
+            top = total - 3 - (head - HEAD_MM)
+            title = axes.text(corner[0], top, "", va="top", fontsize=TEXT_PT, zorder=6)
             body = Drawn(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
             self.panels.append((name, positions, markers, body, title))
         self._surround(axes, camera, view.mm_per_m, total)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import html
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,44 @@ MOST_FRAMES = 300
 STRAINED = 0.995
 
 
-def write_page(replay: Replay, file: str | Path) -> Path:
+@dataclass(frozen=True)
+class Colouring:
+    """What colours the faces.
+
+    Attributes
+    ----------
+    name : str
+    values : mapping of trajectory ("fitted", "rolled out") to (T, F)
+    low, high : float
+        Where the colours begin and end.
+    ends : (str, str)
+        What is written there.
+    """
+
+    name: str
+    values: Mapping[str, Array]
+    low: float
+    high: float
+    ends: tuple[str, str]
+
+    @classmethod
+    def strain(cls, replay: Replay) -> Colouring:
+        """Largest principal strain."""
+        values = {name: surface_strain(replay, x) for name, x in _trajectories(replay).items()}
+        shown = np.abs(next(iter(values.values())))
+        largest = float(np.nanquantile(shown, STRAINED)) or 1e-6
+        return cls("strain", values, 0.0, largest, ("0", f"{100 * largest:.2g} % strain"))
+
+    @classmethod
+    def field(cls, name: str, fitted: Array) -> Colouring:
+        """A field (T, F) of the fitted body."""
+        low, high = float(np.nanmin(fitted)), float(np.nanmax(fitted))
+        return cls(name, {"fitted": fitted}, low, high, (f"{low:.3g}", f"{high:.3g} {name}"))
+
+
+def write_page(
+    replay: Replay, file: str | Path, headline: str = "", colouring: Colouring | None = None
+) -> Path:
     """Write an experiment, as fitted and as rolled out, as a stand-alone web page.
 
     The page draws on a plain canvas, in any browser and without a network. Of long trajectories
@@ -35,28 +74,38 @@ def write_page(replay: Replay, file: str | Path) -> Path:
     replay : Replay
         With at least one trajectory.
     file : str or Path
+    headline : str
+        What was found, in a line.
+    colouring : Colouring, optional
+        What colours the body, and which trajectories; the strain of all by default.
     """
     template = files("collocation_sysid.output").joinpath("page.html").read_text(encoding="utf-8")
     # What would end the script early cannot be in JSON's strings.
-    data = json.dumps(_content(replay)).replace("</", "<\\/")
-    page = template.replace("@TITLE@", html.escape(replay.name)).replace("@DATA@", data)
+    content = _content(replay, colouring or Colouring.strain(replay))
+    texts = {"@TITLE@": replay.name, "@HEADLINE@": headline}
+    page = template
+    for place, text in texts.items():
+        page = page.replace(place, html.escape(text))
+    page = page.replace("@DATA@", json.dumps(content).replace("</", "<\\/"))
     write_whole(file, page)
     return Path(file)
 
 
-def _content(replay: Replay) -> dict[str, Any]:
+def _trajectories(replay: Replay) -> dict[str, Array]:
+    named = {"fitted": replay.positions_m, "rolled out": replay.rolled_out_positions_m}
+    return {name: x for name, x in named.items() if x is not None}
+
+
+def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
     kept = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MOST_FRAMES))
     outer, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)
-    named = {"fitted": replay.positions_m, "rolled out": replay.rolled_out_positions_m}
-    shapes = {name: x[kept][:, outer] for name, x in named.items() if x is not None}
+    positions, values = _trajectories(replay), colouring.values
+    shapes = {name: positions[name][kept][:, outer] for name in values}
     first = next(iter(shapes.values()))
     low, high = np.nanmin(first, axis=(0, 1)), np.nanmax(first, axis=(0, 1))
-    stretched = {
-        name: surface_strain(replay, x[kept]) for name, x in named.items() if x is not None
-    }
-    shown = np.abs(next(iter(stretched.values())))
-    largest = float(np.nanquantile(shown, STRAINED)) or 1e-6
+    span = (colouring.high - colouring.low) or 1.0
+    shares = {name: (x[kept] - colouring.low) / span for name, x in values.items()}
     there = first[np.isfinite(first).all(axis=(1, 2))]
     return {
         "t_s": replay.t_s[kept].tolist(),
@@ -64,9 +113,10 @@ def _content(replay: Replay) -> dict[str, Any]:
         "markers": replay.measured_m.shape[1],
         "faces": _packed(nodes[:, :3], "<i4"),
         "sides": _packed(nodes[:, 3:], "<i4"),
-        "strains": {name: _packed(_bytes(x / largest), "u1") for name, x in stretched.items()},
-        "largest": largest,
-        "opening": int(np.nansum(shown, axis=1).argmax()),
+        "quantity": colouring.name,
+        "ends": colouring.ends,
+        "shares": {name: _packed(_bytes(x), "u1") for name, x in shares.items()},
+        "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
         "held": _packed(replay.held[kept][:, outer], "u1"),
         "measured": _packed(replay.measured_m[kept], "<f4"),

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
+from ..fem.constants import bare, symbol_of
 from ..fem.quadratic import EDGES
 from ..files import RESULT_FILE, damage_refused, read_json, require_own
 
@@ -273,6 +274,17 @@ def read_run(folder: str | Path) -> tuple[dict[str, Any], list[Replay]]:
     with reading_run(run):
         arrays = read_arrays(run)
         return result, [Replay.from_arrays(name, arrays) for name in _experiments(result)]
+
+
+def headline(result: Mapping[str, Any]) -> str:
+    """Young's moduli with their standard errors, and the verdict, in one line."""
+    found = {**result["derived"], **result["parameters"]}
+    moduli = {symbol_of(name): each for name, each in found.items() if bare(name) == "young_pa"}
+    said = []
+    for name, each in moduli.items():
+        bar = f" ± {float(format(each['std_error'], '.2g')):g}" if each["std_error"] else ""
+        said.append(f"{name} = {each['value']:.5g}{bar} Pa")
+    return "; ".join([*said, f"verdict: {result['trust']['verdict']}"])
 
 
 def read_arrays(run: Path) -> dict[str, NDArray[Any]]:

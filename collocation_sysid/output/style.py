@@ -5,10 +5,12 @@ Figures are `matplotlib.figure.Figure` objects without pyplot: no display, no gl
 
 from __future__ import annotations
 
+import warnings
 from io import BytesIO
 from math import inf
 
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
 
@@ -43,6 +45,12 @@ class Picture(Figure):
         png = BytesIO()
         self.savefig(png, dpi=RESOLUTION_DPI)
         return png.getvalue(), {"width": round(96 * self.get_figwidth())}
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw it; letters that the font lacks, as of a marker's name, are boxes and no news."""
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
+            super().draw(renderer)
 
 
 def mathematical(name: str) -> str:

@@ -6,20 +6,23 @@ The fields are those of the run's frames for ParaView.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError
 from ..files import damage_refused, is_own
 from .animation import chosen
-from .page import write_page
+from .page import Colouring, cells_of_faces, write_page
 from .pictures.camera import Camera
-from .replay import Replay, read_run
+from .replay import Replay, headline, read_run, reading_run
 from .style import BLACK, VERMILION
 from .writers import FRAMES_FILE
 
@@ -27,16 +30,58 @@ WINDOW = (1100, 800)
 FIELD = "von_mises_pa"
 
 
-def export_page(run: str | Path, file: str | Path, experiment: str | None = None) -> Path:
+def export_page(
+    run: str | Path, file: str | Path, experiment: str | None = None, field: str | None = None
+) -> Path:
     """Write an experiment of a run as a stand-alone web page; needs no pyvista.
+
+    Parameters
+    ----------
+    run : str or Path
+    file : str or Path
+    experiment : str, optional
+        By default the first.
+    field : str, optional
+        Which of the frames' point or cell data colours the body as fitted; by default the strain
+        of the body as fitted and as rolled out.
 
     Raises
     ------
     InputError
-        If `run` is not a run folder, or has no such experiment.
+        If `run` is not a run folder, or has no such experiment or field.
     """
-    _, replays = read_run(run)
-    return write_page(chosen(replays, experiment, run), file)
+    result, replays = read_run(run)
+    replay = chosen(replays, experiment, run)
+    with reading_run(Path(run)):
+        said = headline(result)
+    colouring = None if field is None else Colouring.field(field, _on_faces(run, replay, field))
+    return write_page(replay, file, said, colouring)
+
+
+def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
+    """A field of the frames (T, F) on the boundary's faces, at each sample that of the nearest."""
+    frames = frame_files(Path(run), replay.name)
+    cells = cells_of_faces(replay.tetrahedra, replay.surface)
+    with _reading_frames(Path(run)):
+        shown = []
+        for _, file in frames:
+            frame = meshio.read(file)
+            points, in_cells = frame.point_data, frame.cell_data
+            require_field(field, [*in_cells, *points])
+            if field in in_cells:
+                values = in_cells[field][0][cells]
+            else:
+                values = points[field][replay.surface].mean(axis=1)
+            shown.append(np.linalg.norm(values, axis=1) if values.ndim == 2 else values)
+        times = np.array([time for time, _ in frames])
+        nearest = np.abs(replay.t_s[:, None] - times).argmin(axis=1)
+        return np.array(shown)[nearest]
+
+
+def require_field(field: str, known: Sequence[str]) -> None:
+    """Refuse a field that the frames do not have."""
+    if field not in known:
+        raise InputError(f"found {field!r}; expected one of {', '.join(known)}", None, "--field")
 
 
 def view(
@@ -120,10 +165,7 @@ class _Scene:
         self.times = np.array([time for time, _ in frames])
         self.meshes: list[Any] = [pv.read(file) for _, file in frames]
         known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
-        if field not in known:
-            raise InputError(
-                f"found {field!r}; expected one of {', '.join(known)}", None, "--field"
-            )
+        require_field(field, known)
         self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW))
         self.plotter.set_background("white")
         self.range = self._range()

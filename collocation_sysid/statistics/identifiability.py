@@ -81,7 +81,6 @@ def _combination(
     weights = vector / deviations
     largest = int(np.argmax(np.abs(weights)))
     fixed = np.exp(quantiles.max() * np.sqrt(eigenvalue) / abs(weights[largest]))
-    alone = [_spread(float(f)) for f in np.exp(np.minimum(quantiles * deviations, 100.0))]
     how = ""
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
@@ -89,8 +88,7 @@ def _combination(
         return f"{listed(names)} are confounded{how}: these data fix one combination of them"
     return (
         f"{listed(names)} are confounded{how}: only their combination "
-        f"{_product(names, weights / weights[largest])} is fixed, to {_spread(float(fixed))}, "
-        f"each alone only to {listed(alone)} (95 %)"
+        f"{_product(names, weights / weights[largest])} is fixed, to {_spread(float(fixed))} (95 %)"
     )
 
 

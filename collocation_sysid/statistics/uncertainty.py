@@ -401,7 +401,7 @@ def _parameter_notes(
     bounded: NDArray[np.bool_],
     estimates: Mapping[str, Estimate],
 ) -> list[str]:
-    notes = []
+    notes, reasons = [], {}
     for k, item in enumerate(parameters.free):
         estimate = estimates[item.name]
         if bounded[k]:
@@ -422,10 +422,25 @@ def _parameter_notes(
                 "the body differently"
             )
         elif estimate.std_error is None:
+            reasons[item.name] = str(estimate.reason)
+    return [*notes, *_unidentifiable(reasons)]
+
+
+def _unidentifiable(reasons: Mapping[str, str]) -> list[str]:
+    """One sentence a parameter, and one for two that are confounded with each other."""
+    notes, told = [], set()
+    for name, reason in reasons.items():
+        because, other = reason, reason.removeprefix("confounded with ").split(" ")[0]
+        which, pronoun = f"{name} is", "it"
+        if reasons.get(other, "").startswith(f"confounded with {name} "):
+            which, pronoun = f"{name} and {other} are", "one of them"
+            because = reason.replace(other, "each other", 1)
+        if other not in told:
             notes.append(
-                f"{item.name} is not identifiable from these data: {estimate.reason}; fix it, "
-                "give it a prior, or move the body differently"
+                f"{which} not identifiable from these data: {because}; fix {pronoun}, give it a "
+                "prior, or move the body differently"
             )
+        told.add(name)
     return notes
 
 
