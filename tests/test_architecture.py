@@ -14,7 +14,7 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting"},
+    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"},
     {"fem"},
     {"experiment"},
     {"nlp"},
