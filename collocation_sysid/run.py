@@ -248,7 +248,7 @@ class Run:
         field : {"von_mises_pa", "energy_density_j_m3", "det_f"} or None
             What colours it, element by element; None for its regions.
         count : int
-            How many shapes, from the first sample to the last.
+            How many shapes, from the first sample to the last; 20 at most.
 
         Returns
         -------
@@ -258,7 +258,7 @@ class Run:
         Raises
         ------
         InputError
-            For an unknown experiment or field, or a run without any motion.
+            For an unknown experiment or field, a count that cannot be, or a run without motion.
         """
         from .output.animation import chosen  # how it looks is no part of a run
         from .output.portrait import portrait

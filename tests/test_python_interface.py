@@ -197,6 +197,9 @@ def test_what_cannot_be_drawn_is_told_with_what_can():
         identified().plot(field="det")
     with pytest.raises(cs.InputError, match=r"found 'sway'; expected one of hung cube"):
         identified().plot("sway")
+    for count in (0, 21):
+        with pytest.raises(cs.InputError, match=rf"count is {count}; expected 1 to 20 shapes"):
+            identified().plot(count=count)
 
 
 # Several bodies -----------------------------------------------------------------------------------

@@ -19,6 +19,8 @@ FIELDS = {
     "energy_density_j_m3": "elastic energy [J/m³]",
     "det_f": "volume over undeformed, det F",
 }
+# More would be too small to tell anything.
+MOST_SHAPES = 20
 
 
 def portrait(
@@ -31,8 +33,10 @@ def portrait(
     Raises
     ------
     InputError
-        For an unknown field.
+        For an unknown field, or for no shapes or too many.
     """
+    if not 1 <= count <= MOST_SHAPES:
+        raise InputError(f"count is {count}; expected 1 to {MOST_SHAPES} shapes")
     if field is not None and field not in FIELDS:
         expected = f"expected one of {', '.join(FIELDS)}{hint_at(field, list(FIELDS))}"
         raise InputError(f"no field {field!r}; {expected}")
