@@ -466,11 +466,9 @@ def run(
     missing = "no forward simulation has checked the answer, and there are no error bars"
     try:
         found = _checked(problem, found.solution, say)
-        missing = "what comes after the error bars is left out, such as causes of the misfit"
+        missing = "what comes after the error bars is left out: finer steps, causes of the misfit"
         if problem.substeps == "auto":
             found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
-            if found.solution.status is Status.INTERRUPTED:
-                return found
         substeps = found.solution.collocation.substeps
         turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
         found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
@@ -546,7 +544,6 @@ def _fine_enough(
     why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
-    status, message = Status.INTERRUPTED, "it was interrupted"
     try:
         require_memory(problem, again, solver)
         positions, failure = marched(again, p)
@@ -555,20 +552,14 @@ def _fine_enough(
         with workers_of(scheduler) as workers:
             shared = _shared(solver, workers)
             finer = _read_where_found(shared, again, watch, again.pack(p, positions))
-        status, message = finer.status, finer.message
+        message = finer.message
     except (InputError, SimulationError) as error:
-        status, message = Status.NOT_SIMULABLE, str(error)
-    except KeyboardInterrupt:
-        pass  # the first answer is whole
-    if not status.converged:
+        finer, message = None, str(error)
+    if finer is not None and finer.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt  # the first answer is whole
+    if finer is None or not finer.status.converged:
         note = f"{why}; with {substeps} it was not solved: {message}"
-        coarse = replace(coarse, notes=(note, *coarse.notes))
-        if status is Status.INTERRUPTED:
-            said = (
-                f"Interrupted while {substeps} steps a sample were tried: this is what one finds."
-            )
-            first = replace(first, status=status, message=said)
-        return replace(coarse, solution=first)
+        return replace(coarse, notes=(note, *coarse.notes))
     most = ", the most that are chosen" if substeps == MOST_SUBSTEPS else ""
     said = f"{why}; so it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, said), say)
