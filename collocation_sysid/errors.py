@@ -63,7 +63,8 @@ class InputError(ValueError):
         self.source = source
         self.where = where
         said = ": ".join(str(part) for part in (source, where, message) if part)
-        super().__init__(excerpt(_ENDLESS_WORD.sub(r"\1…", printable(said)), LONGEST))
+        line = printable(said).replace("\n", "␊")
+        super().__init__(excerpt(_ENDLESS_WORD.sub(r"\1…", line), LONGEST))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
         return type(self), (self.message, self.source, self.where)

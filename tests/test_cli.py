@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib import import_module
@@ -215,6 +216,7 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
     def interrupt(self: terminal.Progress, line: Iteration) -> None:
         if line.number == 1:
             signal.raise_signal(signal.SIGINT)
+            time.sleep(0.5)  # until it is heard, on the main thread
 
     monkeypatch.setattr(terminal.Progress, "iteration", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -243,6 +244,7 @@ def test_an_interrupt_and_sigterm_leave_the_best_result(
         add(self, line)
         if len(self.history) == 3:
             os.kill(os.getpid(), number)
+            time.sleep(0.5)  # until it is heard, on the main thread
 
     monkeypatch.setattr(Recorder, "add", interrupted)
     before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from dataclasses import replace
 from functools import cache
 
@@ -221,6 +222,7 @@ def test_an_interruption_keeps_the_best_iterate():
     def interrupt(iteration: Iteration) -> None:
         if iteration.number == 4:
             os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.5)  # until it is heard, on the main thread
 
     handler = signal.getsignal(signal.SIGINT)
     solution = InteriorPoint()(cube(), watch=interrupt)

@@ -168,6 +168,11 @@ def test_escapes_of_a_terminal_are_shown_and_not_sent(tiny: Path, edit):
     assert "[31m" in refused("check", "problem.toml")
 
 
+def test_a_message_is_one_line_whatever_it_quotes(tiny: Path):
+    replace_text("[object]", '[object]\n"a\\nerror: forged" = 1')(tiny)
+    assert "object.a␊error: forged: unknown key" in refused("check", "problem.toml")
+
+
 def test_names_that_are_shown_in_tables_are_shown_as_they_are(tiny: Path):
     for file in ("problem.toml", MARKERS):
         text = (tiny / file).read_text()

@@ -1,6 +1,7 @@
 """Experiments on threads of their own: the same numbers, whatever the number of threads."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -50,3 +51,22 @@ def test_experiments_are_fitted_alike_on_any_number_of_threads(monkeypatch):
         assert collocation.threads == threads
         answers.append(ReducedSpace(max_iterations=6)(collocation).z)
     assert np.array_equal(*answers)
+
+
+def test_an_interrupt_ends_the_others_within_their_next_row():
+    begun, rows = threading.Event(), []
+
+    def run(k: int) -> None:
+        if k == 0:
+            begun.wait(timeout=10)
+            raise KeyboardInterrupt
+        for _ in range(1000):
+            begun.set()
+            in_slices(lambda *_: rows.append(0), 1, 1)
+            time.sleep(0.005)
+
+    with pytest.raises(KeyboardInterrupt):
+        side_by_side(run, range(2), threads=2)
+    assert len(rows) < 900
+    in_slices(lambda *_: rows.append(-1), 1, 1)
+    assert rows[-1] == -1

@@ -6,7 +6,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -38,6 +38,8 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
     """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread."""
+    if (stop := getattr(_alone, "stop", None)) is not None and stop.is_set():
+        raise KeyboardInterrupt
     threads = min(threads, count)
     if threads <= 1 or getattr(_alone, "whole", False):
         run(0, count)
@@ -60,8 +62,18 @@ def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> lis
     if count == 1:
         return [run(item) for item in items]
 
+    stop = threading.Event()
+
+    def passed(item: T) -> R:
+        _alone.stop = stop
+        return alone(run, item)
+
     with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(partial(alone, run), items))
+        try:
+            return list(pool.map(passed, items))
+        except BaseException:
+            stop.set()  # only the main thread hears of Ctrl-C, and it waits for the others
+            raise
 
 
 def alone(run: Callable[..., R], *arguments: Any) -> R:
