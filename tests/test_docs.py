@@ -112,6 +112,12 @@ def test_links_between_pages_lead_somewhere():
                 assert (page.parent / target).exists(), f"{name_of(page)}: {target}"
 
 
+def test_the_front_page_shows_the_answer_that_the_readme_shows():
+    (shown,) = blocks(ROOT / "docs" / "index.md", "console")
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert [line for line in shown.splitlines() if line not in lines] == []
+
+
 # Pages made when the documentation is built
 
 
