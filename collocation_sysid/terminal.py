@@ -14,12 +14,13 @@ from rich.table import Table
 from rich.text import Text
 
 from .arrays import root_mean
-from .check import BodyFinding, Findings, Recording
+from .check import BodyFinding, Findings, Glance, Recording
 from .check.hold import hold_sentence
 from .console import PlainConsole
 from .errors import listed
 from .export.target import Comparison
 from .fem.constants import GAMMA_R, symbol_of, unit_of
+from .heartbeat import Heartbeat
 from .methods.solution import Iteration
 from .nlp.collocation import Part
 from .nlp.parameters import Parameter
@@ -57,26 +58,33 @@ SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
 class Progress:
-    """A live table of iterations on a terminal; plain lines elsewhere, when asked for."""
+    """A live table of iterations on a terminal; elsewhere a line now and then, or all if asked."""
 
     def __init__(
-        self, console: Console, problem: Problem, verbose: bool = False, quiet: bool = False
+        self,
+        console: Console,
+        problem: Problem | None = None,
+        verbose: bool = False,
+        quiet: bool = False,
     ) -> None:
         self.console = console
         self.verbose = verbose
         self.quiet = quiet
-        self._notes = problem.notes
+        self._notes = problem.notes if problem else ()
         live = console.is_terminal and not quiet and not verbose
         self._live = Live(console=console, refresh_per_second=8, transient=True) if live else None
         self._lines: list[Iteration] = []
         self._doing = "finding a start"
+        silent = not (console.is_terminal or quiet)
+        self._heartbeat = Heartbeat(self._state, self._line) if silent else None
 
     def __enter__(self) -> Progress:
         if not self.quiet:
             for note in self._notes:
-                self.console.print(Text(f"note: {note}"), soft_wrap=True)
-        if self._live is not None:
-            self._live.start()
+                self._line(f"note: {note}")
+        for shown in (self._live, self._heartbeat):
+            if shown is not None:
+                shown.start()
         return self
 
     def __exit__(
@@ -85,28 +93,36 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._live is not None:
-            self._live.stop()
+        for shown in (self._live, self._heartbeat):
+            if shown is not None:
+                shown.stop()
 
     def iteration(self, line: Iteration) -> None:
         """Show an iterate."""
         self._lines.append(line)
         self._doing = "solving"
         if self.verbose:
-            self.console.print(Text("  ".join(_cells(line))), soft_wrap=True)
+            self._line("  ".join(_cells(line)))
         self._refresh()
 
     def say(self, what: str) -> None:
         """Show what is being done now."""
         self._doing = what
         if self.verbose:
-            self.console.print(Text(what), soft_wrap=True)
+            self._line(what)
         self._refresh()
 
     def share(self, done: float) -> None:
         """Show the share of a simulation that is done."""
         self._doing = f"simulating: {done:.0%}"
         self._refresh()
+
+    def _state(self) -> str:
+        done = f", {len(self._lines)} iterations" if self._lines else ""
+        return f"{self._doing}{done}"
+
+    def _line(self, said: str) -> None:
+        self.console.print(Text(said), soft_wrap=True)
 
     def _refresh(self) -> None:
         if self._live is not None:
@@ -464,10 +480,18 @@ def _sigmas(segment: Segment) -> str:
 
 def check_table(findings: Findings) -> RenderableType:
     """The findings of a check on one screen, warnings last."""
+    return Group(glance_table(findings), closer_table(findings))
+
+
+def glance_table(found: Glance | Findings) -> RenderableType:
+    """What a check sees at once."""
+    return Group(*map(_body_section, found.bodies), _measurements_section(found))
+
+
+def closer_table(findings: Findings) -> RenderableType:
+    """What follows it, warnings last."""
     return Group(
-        *map(_body_section, findings.bodies),
         *_motion_section(findings),
-        _measurements_section(findings),
         _solve_section(findings),
         Text(""),
         *_sentences("note", findings.notes, "default"),
@@ -513,10 +537,6 @@ def _body_section(body: BodyFinding) -> RenderableType:
             "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
-            "guess": ", ".join(
-                f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
-                for name, value in body.guess.items()
-            ),
         },
     )
 
@@ -544,7 +564,7 @@ def _motion_section(findings: Findings) -> list[RenderableType]:
     return [Text(title, style="bold"), table, *more]
 
 
-def _measurements_section(findings: Findings) -> RenderableType:
+def _measurements_section(findings: Glance | Findings) -> RenderableType:
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
@@ -557,8 +577,6 @@ def _measurements_section(findings: Findings) -> RenderableType:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
     for hold in findings.holds[:SHOWN_RECORDINGS]:
         rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
-    if findings.samples:
-        rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
     return _section("Measurements", rows)
 
 
@@ -579,6 +597,15 @@ def _markers_seen(recording: Recording) -> str:
 
 def _solve_section(findings: Findings) -> RenderableType:
     rows = {
+        "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
+            f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
+            for name, value in body.guess.items()
+        )
+        for body in findings.bodies
+    }
+    if findings.samples and findings.rms_at_guess_m is not None:
+        rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
+    rows |= {
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
     }

@@ -10,9 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from problem_files import REFERENCES, Edit, both, replace_cell, replace_text, run_command, settings
+from problems_small import TRUTH, hung_cube
+from test_static import block
 
-from collocation_sysid.check import Findings, check_problem
+from collocation_sysid.check import Findings, check_problem, glance
 from collocation_sysid.check.cost import Cost, cost_notes, cost_warnings
+from collocation_sysid.check.derivatives import shortened
 from collocation_sysid.check.elements import element_warnings, slenderness, worst_elements
 from collocation_sysid.check.motion import ModeFinding, Motion, motion_of, motion_warnings
 from collocation_sysid.fem.body import Body
@@ -21,6 +24,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.numerical_damping import numerical_mode
 from collocation_sysid.nlp.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
+from collocation_sysid.terminal import check_table, plain_text
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
 SILICONE = (
@@ -262,7 +266,7 @@ def test_tracks_in_another_unit_are_warned_of(tiny: Path):
 
 @pytest.mark.parametrize("scheme", ["backward-euler", "midpoint", "bdf2"])
 def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme: str):
-    monkeypatch.setattr("collocation_sysid.check.SAMPLES", 5)
+    monkeypatch.setattr("collocation_sysid.check.derivatives.SAMPLES", 5)
     overrides = (f"transcription.scheme={scheme}", "transcription.substeps=2")
     findings = checked(tiny, *overrides)
     whole = Problem.read(tiny / "problem.toml", overrides).collocation()
@@ -290,6 +294,60 @@ def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
     assert cost_notes(small, (small, large)) == []
 
 
+# What is seen at once, and what takes longer -----------------------------------------------------
+
+
+def no_simulation(*_):
+    raise AssertionError("simulated")
+
+
+def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
+    for name in ("initial_variables", "started"):
+        monkeypatch.setattr(f"collocation_sysid.check.{name}", no_simulation)
+    unguessed = ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
+    seen = glance(Problem.read(tiny / "problem.toml", unguessed))
+    assert seen.bodies[0].elements > 0
+    assert seen.recordings[0].samples == 27
+    assert seen.holds[0].nodes == 9
+    assert seen.recordings[0].markers[0].start_miss_m is None
+
+
+def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.check.initial_variables", no_simulation)
+    shown = []
+    show = "collocation_sysid.cli.problems.show"
+    monkeypatch.setattr(show, lambda content: shown.append(plain_text(content)))
+    with pytest.raises(AssertionError, match="simulated"):
+        run_command("check", "problem.toml")
+    (first,) = shown
+    assert "Body" in first
+    assert "grasp of 'swing'  9 nodes" in first
+
+
+def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.check.PATIENCE_S", 0.0)
+    monkeypatch.setattr("collocation_sysid.check.derivatives.SAMPLES", 4)
+    problem, told = Problem.read(tiny / "problem.toml"), []
+    short = check_problem(problem, told.append)
+    assert short.rms_at_guess_m is None
+    assert any("but for their first samples" in n and "check --full" in n for n in short.notes)
+    assert "markers are missed by" not in plain_text(check_table(short))
+    assert short.derivatives_agree
+    assert not any("simulating the recordings" in each for each in told)
+    whole = check_problem(problem, told.append, full=True)
+    assert (whole.rms_at_guess_m or 0) > 0
+    assert "markers are missed by" in plain_text(check_table(whole))
+    assert any("simulating the recordings at the guess" in each for each in told)
+    assert short.jacobian_nonzeros == whole.jacobian_nonzeros
+
+
+def test_of_equilibria_three_samples_have_all_kinds_of_rows():
+    static = shortened(Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH))
+    assert len(static.experiments[0].t_s) == 3
+    moving = shortened(Problem([hung_cube(30)], TRUTH))
+    assert len(moving.experiments[0].t_s) == 12
+
+
 # The screen and the JSON ------------------------------------------------------------------------
 
 
@@ -303,7 +361,7 @@ def test_the_findings_fit_a_screen_with_the_warnings_last(tiny: Path, monkeypatc
     assert max(map(len, lines)) <= 80
     heads = [line.split()[0] for line in lines if line and not line.startswith(" ")]
     sections = [head for head in heads if head in ("Body", "Modes", "Measurements", "Solve")]
-    assert sections == ["Body", "Modes", "Measurements", "Solve"]
+    assert sections == ["Body", "Measurements", "Modes", "Solve"]
     assert heads[-1] == "The"
     assert heads[-2] == "what"
     assert heads[-3] == "warning:"

@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -35,6 +36,7 @@ import collocation_sysid as cs
 from collocation_sysid import terminal
 from collocation_sysid.cli import common
 from collocation_sysid.experiment import read_markers, read_poses
+from collocation_sysid.heartbeat import Heartbeat
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
@@ -308,6 +310,26 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
     assert "violation N" in screen.getvalue()
     assert "2.5000" in screen.getvalue()
     assert "checking" in screen.getvalue()
+
+
+def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
+    monkeypatch.setattr("collocation_sysid.heartbeat.FIRST_S", 0.01)
+    told, lines = threading.Event(), []
+
+    class Log(io.StringIO):
+        def write(self, text: str) -> int:
+            lines.append(text)
+            told.set()
+            return len(text)
+
+    with terminal.Progress(Console(file=Log())) as progress:
+        progress.say("simulating the first samples")
+        assert told.wait(30.0)
+    assert "finding a start" in lines[0] or "simulating the first samples" in lines[0]
+    assert "s so far)" in lines[0]
+    with terminal.Progress(Console(file=Log()), quiet=True) as progress:
+        assert progress._heartbeat is None
+    assert not any(thread.name == Heartbeat.NAME for thread in threading.enumerate())
 
 
 @pytest.mark.parametrize(("options", "shown"), [([], True), (["--quiet"], False)])

@@ -160,7 +160,7 @@ def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches(
 
 def test_check_compares_the_slopes_of_wrenches():
     problem = Problem([swung()], UNKNOWN)
-    short = shortened(problem, 12).collocation()
+    short = shortened(problem).collocation()
     jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
     assert jacobian < 1e-6
     assert 0 < hessian < 1e-6

@@ -5,6 +5,8 @@ Every warning is one sentence that ends with the remedy.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,7 +14,7 @@ from ..arrays import Array
 from ..experiment.turning import turning_warnings
 from ..methods.method import Method
 from ..methods.reduced_space import ReducedSpace
-from ..methods.scan import started
+from ..methods.scan import SOFT_PA, started, usual_parameters
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
 from ..nlp.explicit import Explicit, made_explicit
@@ -29,7 +31,7 @@ from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
 from ..statistics.trust import stability_concerns
 from .cost import Cost, cost_notes, cost_warnings, costs
-from .derivatives import SAMPLES, derivative_errors, shortened
+from .derivatives import derivative_errors, shortened
 from .description import description_causes
 from .elements import ElementShape
 from .hold import Hold, hold_warnings, holds_of
@@ -43,21 +45,34 @@ __all__ = [
     "Cost",
     "ElementShape",
     "Findings",
+    "Glance",
     "Hold",
     "MarkerFinding",
     "ModeFinding",
     "Motion",
     "Recording",
     "check_problem",
+    "glance",
 ]
 
 
+# A simulation of the whole recordings that takes longer than this is left out unless asked for.
+PATIENCE_S = 10.0
 # Agreement with fourth-order central differences that rounding allows.
 AGREEMENT = 1e-6
 CHOSEN = (
     "numbers of steps hold for one a sample: solve takes as many as the error bars ask for, up to "
     f"{MOST_SUBSTEPS}, where transcription.substeps states none"
 )
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What `check` sees without a simulation, see `Findings`."""
+
+    bodies: tuple[BodyFinding, ...]
+    recordings: tuple[Recording, ...]
+    holds: tuple[Hold, ...]
 
 
 @dataclass(frozen=True)
@@ -70,8 +85,9 @@ class Findings:
     samples, missing : int
         Marker samples that are there and that are not, of all experiments.
     largest_marker_distance_m : float
-    rms_at_guess_m : float
-        Distance of the markers from their measurements in the simulation at the guess.
+    rms_at_guess_m : float or None
+        Distance of the markers from their measurements in the simulation at the guess; None where
+        that is left out.
     recordings : tuple of Recording, one for each experiment
     motions : tuple of Motion, one for each fitted experiment that moves
     variables, constraints : int
@@ -98,7 +114,7 @@ class Findings:
     samples: int
     missing: int
     largest_marker_distance_m: float
-    rms_at_guess_m: float
+    rms_at_guess_m: float | None
     recordings: tuple[Recording, ...]
     motions: tuple[Motion, ...]
     variables: int
@@ -127,32 +143,62 @@ class Findings:
         return asdict(self)
 
 
-def check_problem(problem: Problem) -> Findings:
+def glance(problem: Problem) -> Glance:
+    """What is seen at once: bodies, recordings and grasps; missing guesses are usual ones."""
+    usual = usual_parameters(problem.parameters, SOFT_PA)
+    bodies = _bodies(replace(problem, parameters=usual))
+    recordings = tuple(recording_of(e, None) for e in problem.experiments)
+    return Glance(bodies, recordings, _holds(problem, bodies))
+
+
+def check_problem(
+    problem: Problem, say: Callable[[str], None] | None = None, full: bool = False
+) -> Findings:
     """Validate a loaded problem further and measure it.
 
     Where parameters have no guess, a scan finds where a solve would start.
+
+    Parameters
+    ----------
+    problem : Problem
+    say : callable, optional
+        Called with what is being done now, a text.
+    full : bool
+        Whether the whole recordings are simulated at the guess however long that takes; by default
+        their first samples where it is more than some ten seconds.
 
     Raises
     ------
     InputError
         Where no start is found.
     """
+    say = say or (lambda _: None)
     collocation, scan = problem.collocation(), None
     if problem.parameters.unguessed:
+        say("looking for a start, as there is no guess")
         collocation, scan = started(collocation)
         problem = replace(problem, parameters=collocation.parameters)
     guesses = problem.parameters.guesses
-    z, start_notes = initial_variables(collocation)
-    short = shortened(problem, SAMPLES).collocation()
-    jacobian_error, hessian_error = derivative_errors(short, initial_variables(short)[0])
+    say("simulating the first samples at the guess")
+    began, short = time.perf_counter(), shortened(problem).collocation()
+    first_z, start_notes = initial_variables(short)
+    whole_s = (time.perf_counter() - began) * _rows(collocation) / _rows(short)
+    say("comparing derivatives with differences")
+    jacobian_error, hessian_error = derivative_errors(short, first_z)
+    say("estimating what methods take")
     whole = made_explicit(collocation)
     jacobian, hessian = nonzeros(problem, whole)
-    method = _name(problem.method)
-    found_costs = costs(collocation, z, jacobian + hessian, _factorisation(problem))
+    method, choice = _name(problem.method), _factorisation(problem)
+    found_costs = costs(collocation, short, first_z, jacobian + hessian, choice)
     chosen = next((cost for cost in found_costs if cost.method == method), None)
 
+    simulated, z = short, first_z
+    if full or whole_s <= PATIENCE_S:
+        say(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
+        simulated, (z, start_notes) = collocation, initial_variables(collocation)
     bodies = _bodies(problem)
-    recordings = _recordings(problem, collocation, z)
+    recordings = _recordings(problem, simulated, z)
+    say("looking at modes and at the description")
     scheme = as_scheme(collocation.scheme)
     motions = tuple(
         motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
@@ -167,7 +213,7 @@ def check_problem(problem: Problem) -> Findings:
         warnings += hold_warnings(hold)
     for motion in motions:
         warnings += motion_warnings(motion)
-    warnings += [said for said, _ in stability_concerns(instabilities(collocation, z))]
+    warnings += [said for said, _ in stability_concerns(instabilities(simulated, z))]
     for experiment in problem.experiments:
         warnings += turning_warnings(experiment, problem.first_substeps)
     for recording in recordings:
@@ -180,6 +226,11 @@ def check_problem(problem: Problem) -> Findings:
     for motion in motions:
         notes += motion_notes(motion)
     notes += cost_notes(chosen, found_costs) if chosen else []
+    if simulated is short:
+        notes.append(
+            f"the recordings were not simulated at the guess but for their first samples: it would "
+            f"take about {whole_s:.2g} s; check --full does it"
+        )
     notes += [CHOSEN] * (problem.substeps == "auto" and bool(motions))
     return Findings(
         bodies=bodies,
@@ -190,7 +241,7 @@ def check_problem(problem: Problem) -> Findings:
         largest_marker_distance_m=max(
             (r.farthest.distance_m for r in recordings if r.markers), default=0.0
         ),
-        rms_at_guess_m=collocation.rms_m(z),
+        rms_at_guess_m=None if simulated is short else collocation.rms_m(z),
         recordings=recordings,
         motions=motions,
         variables=collocation.variables,
@@ -245,8 +296,13 @@ def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
 
 
 def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[Recording, ...]:
+    """What was recorded; `collocation` may be of the first samples."""
     simulated = {}
     for part in collocation.parts(z):
         at_samples = part.x[part.segment.observation.grid_rows]
         simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
+
+
+def _rows(collocation: Collocation) -> int:
+    return sum(segment.grid_rows for segment in collocation.segments)

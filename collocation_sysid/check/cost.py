@@ -45,21 +45,25 @@ class Cost:
 
 
 def costs(
-    collocation: Collocation, z: Array, nonzeros: int, factorisation: Choice
+    collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
 ) -> tuple[Cost, ...]:
     """Costs by method.
 
     Parameters
     ----------
     collocation : Collocation
-    z : (variables,) the start
+    short : Collocation
+        Of the first samples of the same experiments.
+    z : (variables,) the start of these
     nonzeros : int
         Of the Jacobian and the Hessian that interior point gets, together.
     factorisation : {"auto", "band", "sparse", "supernodal"}
     """
     width = max(unknowns_of_a_timestep(collocation))
     return (
-        Cost("reduced-space", memory_mb(collocation), _sweeps_s(collocation, z, factorisation)),
+        Cost(
+            "reduced-space", memory_mb(collocation), _sweeps_s(collocation, short, z, factorisation)
+        ),
         Cost(
             "interior-point",
             interior_point_mb(nonzeros),
@@ -102,10 +106,12 @@ def cost_warnings(chosen: Cost, others: Sequence[Cost]) -> list[str]:
     ]
 
 
-def _sweeps_s(collocation: Collocation, z: Array, factorisation: Choice) -> float | None:
+def _sweeps_s(
+    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
+) -> float | None:
     """Seconds of all sweeps, from one over the first rows of each experiment."""
     total = 0.0
-    for part in collocation.parts(z):
+    for segment, part in zip(collocation.segments, short.parts(z), strict=True):
         rows, setting = min(ROWS, len(part.x)), part.setting
         solver = BlockSolver(part.segment, rows, factorisation=factorisation)
         began = time.perf_counter()
@@ -113,5 +119,5 @@ def _sweeps_s(collocation: Collocation, z: Array, factorisation: Choice) -> floa
             solver.forward(part.x[:rows], setting)
         except SimulationError:
             return None
-        total += len(part.x) / rows * (time.perf_counter() - began)
+        total += segment.grid_rows / rows * (time.perf_counter() - began)
     return SWEEPS * total

@@ -14,18 +14,23 @@ from ..nlp.collocation import Collocation
 from ..nlp.explicit import Explicit, carried_over, made_explicit
 from ..problem import Problem
 
-# All kinds of rows are among these samples; derivatives do not depend on how many follow.
-SAMPLES = 12
+# All kinds of rows are among these samples, those of equilibria among fewer; derivatives do not
+# depend on how many follow.
+SAMPLES, STATIC_SAMPLES = 12, 3
 STEP = 1e-5
 # With more entries memory and wrenches are not laid out as variables: their slopes are checked.
 LAID_OUT = 5e6
 
 
-def shortened(problem: Problem, samples: int) -> Problem:
-    """The same problem with the first samples of every experiment only."""
-    return replace(
-        problem, experiments=tuple(first_samples(e, samples) for e in problem.experiments)
-    )
+def few(experiment: Experiment) -> int:
+    """How many first samples have all kinds of rows."""
+    return STATIC_SAMPLES if experiment.static else SAMPLES
+
+
+def shortened(problem: Problem) -> Problem:
+    """The same problem with a few first samples of every experiment only."""
+    short = tuple(first_samples(e, few(e)) for e in problem.experiments)
+    return replace(problem, experiments=short)
 
 
 def first_samples(experiment: Experiment, samples: int) -> Experiment:

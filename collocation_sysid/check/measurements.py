@@ -70,12 +70,13 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     ----------
     experiment : Experiment
     positions_m : (T, n, 3) or None
-        Its simulation at the guess, at the samples.
+        Its simulation at the guess, at the samples or the first of them.
     """
     markers = experiment.markers
-    miss = None
+    miss = np.zeros((0, len(markers.names)))
     if positions_m is not None:
-        miss = np.linalg.norm(markers.observe(positions_m) - markers.positions_m, axis=2)
+        seen_m = markers.positions_m[: len(positions_m)]
+        miss = np.linalg.norm(markers.observe(positions_m) - seen_m, axis=2)
     found = []
     for k, name in enumerate(markers.names):
         seen = np.flatnonzero(markers.present[:, k])
@@ -85,7 +86,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
                 float(markers.placement.distance_m[k]),
                 len(seen),
                 int(markers.missing[k]),
-                None if miss is None or not len(seen) else float(miss[seen[0], k]),
+                float(miss[seen[0], k]) if len(seen) and seen[0] < len(miss) else None,
             )
         )
     return Recording(

@@ -17,7 +17,7 @@ from ..methods.reduced_space import ReducedSpace, memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.explicit import Explicit, made_explicit
 from ..problem import Problem
-from .derivatives import SAMPLES, first_samples, shortened
+from .derivatives import few, first_samples, shortened
 
 # IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
 BYTES = 280.0
@@ -89,14 +89,14 @@ def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
     `whole` is the problem's program as interior point has it.
     """
     further = whole.further_nonzeros if isinstance(whole, Explicit) else (0, 0)
-    short = shortened(problem, SAMPLES)
-    total = few = _counted(short)
+    short = shortened(problem)
+    total = least = _counted(short)
     for k, experiment in enumerate(problem.experiments):
         if not experiment.validation:
             parts = list(short.experiments)
-            parts[k] = first_samples(experiment, SAMPLES + 1)
-            more = _counted(replace(problem, experiments=parts)) - few
-            total = total + max(0, len(experiment.t_s) - SAMPLES) * more
+            parts[k] = first_samples(experiment, few(experiment) + 1)
+            more = _counted(replace(problem, experiments=parts)) - least
+            total = total + max(0, len(experiment.t_s) - few(experiment)) * more
     return int(total[0]) + further[0], int(total[1]) + further[1]
 
 

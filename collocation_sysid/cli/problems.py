@@ -152,24 +152,38 @@ def simulate(
 
 @commands.command(
     epilog=examples(
-        "check problem.toml", "check problem.toml --set transcription.scheme=backward-euler"
+        "check problem.toml",
+        "check problem.toml --full",
+        "check problem.toml --set transcription.scheme=backward-euler",
     )
 )
 def check(
     problem: ProblemPath,
     set_: Overrides = None,
     allow_code: AllowCode = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Simulate all samples, however long that takes.")
+    ] = False,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Tell what is wrong with a problem before solving it."""
-    from ..check import check_problem
-    from ..problem import Problem
-    from ..terminal import check_table
+    """Tell what is wrong with a problem before solving it.
 
-    findings = check_problem(Problem.read(problem, set_ or (), allow_code))
+    Bodies, recordings and grasps are shown at once; derivatives, costs and the simulation at the
+    guess follow, of the first samples where the whole takes more than some ten seconds.
+    """
+    from ..check import check_problem, glance
+    from ..problem import Problem
+    from ..terminal import Progress, closer_table, glance_table
+
+    loaded = Problem.read(problem, set_ or (), allow_code)
+    if not as_json:
+        show(glance_table(glance(loaded)))
+    with Progress(errors, quiet=quiet) as progress:
+        findings = check_problem(loaded, progress.say, full)
     if as_json:
         typer.echo(json.dumps(findings.as_dict(), indent=1))
     else:
-        show(check_table(findings))
+        show(closer_table(findings))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
