@@ -24,7 +24,7 @@ LAYERS = (
     {"check", "earlier", "rollout", "second_start", "verdict", "run", "refine"},
     {"output", "synthesis", "beginning"},
     {"export"},
-    {"terminal", "method_tables"},
+    {"terminal", "heartbeat", "method_tables"},
     {"live"},
     {"design", "study"},
     {"cli"},
