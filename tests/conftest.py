@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from problem_files import write_problem
 
+from collocation_sysid import heartbeat
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
@@ -22,6 +23,14 @@ def _runs_without_pictures() -> Iterator[None]:
     """Pictures take most of the time of a small run; `problem_files.pictures_drawn` has them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(record, "_write_pictures", lambda *_: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_lines_of_slow_machines() -> Iterator[None]:
+    """What runs leave on stderr does not depend on how busy the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(heartbeat, "FIRST_S", 1e6)
         yield
 
 
