@@ -73,6 +73,9 @@ def test_without_any_nothing_is_added():
     assert none.force(cube.body.nodes_m.ravel()[None]) == 0.0
     at = cube.body.linearise(*still(cube.body, 1))
     assert none.added_to(at, cube.body.nodes_m.ravel()[None]) is at
+    x, v, theta = still(cube.body, 1)
+    bent = cube.body.curvature(x, v, x, theta)
+    assert none.bent(bent, x, x) is bent
 
 
 def still(body, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,3 +113,23 @@ def test_slopes_are_those_of_the_forces(xi):
         ends = (drives.off_by(given + s * off.reshape(2, 2)).force(xi) for s in (1, -1))
         slope = np.subtract(*ends) / 2e-4
         np.testing.assert_allclose(by_theta[:, :, k], slope, atol=1e-7 * np.abs(slope).max())
+
+
+def test_second_derivatives_are_those_of_the_slopes(xi):
+    drives, step = Drives.of(BAR, FROM_S), 1e-6
+    w, way = np.random.default_rng(3).normal(size=(2, *xi.shape))
+    x, v, theta = still(BAR.body, len(xi))
+    own = BAR.body.curvature(x, v, w, theta)
+    found = drives.bent(own, xi, w)
+    before, constants = drives.joined.spread(own.position_position), own.position_theta.shape[2]
+    ends = [linearised(drives, xi + sign * step * way) for sign in (1, -1)]
+
+    ahead, behind = (drives.joined.pattern.products(each[1], w) for each in ends)
+    expected = (ahead - behind) / (2 * step)
+    turned = drives.joined.pattern.products(found.position_position - before, way)
+    np.testing.assert_allclose(turned, expected, atol=1e-5 * np.abs(expected).max())
+
+    ahead, behind = (np.einsum("ti,tik->tk", w, each[2]) for each in ends)
+    expected = (ahead - behind) / (2 * step)
+    along = np.einsum("ti,tik->tk", way, found.position_theta[:, :, constants:])
+    np.testing.assert_allclose(along, expected, atol=1e-5 * np.abs(expected).max())

@@ -124,6 +124,15 @@ def test_three_parameters_can_be_confounded_without_any_two_being_so():
     assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded: only")
 
 
+def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
+    basis = np.array([[1.0, 0, 0], [-1.0, -0.35, 0.05], [0, 1.0, 0]])
+    covariance = np.diag([0, 0, 0, 1e-4])
+    covariance[:3, :3] = 0.2**2 * basis @ basis.T
+    (sentence,) = [s for s in verdicts(uncertainty(covariance)) if "only their" in s]
+    assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded")
+    assert "lambda_pa · mu_pa · gamma_r_s^0.35 is fixed" in sentence
+
+
 # The third's deviation is √2 times as large, and an interval of 25 % is still well fixed.
 WELL = np.log(1.25) / (Z95 * np.sqrt(2.01))
 

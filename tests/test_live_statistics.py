@@ -51,6 +51,7 @@ TOO_LITTLE = {
 }
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("values", TOO_LITTLE.values(), ids=TOO_LITTLE)
 def test_too_little_shows_no_autocorrelation(values):
     assert Scatter.of(values).lag1 == 0.0
@@ -58,6 +59,13 @@ def test_too_little_shows_no_autocorrelation(values):
 
 def test_ten_samples_are_enough_and_what_never_forgets_is_limited():
     assert Scatter.of(samples(np.ones(10))) == Scatter(1.0, 0.98)
+
+
+@pytest.mark.parametrize(("count", "matters"), [(30, False), (60, True)])
+def test_what_matters_is_larger_than_its_deviation_by_3(count, matters):
+    wave = np.cos(np.arccos(0.3) * np.arange(count))
+    found = Scatter.of(samples(wave, markers=1)).lag1
+    assert found == pytest.approx(0.3 if matters else 0.0, abs=0.03)
 
 
 def test_only_what_is_more_than_chance_counts(rng):
