@@ -472,7 +472,7 @@ def run(
         substeps = found.solution.collocation.substeps
         turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
         found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
-        if not seek_causes:
+        if not seek_causes or found.solution.status is Status.INTERRUPTED:
             return found
         say("looking for causes of the misfit")
         found = replace(found, causes=likely_causes(found.solution))

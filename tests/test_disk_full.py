@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -136,3 +138,13 @@ def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
         write_whole(place / "table.csv", 100 * "x")
     assert ".partial" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
+def test_an_output_that_is_full_is_told():
+    program = [sys.executable, "-c", "from collocation_sysid.cli import main; main()", "schema"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: standard output, or a temporary file: No space left")
+    assert done.stderr.count("\n") == 1
