@@ -16,6 +16,7 @@ from collocation_sysid.experiment import displaced_axes, read_displacement, read
 from collocation_sysid.experiment.force_files import read_pressure
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
+from collocation_sysid.statistics.description import doubts
 
 TIMES = [0.0, 0.1, 0.2]
 PRESSED_MM = [0.0, 0.25, 0.5]
@@ -221,6 +222,30 @@ def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
     assert {file.name for file in problem.origin.files} == {"block.vtu", "first.csv", "second.csv"}
     overridden = Problem.read(tmp_path / "problem.toml", ["experiment_defaults.every=3"])
     np.testing.assert_allclose(overridden.experiments[0].t_s, [0, 0.3])
+
+
+def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
+    def said(text: str) -> list[str]:
+        problem = Problem.read(block_problem(tmp_path, text))
+        return [cause.sentence for each in problem.experiments for cause in doubts(each, {})]
+
+    assert said(SHARED) == []
+    assert said(SHARED.replace("sign = -1", "sign = 1")) == []  # pulled, not pressed
+    for wrong in (
+        SHARED.replace("{ sign = -1 }", "{}"),
+        SHARED.replace("{ sign = -1, sym", "{ sym"),
+    ):
+        both = said(wrong)
+        assert [sentence.partition(":")[0] for sentence in both] == ["'second'"]
+        assert "along z grasp 2 and the force that it gives go opposite ways" in both[0]
+        assert "set sign = -1 of its displacement or of its wrench" in both[0]
+
+
+def test_a_part_of_a_default_is_overridden_for_one_experiment(tmp_path):
+    file = block_problem(tmp_path)
+    problem = Problem.read(file, ["experiment.second.grasp.1.wrench.sigma_n=0.4"])
+    sigmas = [e.grasps[1].wrench.sigma_n for e in problem.experiments if e.grasps[1].wrench]
+    assert sigmas == [0.01, 0.1]
 
 
 @pytest.mark.parametrize(

@@ -462,7 +462,8 @@ def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
         pytest.skip(str(error))
     findings = check_problem(problem)
     assert findings.derivatives_agree
-    assert findings.samples > 0
+    grasps = [grasp for each in problem.experiments for grasp in each.grasps]
+    assert findings.samples > 0 or any(grasp.wrench for grasp in grasps)
     assert all(body.smallest_element_quality > 0.1 for body in findings.bodies)
 
 

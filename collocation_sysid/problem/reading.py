@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,9 @@ def _apply(content: dict[str, Any], override: str) -> None:
         )
     place: Any = content
     *leading, last = _as_written(content, parts)
-    for part in leading:
+    for depth, part in enumerate(leading):
+        if depth == 2 and leading[0] == "experiment" and isinstance(place, dict):
+            _take_default(content, place, part)
         place = _descend(place, part, key)
     if isinstance(place, list):
         place[_index(place, last, key)] = _value(value, key)
@@ -152,6 +155,13 @@ def _apply(content: dict[str, Any], override: str) -> None:
         place[last] = _value(value, key)
     else:
         raise _no_table(place, key)
+
+
+def _take_default(content: dict[str, Any], experiment: dict[str, Any], key: str) -> None:
+    """Give an experiment a default of its own, a part of which is to be overridden."""
+    shared = content.get("experiment_defaults")
+    if isinstance(shared, dict) and key in shared and key not in experiment:
+        experiment[key] = deepcopy(shared[key])
 
 
 def _as_written(content: Any, parts: list[str]) -> list[str]:

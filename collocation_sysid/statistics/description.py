@@ -23,6 +23,7 @@ from .cause import Cause, ranked
 from .exchanges import exchanges
 from .mistakes import mistakes
 from .steps import steps
+from .work import against_the_load
 
 # The misfit falls by this factor at least before a cause is named.
 FAR_BETTER = 2.0
@@ -61,7 +62,9 @@ def doubts(
     huber : float, optional
         Of the loss, where it is Huber's.
     """
-    if experiment.static or not experiment.markers.names:
+    if experiment.static:
+        return ranked(against_the_load(experiment))
+    if not experiment.markers.names:
         return ()
     sudden = (*exchanges(experiment, huber), *steps(experiment))
     comparison = Comparison.of(experiment, constants)
