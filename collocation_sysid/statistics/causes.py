@@ -25,6 +25,7 @@ from ..nlp.any_stiffness import Described
 from .cause import Cause, ranked
 from .description import Comparison, doubts
 from .mistakes import gravity_mistakes
+from .work import against_the_load
 from .wrench_causes import wrench_causes
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ def likely_causes(found: Run | Solution, budget: int | None = None) -> tuple[Cau
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
     causes, worst = [], fitted[int(np.argmax(misfits))]
     causes += wrench_causes(solution)
+    causes += [cause for each in fitted for cause in against_the_load(each)]
     if max(misfits) <= NOISE:
         return ranked(causes)
     causes += doubts(worst, solution.parameters, solution.collocation.huber)

@@ -62,10 +62,8 @@ def doubts(
     huber : float, optional
         Of the loss, where it is Huber's.
     """
-    if experiment.static:
+    if experiment.static or not experiment.markers.names:
         return ranked(against_the_load(experiment))
-    if not experiment.markers.names:
-        return ()
     sudden = (*exchanges(experiment, huber), *steps(experiment))
     comparison = Comparison.of(experiment, constants)
     if comparison is None:

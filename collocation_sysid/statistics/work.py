@@ -15,8 +15,11 @@ FEWEST = 3
 
 
 def against_the_load(experiment: Experiment) -> Iterator[Cause]:
-    """Displacements of an experiment whose own load goes the other way."""
-    for k, grasp in enumerate(experiment.grasps, start=1):
+    """Displacements of a static experiment whose own load goes the other way.
+
+    What moves may be pushed against its displacement, by its inertia.
+    """
+    for k, grasp in enumerate(experiment.grasps if experiment.static else (), start=1):
         if grasp.wrench is None:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
