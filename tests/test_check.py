@@ -205,7 +205,15 @@ def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, e
     assert shape.thickness_m == pytest.approx(min(size_m))
     body = Body(mesh, density_kg_m3=30.0, element=element)
     warnings = element_warnings(body, COMPRESSIBLE, shape, worst_elements(mesh)[0])
-    assert any("too stiff in bending" in warning for warning in warnings) == warned
+    said = [warning for warning in warnings if "too stiff in bending" in warning]
+    assert bool(said) == warned
+    assert all("of a real body" in each and "not of data simulated with" in each for each in said)
+
+
+def test_as_many_elements_across_as_are_needed_are_enough():
+    mesh = box_mesh((0.005, 0.005, 0.03), (2, 2, 12))
+    body = Body(mesh, density_kg_m3=30.0, element="tet10-p0")
+    assert not element_warnings(body, COMPRESSIBLE, slenderness(mesh), worst_elements(mesh)[0])
 
 
 def test_thickness_does_not_depend_on_how_the_body_lies():
