@@ -218,8 +218,8 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("collocation_sysid.experiment.writers.os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr("collocation_sysid.files.os.replace", fail)
+    with pytest.raises(InputError, match=r"poses\.csv: cannot be written: disk full"):
         write_poses_csv(path, PoseSequence.fixed())
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
