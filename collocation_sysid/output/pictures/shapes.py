@@ -98,7 +98,7 @@ def shapes(
     total = HEAD_MM + scale * (high - low) + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
     skins = [None] * len(shown) if field is None else _coloured(axes, field, positions_m[shown])
-    start = CORNER_MM
+    start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, skin in zip(shown, left, right, skins, strict=True):
         view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
         body = Drawn(axes, view, surface, surface_parts, surface_nodes)

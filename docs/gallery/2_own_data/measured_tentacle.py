@@ -7,6 +7,7 @@ markers in each. Tension and weight, both known, tell stiffness and density. The
 ``python scripts/get_soft_tentacle.py``; it takes some minutes.
 """
 
+# sphinx_gallery_thumbnail_path = 'pictures/measured_tentacle.png'
 from pathlib import Path
 
 import matplotlib.pyplot as plt
