@@ -7,6 +7,7 @@ every run starts from table1's guess in a process of its own. Writes a table, JS
     python scripts/benchmark_methods.py --scaling            # T = 50 … 1600, 95 … 5000 nodes
     python scripts/benchmark_methods.py --mesh 4x32 --steps 1000 --methods reduced-space
     python scripts/benchmark_methods.py --cluster --mesh 3x12 --steps 50   # one and two workers
+    python scripts/benchmark_methods.py --unknown --mesh 2x4 --steps 50    # what is not known costs
 """
 
 from __future__ import annotations
@@ -37,13 +38,17 @@ from collocation_sysid import (
     Parameters,
     simulate,
 )
-from collocation_sysid.experiment import Nuisance, place_markers
+from collocation_sysid.experiment import Nuisance, Wrench, place_markers
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.workers import OnCluster
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.nlp.parameters import Unknown
+from collocation_sysid.nlp.simulation import with_markers, with_wrenches
+from collocation_sysid.problem import Problem
+from collocation_sysid.run import solve
 
 BOTH = ["interior-point", "reduced-space"]
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -164,6 +169,58 @@ def in_own_process(mesh: str, steps: int, method: str) -> Row:
         return pool.apply(measure, (mesh, steps, method))
 
 
+# What may not be known, each beside the same with nothing unknown but the parameters.
+UNKNOWN = ("clock, gravity, grasp", "places as well", "with a wrench", "with memory")
+MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.05}
+WRENCH_SIGMAS = 0.01, 0.001
+
+
+def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
+    """A recording with noise and what is unknown by default, or nothing."""
+    noise = np.random.default_rng(0).normal
+    memory = MEMORY if case == "with memory" else {}
+    body = Body(cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else [])
+    experiment = swung(body, steps)
+    if case == "with a wrench":
+        sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
+        grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]
+        experiment = replace(experiment, grasps=grasps)
+    made, markers = simulate(experiment, TRUTH | memory, "midpoint"), experiment.markers
+    sigmas = np.repeat(WRENCH_SIGMAS, 3)
+    felt = [wrench + sigmas * noise(size=wrench.shape) for wrench in made.wrenches]
+    placement = None if case == "places as well" and not ideal else markers.placement
+    tracks = made.markers_m + 1e-3 * noise(size=made.markers_m.shape)
+    seen = Markers(markers.t_s, tracks, markers.sigma_m, placement=placement)
+    nuisance = Nuisance.none() if ideal else Nuisance()
+    experiment = replace(with_wrenches(experiment, felt), markers=seen, nuisance=nuisance)
+    guesses = {item.name: Unknown(item.guess, item.lower, item.upper) for item in PARAMETERS.items}
+    return Problem([experiment], guesses | memory, scheme="midpoint")
+
+
+def identified(mesh: str, steps: int, case: str, ideal: bool) -> tuple[float, int, float]:
+    """Processor time and iterations of interior point, and how far reduced space ends from it."""
+    expected = solve(problem_of(mesh, steps, case, ideal), ReducedSpace())
+    began = time.process_time()
+    found = InteriorPoint()(expected.collocation)  # where its markers are read
+    spent_s = time.process_time() - began
+    if not found.status.converged:
+        raise SystemExit(f"{case}: {found.message}")
+    return spent_s, found.iterations, float(np.abs(found.q - expected.q).max())
+
+
+def show_unknown(mesh: str, steps: int) -> None:
+    """What interior point takes for what is not known, over what it takes without."""
+    for case in UNKNOWN:
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            ideal, whole = (pool.apply(identified, (mesh, steps, case, e)) for e in (True, False))
+        print(
+            f"{case:22} {mesh}, {steps} steps: {ideal[0]:7.2f} s, {ideal[1]} iterations without; "
+            f"{whole[0]:7.2f} s, {whole[1]} with: {whole[0] / ideal[0]:.2f} times; "
+            f"log parameters off reduced space's by {max(ideal[2], whole[2]):.1e}",
+            flush=True,
+        )
+
+
 def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) -> None:
     """Print how much faster two workers, and two threads, are than one, in turns.
 
@@ -264,7 +321,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--cluster", action="store_true", help="four experiments on 1, 2 workers")
+    parser.add_argument("--unknown", action="store_true", help="nuisances, places, wrench, memory")
     arguments = parser.parse_args()
+    if arguments.unknown:
+        show_unknown(arguments.mesh[0], arguments.steps[0])
+        return
     if arguments.cluster:
         shared_out(arguments.mesh[0], arguments.steps[0])
         return

@@ -21,9 +21,10 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.experiment import Experiment, Markers, Nuisance
 from collocation_sysid.fem.batched.combine import combine_with_numpy
 from collocation_sysid.fem.moduli import engineering as engineering_moduli
+from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp import block_band
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
@@ -315,6 +316,34 @@ def test_structures_are_compressed_columns_with_ascending_rows(
     indptr, indices = collocation.hessian_structure
     column = np.repeat(np.arange(collocation.variables), np.diff(indptr))
     assert (indices <= column).all()
+
+
+@pytest.mark.parametrize("huber", [None, 2.0])
+def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(huber: float | None):
+    cube = swung_cube_without_places()
+    collocation = Collocation([cube], GUESS, huber=huber)
+    z = some_point(collocation)
+    exact = collocation.hessian(z, 1.0, np.zeros(collocation.constraints)).toarray()
+    convex = np.linalg.eigvalsh(collocation.hessian(z, 1.0, None).toarray())
+    assert np.linalg.eigvalsh(exact)[0] < -1e-6 * convex[-1]
+    assert convex[0] > -1e-12 * convex[-1]
+
+
+def swung_cube_without_places() -> Experiment:
+    experiment = cube_with_nuisance(4)
+    marked = measured(experiment).markers
+    rng = np.random.default_rng(3)
+    tracks = marked.positions_m + 5e-3 * rng.normal(size=marked.positions_m.shape)
+    return replace(experiment, markers=Markers(marked.t_s, tracks, marked.sigma_m, marked.names))
+
+
+def test_gauss_newtons_hessian_is_the_exact_one_where_readings_are_met():
+    truth = Parameters(tuple(replace(item, guess=TRUTH[item.name]) for item in GUESS.items))
+    collocation = Collocation([measured(cube_with_nuisance(4))], truth)
+    (start, _), none = initial_variables(collocation), np.zeros(collocation.constraints)
+    exact = collocation.hessian(start, 1.0, none).toarray()
+    found = collocation.hessian(start, 1.0, None).toarray()
+    np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
 
 
 def test_values_are_written_where_they_are_wanted():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from dataclasses import replace
@@ -8,25 +9,35 @@ from functools import cache
 
 import numpy as np
 import pytest
+from memories_small import ONE
 from problems_small import (
     EXPERIMENTS_AND_SCHEMES,
     GUESS,
     SMALL_EXPERIMENTS,
     TRUTH,
     as_theta,
+    bar_in_two_hands,
     hung_cube,
     measured,
+    noisy,
     relative_errors,
     released_cube,
 )
+from test_explicit import of_branches, swung
+from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment, Markers, Nuisance
 from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters
+from collocation_sysid.nlp.parameters import Parameter, Parameters, Unknown
+from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.problem import Problem
+from collocation_sysid.run import solve
 
 PRECISE = InteriorPoint(tolerance=1e-11)
 
@@ -167,6 +178,50 @@ def test_a_given_start_is_used():
     assert again.history[0].parameters == solved_cube().parameters
     assert again.history[0].rms_m == pytest.approx(solved_cube().rms_m)
     np.testing.assert_allclose(again.theta, solved_cube().theta, rtol=1e-5)
+
+
+# What is unknown by default
+
+
+def unplaced() -> Experiment:
+    """A bar in one hand; nothing is known of its markers but what they show."""
+    bar = bar_in_two_hands(16)
+    held = replace(bar, grasps=bar.grasps[1:])
+    seen = noisy(held).markers
+    return replace(held, markers=Markers(seen.t_s, seen.positions_m, seen.sigma_m, seen.names))
+
+
+def remembering() -> Experiment:
+    """A small cube with a memory."""
+    made = swung(of_branches(1), ONE, 12)
+    tracks = made.markers.positions_m
+    noise = 1e-4 * np.random.default_rng(5).normal(size=tracks.shape)
+    return with_markers(made, tracks + noise)
+
+
+UNKNOWN = {
+    "places": (unplaced, TRUTH, "gamma_m_1_s"),
+    "wrench": (lambda: noisy(sensed(wristed_cube(12)), 1e-4), TRUTH, "gamma_m_1_s"),
+    "memory": (remembering, ONE, "prony_1.tau_s"),
+}
+# IPOPT's line of an iteration, with lg(rg): by how much it shifted the Hessian's diagonal.
+ITERATION = r"^ +\d+r?(?: +\S+){5} +(-|-?\d\S+) +\S+ +\S+ +\d+"
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str, capfd):
+    make, truth, known = UNKNOWN[name]
+    factors = dict(zip(truth, (2.0, 0.5, 2.0, 0.5, 1.5, 1.5), strict=False))
+    given = {k: v if k == known else Unknown(factors[k] * v) for k, v in truth.items()}
+    problem = Problem([replace(make(), nuisance=Nuisance())], given, scheme="midpoint")
+    expected = solve(problem, ReducedSpace(tolerance=1e-10))
+    precise = InteriorPoint(tolerance=1e-10, ipopt={"print_level": 5})
+    found = precise(expected.collocation)  # where its markers are read
+    shifts = re.findall(ITERATION, capfd.readouterr().out, re.MULTILINE)
+    assert found.status.converged
+    assert len(shifts) == found.iterations + 1
+    assert set(shifts) == {"-"}
+    np.testing.assert_allclose(found.q, expected.q, atol=3e-4)
 
 
 # Ends other than convergence

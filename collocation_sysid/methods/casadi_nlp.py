@@ -224,8 +224,6 @@ def _curvature(collocation: Collocation, hessian: Hessian) -> HessianValues:
     """The Hessian's values as `NlpFunctions` wants them."""
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
-        if hessian == "gauss-newton":
-            multipliers = np.zeros_like(multipliers)
-        collocation.hessian_values(z, weight, multipliers, out)
+        collocation.hessian_values(z, weight, multipliers if hessian == "exact" else None, out)
 
     return values

@@ -57,6 +57,10 @@ IPOPT_STATUS = {
 
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
+# Of MUMPS: lower than what that diagonal gives, higher than what rounding makes of a zero.
+PIVOT_TOLERANCE = 1e-10
+# By how much a step may change the damping, and the share from which on it is as good as none.
+DAMPING_CHANGE, NO_DAMPING = (0.1, 10.0), 1e-2
 
 
 @dataclass(frozen=True)
@@ -67,12 +71,14 @@ class InteriorPoint(Options):
     ----------
     hessian : {"exact", "gauss-newton", "limited-memory"}
         Second derivatives of the Lagrangian: all of them once parameters move by less than
-        `warm_up`, the loss's only, or IPOPT's own.
+        `warm_up`, those of the loss with readings that count as linear, or IPOPT's own.
     warm_up : float
-        While an iteration still changes a parameter by more than this share, an exact Hessian is
-        replaced by Gauss–Newton's with Levenberg's damping, which keeps every parameter within
-        about a factor of two a step: far from the answer, multipliers of a large residual make
-        the full Hessian indefinite and the steps wild. 0 is exact from the start.
+        While an iteration still changes a parameter by more than this share (or a nuisance
+        parameter, of its prior deviation), an exact Hessian is replaced by Gauss–Newton's with
+        Levenberg's damping, which keeps every parameter within about a factor of two a step and
+        eases off as steps shorten: far from the answer, what readings and equations of motion
+        curve at a large residual makes the full Hessian indefinite and the steps wild. 0 is exact
+        from the start.
     proximal : float
         Added to the Hessian's diagonal at the positions, most of which is zero otherwise. It
         changes the steps a little and the answer not at all, and spares the linear solver
@@ -139,11 +145,18 @@ class InteriorPoint(Options):
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
+            # A row without a pivot of its own on the diagonal waits for its columns' pivots, and
+            # fills the factor on the way. A constant there is refined away.
+            "ipopt.perturb_always_cd": "yes",
+            "ipopt.jacobian_regularization_exponent": 0.0,
+            "ipopt.jacobian_regularization_value": 1e-9,
+            "ipopt.constr_mult_init_max": 0.0,  # the warm-up needs no multipliers
             "jac_g": functions.function("jac_g", "g", "jac_g"),
             "grad_f": functions.function("grad_f", "f", "grad_f"),
         }
-        if self.linear_solver == "mumps":  # METIS ordering, no scaling: a little faster here
+        if self.linear_solver == "mumps":  # METIS's ordering as it is: IPOPT refines
             settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
+            settings |= {"ipopt.mumps_pivtol": PIVOT_TOLERANCE}
         if self.hessian == "limited-memory":
             settings["ipopt.hessian_approximation"] = "limited-memory"
         else:
@@ -157,22 +170,28 @@ class _DampedHessian:
     def __init__(self, collocation: Collocation, options: InteriorPoint) -> None:
         self.collocation = collocation
         self.options = options
-        self._last_q = np.full(collocation.nq, np.inf)
+        self._last_p = np.full(collocation.nq + collocation.nphi, np.inf)
+        self._damping = 1.0
         self._of_q, self._of_x = collocation.hessian_diagonals
 
     def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
         """Write the values at z."""
-        settled = self._is_settled(z[: self.collocation.nq])
-        if not (self.options.hessian == "exact" and settled):
-            multipliers = np.zeros_like(multipliers)
-        self.collocation.hessian_values(z, weight, multipliers, values)
+        settled = self._is_settled(self.collocation.parameters_of(z))
+        exact = self.options.hessian == "exact" and settled
+        self.collocation.hessian_values(z, weight, multipliers if exact else None, values)
         values[self._of_x] += self.options.proximal
         if not settled:
             # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
-            values[self._of_q] += weight * self.collocation.objective(z) / (2 * STEP_LIMIT**2)
+            largest = self.collocation.objective(z) / (2 * STEP_LIMIT**2)
+            values[self._of_q] += weight * self._damping * largest
 
-    def _is_settled(self, q: Array) -> bool:
-        """Whether the last step to q was short enough to end the warm-up."""
-        moved = np.abs(q - self._last_q).max(initial=0.0)
-        self._last_q = q.copy()
-        return self.options.warm_up == 0 or bool(moved < self.options.warm_up)
+    def _is_settled(self, p: Array) -> bool:
+        """Whether the last step to p was short enough to end the warm-up, and not by damping."""
+        steps = np.abs(p - self._last_p) / self.collocation.reach_p
+        self._last_p = p
+        of_q = steps[: self.collocation.nq].max(initial=0.0)
+        settled = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING
+        if np.isfinite(of_q):
+            change = np.clip((of_q / STEP_LIMIT) ** 2, *DAMPING_CHANGE)
+            self._damping = min(1.0, self._damping * change)
+        return self.options.warm_up == 0 or bool(settled)

@@ -78,6 +78,8 @@ class Part:
         What the evaluations bring from the past, where it is given; see `Dynamics`.
     felt : bool
         Whether its loss has the wrenches that follow from x.
+    bent : bool
+        Whether readings are, or taken as linear in second derivatives.
     """
 
     segment: Segment
@@ -86,6 +88,7 @@ class Part:
     x: Array
     brought: Array | None = None
     felt: bool = True
+    bent: bool = True
 
     @cached_property
     def setting(self) -> Setting:
@@ -467,11 +470,22 @@ class Collocation:
         return np.cumsum(np.arange(1, self.nq + 1)) - 1, np.concatenate(of_x)
 
     def hessian_values(
-        self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
+        self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
-        """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
+        """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
+
+        Without multipliers Gauss–Newton's: readings and constraints count as linear. That is
+        convex, which the loss itself is not where residuals are large: places and motions multiply.
+        """
+        parts, multipliers = self.bending(z, multipliers)
         weights = [segment.weights(multipliers[segment.rows]) for segment in self.segments]
-        return self.curved(self.parts(z), loss_weight, weights, out)
+        return self.curved(parts, loss_weight, weights, out)
+
+    def bending(self, z: Array, multipliers: Array | None) -> tuple[list[Part], Array]:
+        """The experiments and multipliers of `hessian_values`."""
+        bent = multipliers is not None
+        parts = [replace(part, bent=bent) for part in self.parts(z)]
+        return parts, multipliers if multipliers is not None else np.zeros(self.constraints)
 
     def curved(
         self,
@@ -502,6 +516,7 @@ class Collocation:
                 weight,
                 here,
                 (memory_weights or {}).get(number, ()),
+                part.bent,
             )
             if of_phi:
                 values[used : used + of_x], values[phi : phi + of_phi] = here[:of_x], here[of_x:]
@@ -542,7 +557,7 @@ class Collocation:
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
         return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
 
-    def hessian(self, z: Array, loss_weight: float, multipliers: Array) -> sp.csc_array:
+    def hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> sp.csc_array:
         """∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse matrix."""
         indptr, indices = self.hessian_structure
         values = self.hessian_values(z, loss_weight, multipliers)

@@ -185,11 +185,12 @@ class Explicit(Collocation):
         return self.plain.hessian_diagonals
 
     def hessian_values(
-        self, z: Array, loss_weight: float, multipliers: Array, out: Array | None = None
+        self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
         """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
         values = np.empty(len(self._hessian.indices)) if out is None else out
-        parts, weights = self.parts(z), self._weights(multipliers)
+        parts, multipliers = self.bending(z, multipliers)
+        weights = self._weights(multipliers)
         of_memory = {
             each.number: each.weights(multipliers)
             for each in self.additions

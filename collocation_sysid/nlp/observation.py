@@ -392,21 +392,21 @@ class Observation:
         rows, columns = (np.asarray(index, dtype=np.int64)[order] for index in found.coords)
         return rows, columns
 
-    def hessian(self, x: Array, phi: Array) -> Array:
-        """Values of the entries of `hessian_structure`."""
+    def hessian(self, x: Array, phi: Array, bent: bool = True) -> Array:
+        """Values of the entries of `hessian_structure`; of readings that are bent, or linear."""
         if not self.markers.names:
             return np.zeros(0)
         if self.nuisance.size == 0 and self.huber is None:
             return self._constant_hessian
-        return self._hessian_values(x, phi)
+        return self._hessian_values(x, phi, bent)
 
     @cached_property
     def _constant_hessian(self) -> Array:
         dofs = 3 * self.markers.placement.node_count
-        return self._hessian_values(np.zeros((self.grid_rows[-1] + 1, dofs)), np.zeros(0))
+        return self._hessian_values(np.zeros((self.grid_rows[-1] + 1, dofs)), np.zeros(0), True)
 
-    def _hessian_values(self, x: Array, phi: Array) -> Array:
-        by_u = self._sample.loss.curvature(self._inputs(x, phi, self._all), self._data)
+    def _hessian_values(self, x: Array, phi: Array, bent: bool) -> Array:
+        by_u = self._sample.curvature(self._inputs(x, phi, self._all), self._data, bent)
         operator = self._operator(self._operator_values(x, phi))
         found = self._hessian(operator, np.moveaxis(by_u, (0, 1), (2, 3)))
         rows, columns = self.hessian_structure
@@ -419,7 +419,7 @@ class Observation:
 
         row, column = found.coords
         add(row, column, found.data)
-        if len(self.chart.estimated):
+        if bent and len(self.chart.estimated):
             self._add_curvature_of_places(x, phi, add)
         return values
 

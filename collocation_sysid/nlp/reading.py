@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
+from ..arrays import Array
 from .generated import Expression, Generated
 
 GROUP = 3
@@ -49,6 +51,22 @@ class Reading:
         """Σ ρ of a sample."""
         return Generated(self._loss, self.inputs, self._data)
 
+    @cached_property
+    def _robust(self) -> Generated:
+        """Σ ρ of residuals."""
+        return Generated(self._rhos, self.measured, 0)
+
+    def curvature(self, u: Array, data: Array, bent: bool = True) -> Array:
+        """Second derivatives (k, k, …) of the loss by u.
+
+        Unless readings are bent, they count as linear: Gauss–Newton's, which is convex.
+        """
+        if bent:
+            return self.loss.curvature(u, data)
+        residual, slopes = self.residual.slopes(u, data)
+        bending = self._robust.curvature(residual, data[:0])
+        return np.einsum("ai...,ab...,bj...->ij...", slopes, bending, slopes, optimize=True)
+
     @property
     def _data(self) -> int:
         return self.data + 2 * self.measured
@@ -59,7 +77,10 @@ class Reading:
         return weight * (self.expression(u, own) - measured)
 
     def _loss(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        groups = ca.vertsplit(self._residual(u, data), GROUP)
+        return self._rhos(self._residual(u, data), data)
+
+    def _rhos(self, residual: ca.SX, _: ca.SX) -> ca.SX:
+        groups = ca.vertsplit(residual, GROUP)
         return sum((self._rho(ca.sumsqr(group)) for group in groups), start=ca.SX(0))
 
     def _rho(self, square: ca.SX) -> ca.SX:

@@ -567,12 +567,14 @@ class Segment:
         loss_weight: float,
         values: Array,
         memory_weights: Sequence[Array] = (),
+        bent: bool = True,
     ) -> Array:
         """Write the columns of x, then of φ, of ∇²(loss_weight · L + weights · c).
 
         Parameters
         ----------
         values : (hessian_layout.entries,) out
+        bent : whether readings are, see `Observation.hessian`
         memory_weights : μ (N, …) of each branch
             Where the memory is given, Σ μ_k (d_k m_{k−1} + a_k S_k) is added; see `memory`.
 
@@ -601,7 +603,7 @@ class Segment:
             values[: layout.x_entries] = 0
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
-        values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi)
+        values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi, bent)
         if layout.driven.size:
             of_drives = setting.by_drive(curvature.position_theta)[..., self._driving]
             of_x = dynamics.combine_transposed(dynamics.state_weights, of_drives)

@@ -151,10 +151,9 @@ class Samples:
         np.add.at(of_given, self.window, by_u[: 6 * used].T.reshape(samples, used, 6))
         return of_given, by_u[6 * used :].sum(axis=1)
 
-    @property
-    def loss_curvature(self) -> tuple[Array, Array, Array]:
+    def loss_curvature(self, bent: bool) -> tuple[Array, Array, Array]:
         """∂²loss of each sample: Y by Y (S, u, 6, u, 6), Y by φ (S, u, 6, m), φ by φ (m, m)."""
-        by_u = np.moveaxis(self.reading.loss.curvature(self.inputs, self.data), 2, 0)
+        by_u = np.moveaxis(self.reading.curvature(self.inputs, self.data, bent), 2, 0)
         samples, used = self.window.shape
         own, both = by_u[:, : 6 * used], (samples, used, 6)
         return (

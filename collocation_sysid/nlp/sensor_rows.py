@@ -236,7 +236,7 @@ class SensorRows(Addition):
         crossed = -np.einsum("abc,ka->kbc", LEVI_CIVITA, turned)
         scale = segment.length_m * segment.force_n
         found = [np.repeat(crossed[:, b, c], len(nodes)) * scale for b, c, nodes in self._crossing]
-        found += [loss_weight * each for each in self._loss_curvature(self._samples(part, z))]
+        found += [loss_weight * each for each in self._loss_curvature(part, z)]
         if len(self._lag):
             (e, a, b), mu = self._fading(part)[:, 1] * self._lag_scale, of_rows[1] * self._unit
             of_wrench = np.zeros_like(mu)
@@ -261,7 +261,7 @@ class SensorRows(Addition):
         if len(self._lag):
             bent = self._smoothed(part, *self._own(z), order=2) * self._lag_scale**2
             found[self._lag, self._lag] -= np.sum(of_rows[1] * bent)
-        own = self._samples(part, z).loss_curvature[2]
+        own = self._samples(part, z).loss_curvature(part.bent)[2]
         found[np.ix_(self._reading, self._reading)] += loss_weight * own
         return found
 
@@ -281,10 +281,10 @@ class SensorRows(Addition):
         own[self._given] = by_given * self._unit
         return own, of_phi
 
-    def _loss_curvature(self, samples: Samples) -> list[Array]:
+    def _loss_curvature(self, part: Part, z: Array) -> list[Array]:
         """∂²L_w: φ of `_reading` by Y (n, 6, m), then each of `_bands` (n − apart, entries)."""
-        count, window = len(self._times), samples.window
-        twice, by_phi, _ = samples.loss_curvature
+        samples, count = self._samples(part, z), len(self._times)
+        window, (twice, by_phi, _) = samples.window, samples.loss_curvature(part.bent)
         of_phi = np.zeros((count, 6, len(self._reading)))
         np.add.at(of_phi, window, by_phi)
         # Forces and torques are groups of their own.
