@@ -57,6 +57,13 @@ IPOPT_STATUS = {
 
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
+# A row without a pivot of its own on the diagonal waits for its columns' pivots, and fills the
+# factor on the way. A constant there is refined away.
+ROW_PIVOTS = {
+    "ipopt.perturb_always_cd": "yes",
+    "ipopt.jacobian_regularization_exponent": 0.0,
+    "ipopt.jacobian_regularization_value": 1e-9,
+}
 # Of MUMPS: lower than what that diagonal gives, higher than what rounding makes of a zero.
 PIVOT_TOLERANCE = 1e-10
 # By how much a step may change the damping, and the share from which on it is as good as none.
@@ -145,11 +152,6 @@ class InteriorPoint(Options):
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
-            # A row without a pivot of its own on the diagonal waits for its columns' pivots, and
-            # fills the factor on the way. A constant there is refined away.
-            "ipopt.perturb_always_cd": "yes",
-            "ipopt.jacobian_regularization_exponent": 0.0,
-            "ipopt.jacobian_regularization_value": 1e-9,
             "ipopt.constr_mult_init_max": 0.0,  # the warm-up needs no multipliers
             "jac_g": functions.function("jac_g", "g", "jac_g"),
             "grad_f": functions.function("grad_f", "f", "grad_f"),
@@ -161,6 +163,7 @@ class InteriorPoint(Options):
             settings["ipopt.hessian_approximation"] = "limited-memory"
         else:
             settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
+            settings |= ROW_PIVOTS
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 
 
