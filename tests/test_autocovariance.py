@@ -61,6 +61,20 @@ def test_lags_explain_the_expected_products_of_residuals(name):
     np.testing.assert_allclose(explained, expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_products_are_those_of_residuals_so_many_samples_apart(name):
+    of = PROBLEMS[name]
+    fit, lengths = some_fit(of), [len(present) for present in of.present]
+    expected = []
+    for block, length in zip(fit.blocks, lengths, strict=True):
+        residual, distance = block.channels[0], np.arange(length)
+        for lag in range(LAG + 1):
+            apart = toeplitz(distance == lag).astype(float)
+            expected.append(np.einsum("tc,ts,sc->", residual, apart, residual))
+    found = lagged_products(fit, information(fit), [LAG] * len(lengths))
+    np.testing.assert_allclose(found.products, expected, rtol=1e-9)
+
+
 def test_experiments_have_lags_of_their_own():
     of, lags = PROBLEMS["two"], (1, 3)
     fit = some_fit(of)
@@ -69,6 +83,8 @@ def test_experiments_have_lags_of_their_own():
     assert (len(first), len(second)) == (2, 4)
     np.testing.assert_allclose(found.expected @ [*first, *second], found.products, atol=1e-9)
     np.testing.assert_array_equal(np.concatenate(found.split(np.arange(6.0))), np.arange(6))
+    three = replace(found, lags=(0, 2, 1)).split(np.arange(6.0))
+    assert [part.tolist() for part in three] == [[0.0], [1.0, 2.0, 3.0], [4.0, 5.0]]
     beyond = np.arange(6.0)
     less = np.concatenate(found.autocovariances(beyond))
     np.testing.assert_allclose(found.expected @ less, found.products - beyond, atol=1e-9)

@@ -57,6 +57,15 @@ def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
     )
 
 
+@pytest.mark.parametrize(
+    ("deviation", "said"), [(0.2, "±48 %"), (0.23, "within a factor of 1.6"), (0.4, "of 2.2")]
+)
+def test_wide_intervals_are_told_by_their_factor(deviation, said):
+    sentence, *_ = verdicts(uncertainty(spread([deviation, 0.01, 0.02, 0.05])))
+    assert "lambda_pa only to " in sentence
+    assert f"{said} (95 %)" in sentence
+
+
 def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
     found = uncertainty(spread([0.9, 0.01, 0.02, 0.05]))
     assert found.estimates["lambda_pa"].std_error is None
