@@ -156,11 +156,11 @@ def spread(found: Design, twins: int, seed: int) -> str:
 def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     """The answer for one recording of the designed motion; None where there is none."""
     problem, experiment = found.recording.problem, found.experiment
-    options = problem.parameters, problem.scheme, problem.substeps
+    options = problem.parameters, problem.scheme, problem.first_substeps
     (segment,) = Collocation([experiment], *options).segments
     phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
-    actual = simulate(segment.corrected(phi), values, problem.scheme, substeps=problem.substeps)
+    actual = simulate(segment.corrected(phi), values, problem.scheme, substeps=problem.first_substeps)
     tracks = segment.observation.of_samples(actual.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     seen = with_markers(experiment, tracks + noise)
