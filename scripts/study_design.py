@@ -160,7 +160,8 @@ def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     (segment,) = Collocation([experiment], *options).segments
     phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
-    actual = simulate(segment.corrected(phi), values, problem.scheme, substeps=problem.first_substeps)
+    _, scheme, substeps = options
+    actual = simulate(segment.corrected(phi), values, scheme, substeps=substeps)
     tracks = segment.observation.of_samples(actual.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     seen = with_markers(experiment, tracks + noise)
