@@ -58,12 +58,9 @@ IPOPT_STATUS = {
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
 # A row without a pivot of its own on the diagonal waits for its columns' pivots, and fills the
-# factor on the way. A constant there is refined away.
-ROW_PIVOTS = {
-    "ipopt.perturb_always_cd": "yes",
-    "ipopt.jacobian_regularization_exponent": 0.0,
-    "ipopt.jacobian_regularization_value": 1e-9,
-}
+# factor on the way. A constant there slows the last steps by its product with what the objective
+# curves, which must stay small.
+ROW_PIVOT, ROW_SLOWNESS = 1e-9, 1e-7
 # Of MUMPS: lower than what that diagonal gives, higher than what rounding makes of a zero.
 PIVOT_TOLERANCE = 1e-10
 # By how much a step may change the damping, and the share from which on it is as good as none.
@@ -163,8 +160,23 @@ class InteriorPoint(Options):
             settings["ipopt.hessian_approximation"] = "limited-memory"
         else:
             settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
-            settings |= ROW_PIVOTS
+            sharpness = _sharpness(functions.collocation)
+            settings |= {
+                "ipopt.perturb_always_cd": "yes",
+                "ipopt.jacobian_regularization_exponent": 0.0,
+                "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
+            }
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
+
+
+def _sharpness(collocation: Collocation) -> float:
+    """How much the objective curves at most by a scaled position, at least one."""
+    units = (
+        segment.length_m / float(np.min(segment.experiment.markers.sigma_m))
+        for segment in collocation.segments
+        if segment.experiment.markers.names
+    )
+    return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
 
 
 class _DampedHessian:
