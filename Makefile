@@ -4,6 +4,8 @@ CORE := .venv/.installed-core
 DEV := .venv/.installed-dev
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 RUN := runs/foam_cylinder
+# A test process has a core of its own; more threads would take turns.
+ALONE := COLLOCATION_SYSID_THREADS=1 OMP_NUM_THREADS=1
 
 TRIED := build/tried
 
@@ -17,10 +19,10 @@ solve: $(CORE) ## identify the foam cylinder's parameters
 	@echo "Plots, result.json and ParaView frames are in $(RUN)/"
 
 test: $(DEV) ## run the tests
-	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+	@$(ALONE) $(BIN)/python -m pytest -n auto --dist worksteal
 
 test-long: $(DEV) ## run whole runs, the notebook and the gallery
-	@COLLOCATION_SYSID_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "long and not slow"
+	@$(ALONE) $(BIN)/python -m pytest -n auto --dist worksteal -m "long and not slow"
 
 test-dependencies: ## run the tests with the lowest dependencies, and with the newest
 	@mkdir -p build && $(PYTHON) scripts/lowest_dependencies.py > build/lowest.txt && : > build/newest.txt
@@ -28,7 +30,7 @@ test-dependencies: ## run the tests with the lowest dependencies, and with the n
 	  echo "With the $$which dependencies" && rm -rf build/$$which && $(PYTHON) -m venv build/$$which && \
 	  build/$$which/bin/python -m pip install --quiet --disable-pip-version-check --upgrade \
 	    -c build/$$which.txt -e '.[test]' && \
-	  COLLOCATION_SYSID_THREADS=1 build/$$which/bin/python -m pytest -n auto --dist loadfile || exit 1; \
+	  $(ALONE) build/$$which/bin/python -m pytest -n auto --dist loadfile || exit 1; \
 	done
 
 check: $(DEV) ## lint, formatting and types
