@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems_small import IDEAL, nodes_where, point_markers
+from scipy.sparse.linalg import ArpackNoConvergence
 
 from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
@@ -160,6 +161,18 @@ def test_a_bar_pressed_beyond_buckling_is_not_stable(law, monkeypatch):
         expected = fastest(Forces.on(body), x, free, theta)
         assert found[-1] == pytest.approx(max(expected, 0.0), rel=1e-6)
     assert found[0] == 0 < found[1]
+
+
+def test_growth_is_found_where_the_search_for_directions_ends_early(monkeypatch):
+    def ended(matrix, *_, **__):
+        raise ArpackNoConvergence("ended", np.zeros(0), np.zeros((matrix.shape[0], 0)))
+
+    monkeypatch.setattr(stability, "DENSE", 0)
+    monkeypatch.setattr(stability, "eigsh", ended)
+    body = bar(RATE_OF_STRESS, across=2)
+    x, free, theta = equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body)
+    expected = fastest(Forces.on(body), x, free, theta)
+    assert growth_rate_1_s(Forces.on(body), x.ravel(), free, theta) == pytest.approx(expected)
 
 
 def test_a_body_that_nobody_holds_is_stable():

@@ -130,17 +130,22 @@ def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     size = len(stiffness.diagonal())
     if size <= DENSE:
         return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
-    start = np.random.default_rng(0).normal(size=size)
-    lowest = [
-        eigsh(each, DIRECTIONS, which="SA", tol=TOLERANCE, v0=start, ncv=12 * DIRECTIONS)[1]  # pyright: ignore[reportArgumentType]
-        for each in (stiffness, damping)
-        if each.nnz
-    ]
+    lowest = [_lowest(each) for each in (stiffness, damping) if each.nnz]
     basis, _ = np.linalg.qr(np.hstack(lowest))
     in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
     exponents = _exponents(*in_basis)
     guess = exponents[np.argmax(exponents.real)]
     return max(_near(stiffness, damping, float(abs(guess))), 0.0)
+
+
+def _lowest(matrix: sp.csc_array) -> Array:
+    """(n, k) directions in which it is most negative, or some where the search for them ends."""
+    start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
+    options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
+    try:
+        return np.asarray(eigsh(matrix, DIRECTIONS, **options)[1])
+    except ArpackNoConvergence as stopped:
+        return np.column_stack([stopped.eigenvectors, start])
 
 
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
