@@ -68,12 +68,7 @@ class Earlier:
         collocation, nuisance, places_m = solution.collocation, {}, {}
         for part in collocation.parts(solution.z):
             segment = part.segment
-            kinds, names, scales = (
-                getattr(segment.nuisance, key) for key in ("kinds", "names", "scales")
-            )
-            for kind, name, phi, scale in zip(kinds, names, part.phi, scales, strict=True):
-                if kind != "place":
-                    nuisance[name] = float(phi * scale)
+            nuisance |= {name: value for _, name, value in segment.nuisance.valued(part.phi)}
             markers = segment.experiment.markers.names
             places = segment.places_m(part.phi)
             places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))

@@ -13,11 +13,12 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from .arrays import root_mean
+from .arrays import Array, root_mean
 from .check import BodyFinding, Findings, Glance, Recording
 from .check.hold import hold_sentence
 from .console import PlainConsole
 from .errors import listed
+from .experiment.nuisance import JOINING, PLACE, in_unit_for_people
 from .export.target import Comparison
 from .fem.constants import GAMMA_R, symbol_of, unit_of
 from .heartbeat import Heartbeat
@@ -38,22 +39,6 @@ COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
 WIDE = 200
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2
-VECTORS = (
-    ("offset", "camera offsets up to", " mm"),
-    ("tilt", "gravity tilted by", "°"),
-    ("grasp-turn", "body turned in its grasp by", "°"),
-    ("grasp-shift", "body shifted in its grasp by", " mm"),
-    ("turn", "poses turned by", "°"),
-    ("shift", "poses shifted by", " mm"),
-)
-SENSORS = (
-    ("tare", "tare up to", 1.0, ""),
-    ("sensor-time", "sensor late by", 1e3, "ms"),
-    ("sensor-lag", "lag of the sensor", 1e3, "ms"),
-    ("tool-mass", "tool of", 1e3, "g"),
-    ("tool-centre", "its centre off by", 1e3, "mm"),
-    ("zero", "zero of a displacement off by", 1e3, "mm"),
-)
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
@@ -311,8 +296,7 @@ def _nuisance(finished: Run) -> list[Text]:
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
         name = part.segment.experiment.name
-        said = _places(finished.places[name]) + _lengths(part) + _clock(part)
-        said += _of_sensors(part) + _drives(part) + _joining(part, finished)
+        said = _places(finished.places[name]) + _of_rows(part, finished)
         if said:
             lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
     return lines
@@ -340,80 +324,48 @@ def _places(places: Mapping[str, Place]) -> list[str]:
     return said
 
 
-def _lengths(part: Part) -> list[str]:
-    """Vectors of nuisance parameters by their lengths."""
-    nuisance = part.segment.nuisance
-    values, said = part.phi * nuisance.scales, []
-    for kind, what, unit in VECTORS:
-        if len(here := nuisance.places(kind)):
-            size = 1e3 if unit == " mm" else 180 / np.pi
+def _of_rows(part: Part, finished: Run) -> list[str]:
+    """What was found of each row of the table but the places, beside its prior."""
+    nuisance, said = part.segment.nuisance, []
+    values = part.phi * nuisance.scales
+    for row in part.segment.experiment.nuisance.rows:
+        here = nuisance.places(row).tolist()
+        if row == PLACE or not here:
+            continue
+        groups = [[k] for k in here]
+        if row.by == "length":
+            numbers = dict.fromkeys(nuisance.entries[k].number for k in here)
+            vectors = [nuisance.places(row, of=number).tolist() for number in numbers]
             # Several markers have one each: the longest counts.
-            lengths = np.linalg.norm(values[here].reshape(-1, min(3, len(here))), axis=1)
-            length, prior = float(lengths.max()), float(nuisance.scales[here[0]])
-            said.append(f"{what} {_short(size * length)}{unit} (prior {_short(size * prior)})")
+            groups = [max(vectors, key=lambda own: float(np.linalg.norm(values[own])))]
+        elif row.by == "worst":
+            groups = [[max(here, key=lambda k: abs(part.phi[k]))]]
+        said += [_told(part, own, values[own], finished) for own in groups]
     return said
 
 
-def _clock(part: Part) -> list[str]:
-    """The time shift in words."""
-    nuisance, said = part.segment.nuisance, []
-    low, high = nuisance.limits(part.segment.chart.samples)
-    for k in nuisance.places("time"):
-        phi, prior = float(part.phi[k]), 1e3 * float(nuisance.scales[k])
-        when = "later" if phi > 0 else "earlier"
-        limit = "" if low[k] + 1e-3 < phi < high[k] - 1e-3 else ", the most that is allowed"
-        said.append(
-            f"markers seen {_short(abs(phi) * prior)} ms {when} than their times say{limit} "
-            f"(prior {_short(prior)})"
-        )
-    return said
-
-
-def _of_sensors(part: Part) -> list[str]:
-    """What was not known of the sensors, each with its prior."""
-    nuisance, said = part.segment.nuisance, []
-    for kind, what, factor, unit in SENSORS:
-        here = [k for k, own in enumerate(nuisance.kinds) if own.startswith(kind)]
-        values = [float(part.phi[k] * nuisance.scales[k]) for k in here]
-        if here:
-            worst = max(range(len(here)), key=lambda i: abs(part.phi[here[i]]))
-            prior, of = float(nuisance.scales[here[worst]]), nuisance.names[here[worst]]
-            own = unit or of.rpartition("[")[2].rstrip("]")
-            size = _short(factor * abs(values[worst]))
-            said.append(f"{what} {size} {own} (prior {_short(factor * prior)})")
-    return said
-
-
-def _drives(part: Part) -> list[str]:
-    """What tensions and pressures are off by."""
-    nuisance, said = part.segment.nuisance, []
-    for k in nuisance.of_drives:
-        prior = float(nuisance.scales[k])
-        value = float(part.phi[k]) * prior
-        what = nuisance.names[k].partition(": ")[2].partition(" [")[0]
-        unit = nuisance.names[k].rpartition("[")[2].rstrip("]")
-        if nuisance.kinds[k] == "factor":
-            said.append(f"{what} by {_short(1e2 * value)} % (prior {_short(1e2 * prior)})")
-        else:
-            said.append(f"{what} {_short(value)} {unit} (prior {_short(prior)})")
-    return said
-
-
-def _joining(part: Part, finished: Run) -> list[str]:
-    """When loads join and leave, in words."""
-    nuisance, said = part.segment.nuisance, []
+def _told(part: Part, own: Sequence[int], values: Array, finished: Run) -> str:
+    """The sentence of a row about a vector, or a number."""
+    nuisance, k = part.segment.nuisance, own[0]
+    entry, name = nuisance.entries[k], nuisance.names[k]
     known = finished.uncertainty.nuisance if finished.uncertainty else {}
-    for k, timed in zip(nuisance.places("joining"), nuisance.timed, strict=True):
-        name, prior = nuisance.names[k], 1e3 * float(nuisance.scales[k])
-        late, deviation = prior * float(part.phi[k]), prior * known.get(name, np.nan)
-        what = name.removeprefix(f"{part.segment.experiment.name}: ").removesuffix(" [s]")
-        when = "later" if late > 0 else "earlier"
-        error = "" if np.isnan(deviation) else f" ± {_short(deviation)}"
-        said.append(
-            f"{what} {_short(abs(late))}{error} ms {when} than {timed.stated_s:g} s "
-            f"(prior {_short(prior)})"
-        )
-    return said
+    low, high = (limit[k] for limit in nuisance.limits(part.segment.chart.samples))
+    factor, unit = in_unit_for_people(1.0, entry.unit)
+    size, error = float(np.linalg.norm(values)), entry.sigma * known.get(name, np.nan)
+    told = entry.row.told or "{which} {signed}"
+    allowed = low + 1e-3 < part.phi[k] < high - 1e-3
+    sentence = told.format(
+        size=f"{_short(factor * size)}{unit}",
+        signed=f"{_short(factor * float(values[0]))}{unit}",
+        number=_short(factor * size),
+        unit=unit,
+        error="" if np.isnan(error) else f" ± {_short(factor * error)}",
+        way="later" if values[0] > 0 else "earlier",
+        which=entry.label.rpartition(" [")[0],
+        limit="" if allowed else ", the most that is allowed",
+        stated=f"{nuisance.timed[entry.number].stated_s:g} s" if entry.row == JOINING else "",
+    )
+    return f"{sentence} (prior {_short(factor * entry.sigma)})"
 
 
 def _short(value: float) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from .check.motion import Motion, motion_of
 from .errors import SimulationError
+from .experiment.nuisance import TIME
 from .experiment.turning import TOO_FAST, fastest_turn
 from .fem.plausible import odd_material, oddities
 from .methods.solution import Solution, Status, pooled_wrench_rms
@@ -63,7 +64,7 @@ def concerns(
         # A lag and a tool may well be none.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
-        for k in nuisance.places("time"):
+        for k in nuisance.places(TIME):
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))

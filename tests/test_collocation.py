@@ -156,7 +156,8 @@ def test_derivatives_where_the_clock_is_whole_samples_off(samples: int, rng):
     nuisance = Nuisance.none(marker_offset_m=2e-3, time_shift_s=0.01)
     collocation = Collocation([replace(swung(steps=8), nuisance=nuisance)], GUESS)
     (segment,) = collocation.segments
-    phi = np.where(np.array(segment.nuisance.kinds) == "time", float(samples), 0.0)
+    phi = np.zeros(segment.nuisance.size)
+    phi[segment.nuisance.of_clock] = float(samples)
     read, _ = collocation.following(np.concatenate([GUESS.guess_q, phi]))
     assert read.segments[0].chart.samples == samples
     assert_derivatives(read, rng)

@@ -1,100 +1,472 @@
-"""What else is not known exactly about one recording, and how well it is known."""
+"""What else is not known exactly about one recording, and how well it is known.
+
+`ROWS` is all there is to say of each: the fields of `Nuisance`, the keys of the problem file,
+limits, tables and texts follow from it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field, make_dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
+import casadi as ca
 import numpy as np
 
 from ..errors import InputError
-from .actuator import Actuator
-from .tendon import Tendon
 
 DEGREE = float(np.pi / 180)
+# What enters linearly needs no trust region.
+FREELY = 1e3
+# A place may move this many edges of the mesh in a step, the time of a load this many samples.
+EDGES_A_STEP = SAMPLES_A_STEP = 2.0
+
+Of = Literal["recording", "place", "marker", "grasp", "tendon", "pressure", "load", "sensor"]
+Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives"]
+# Units for people.
+SHOWN = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°"), "kg": (1e3, " g")}
+SHOWN |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
 
 
 @dataclass(frozen=True)
-class Nuisance:
-    """Standard deviations of an experiment's nuisance parameters; None where not estimated.
+class NuisanceRow:
+    """Something that may not be known exactly of a recording; its prior is normal about zero.
 
-    Every one has a normal prior around zero with its deviation. The defaults are those of a
-    careful laboratory; `none` is for ideal data.
+    A recording has its values by components (markers, grasps, …) and axes.
 
     Attributes
     ----------
-    marker_offset_m : float or None
-        How far markers sit off the places given for them, each coordinate. An error of a place
-        turns with the body. Markers have deviations of their own in `Markers`.
-    time_shift_s : float or None
-        How much later than their times say the markers were seen, on the clock of the grasps.
-    gravity_rad : float or None
-        Tilt of gravity's direction about two axes across it.
-    hand_eye_m, hand_eye_rad : float or None
-        A small rigid motion, constant in time, by which the undeformed body is off in the grasp:
-        x = U_t H X. It is taken as none where the start is not an equilibrium: the state that is
-        given then tells where the body is.
-    displacement_zero_m : float or None
-        By how much displacements are off, constant in time, along each axis of a grasp whose zero
-        is not known.
-    joining_s : float or None
-        How much later than stated point masses and forces join or leave, each that does within the
-        recording.
-    pose_shift_m, pose_turn_rad : float or None
-        A small rigid motion, constant in time, by which grasps and body are off in the frame of
-        the markers, such as that of cameras. It turns the body against gravity.
-    camera_offset_m : float or None
-        A constant vector by which the cameras see each marker off.
-    tare : float or None
-        Offset of each component of a measured wrench, constant in time, in its sigmas.
-    sensor_time_s : float or None
-        How much later than their times say the wrenches were measured, on the clock of the grasps;
-        three deviations at most.
-    sensor_lag_s : float or None
-        Time constant of a first-order low-pass in the sensor; from zero to three deviations.
-    tool_kg, tool_m : float or None
-        Mass of what is between a sensor and the body, and each coordinate of its centre about the
-        sensor's point (in the world's frame, about the middle of the grasped nodes); it is there
-        without `tool_m`.
-    tension_factor, tension_lost_n : float or None
-        How far the factor of each tendon's tension is from one, and what friction takes of it.
-    pressure_factor, pressure_lost_pa : float or None
-        The same of each pressure, whose sensor may have another zero.
+    name : str
+        Field of `Nuisance`.
+    unit : str
+        Of its values: "m", "s", "rad", …
+    sigma : float or None
+        Standard deviation of the prior; None where it is not estimated by default.
+    said : str
+        What it is, for documentation.
+    label : str
+        The same for tables of results, with {which} component and {axis}.
+    key, prior : str
+        Keys of the problem file, of [experiment.nuisance] and in its table.
+    beside : float or None
+        The deviation where the key's table has other priors only.
+    of : str
+        What there is one of: the recording, or each marker, grasp, …
+    axes : str
+        Names of the components of a vector, apart by blanks; one number without.
+    changes : tuple of str
+        What in the model depends on it.
+    applies : callable
+        Of an experiment: whether there is such a thing in it.
+    low, high : float
+        Limits, in deviations.
+    reach : float
+        Deviations that a step may move it.
+    step : callable, optional
+        Of an experiment: what a step may move it, in its unit.
+    told : str
+        What the terminal says, with {size}, {way} and {which}.
+    by : {"length", "worst", "each"}
+        It says the longest vector, the value farthest from its prior, or each.
+    reading : callable, optional
+        ``reading(y, values, t_s, data) -> y``, what it makes of a marker's reading y (3,), an
+        expression of CasADi: of its values (one, or as many as axes), the time, and the
+        recording's `RecordingData`.
+    clock : callable, optional
+        ``clock(values, t_s, data)``, how much later than at t_s a marker was seen [s].
     """
 
-    marker_offset_m: float | None = 1e-3
-    time_shift_s: float | None = 5e-3
-    gravity_rad: float | None = DEGREE
-    hand_eye_m: float | None = 1e-3
-    hand_eye_rad: float | None = 0.5 * DEGREE
-    displacement_zero_m: float | None = 1e-4
-    joining_s: float | None = 1e-2
-    pose_shift_m: float | None = None
-    pose_turn_rad: float | None = None
-    camera_offset_m: float | None = None
-    tare: float | None = 10.0
-    sensor_time_s: float | None = 5e-3
-    sensor_lag_s: float | None = None
-    tool_kg: float | None = None
-    tool_m: float | None = None
-    tension_factor: float | None = None
-    tension_lost_n: float | None = None
-    pressure_factor: float | None = None
-    pressure_lost_pa: float | None = None
+    name: str
+    unit: str
+    sigma: float | None
+    said: str = ""
+    label: str = ""
+    _: KW_ONLY
+    key: str = ""
+    prior: str = ""
+    beside: float | None = None
+    of: Of = "recording"
+    axes: str = ""
+    changes: tuple[Changes, ...] = ("reading",)
+    applies: Callable[[Any], bool] = lambda experiment: True
+    low: float = -np.inf
+    high: float = np.inf
+    reach: float = 1.0
+    step: Callable[[Any], float] | None = None
+    told: str = ""
+    by: Literal["length", "worst", "each"] = "each"
+    reading: Callable[[Any, Any, Any, Any], Any] | None = None
+    clock: Callable[[Any, Any, Any], Any] | None = None
+
+    @property
+    def usual(self) -> str:
+        """The default deviation in a unit for people."""
+        size, unit = in_unit_for_people(self.sigma or 0.0, self.unit)
+        return f"{size:.4g}{unit}"
+
+
+def rotation(turn: ca.SX) -> ca.SX:
+    """Rotation matrix of Cayley's parameters `turn` / 2; smooth and rational."""
+    half = ca.skew(turn / 2)
+    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(turn) / 4) * (half + half @ half)
+
+
+def in_unit_for_people(value: float, unit: str) -> tuple[float, str]:
+    """A value, and its unit as it stands behind it: millimetres, milliseconds, degrees, …"""
+    factor, shown = SHOWN.get(unit, (1.0, f" {unit}"))
+    return factor * value, shown
+
+
+def _turned(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+    pivot = ca.DM(data.pivot_m)
+    return rotation(values) @ (y - pivot) + pivot
+
+
+def _shifted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+    return y + values
+
+
+def _moves(experiment: Any) -> bool:
+    return not experiment.static
+
+
+def _seen_in_grasp(experiment: Any) -> bool:
+    # Nothing but what markers see tells how the body is off in its grasp, and a start that is
+    # given tells where it is.
+    marked = bool(experiment.markers.names) and experiment.start == "equilibrium"
+    return bool(experiment.grasps) and marked
+
+
+def _edges(experiment: Any) -> float:
+    return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
+
+
+PLACE = NuisanceRow(
+    "marker_offset_m",
+    "m",
+    1e-3,
+    "errors of the places in reference_m without a reference_sigma_m; they turn with the body",
+    "place of {which}, {axis}",
+    key="marker_offsets",
+    prior="prior_m",
+    of="place",
+    axes="x y z",
+    changes=(),
+    reach=FREELY,
+    step=_edges,
+)
+OFFSET = NuisanceRow(
+    "camera_offset_m",
+    "m",
+    None,
+    "a constant offset of each marker in the cameras' frame",
+    "camera offset of {which}, {axis}",
+    key="camera_offsets",
+    prior="prior_m",
+    of="marker",
+    axes="x y z",
+    reach=FREELY,
+    told="camera offsets up to {size}",
+    by="length",
+    reading=_shifted,
+)
+TIME = NuisanceRow(
+    "time_shift_s",
+    "s",
+    5e-3,
+    "how much later than their times say markers were seen, on the grasps' clock",
+    "time shift",
+    key="time_shift",
+    prior="prior_s",
+    changes=("clock",),
+    applies=_moves,
+    told="markers seen {size} {way} than their times say{limit}",
+    clock=lambda values, t_s, data: values,
+)
+TURN = NuisanceRow(
+    "pose_turn_rad",
+    "rad",
+    None,
+    "a constant turn of grasps and body in the cameras' frame, which turns gravity in the body's",
+    "turn of the pose, {axis}",
+    key="pose",
+    prior="prior_rad",
+    axes="x y z",
+    changes=("reading", "gravity"),
+    told="poses turned by {size}",
+    by="length",
+    reading=_turned,
+)
+SHIFT = NuisanceRow(
+    "pose_shift_m",
+    "m",
+    None,
+    "a constant shift of both",
+    "shift of the pose, {axis}",
+    key="pose",
+    prior="prior_m",
+    axes="x y z",
+    reach=FREELY,
+    told="poses shifted by {size}",
+    by="length",
+    reading=_shifted,
+)
+TILT = NuisanceRow(
+    "gravity_rad",
+    "rad",
+    DEGREE,
+    "a tilt of the direction of gravity",
+    "tilt of gravity, {axis}",
+    key="gravity",
+    prior="prior_rad",
+    axes="first second",
+    changes=("gravity",),
+    applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
+    told="gravity tilted by {size}",
+    by="length",
+)
+GRASP_TURN = NuisanceRow(
+    "hand_eye_rad",
+    "rad",
+    0.5 * DEGREE,
+    "a constant turn of the body in its grasps",
+    "turn in the grasp, {axis}",
+    key="hand_eye",
+    prior="prior_rad",
+    axes="x y z",
+    changes=("grasps",),
+    applies=_seen_in_grasp,
+    told="body turned in its grasp by {size}",
+    by="length",
+)
+GRASP_SHIFT = NuisanceRow(
+    "hand_eye_m",
+    "m",
+    1e-3,
+    "a constant shift of it there; both where the start is an equilibrium and markers see it",
+    "shift in the grasp, {axis}",
+    key="hand_eye",
+    prior="prior_m",
+    axes="x y z",
+    changes=("grasps",),
+    applies=_seen_in_grasp,
+    told="body shifted in its grasp by {size}",
+    by="length",
+)
+ZERO = NuisanceRow(
+    "displacement_zero_m",
+    "m",
+    1e-4,
+    "a constant offset of each displacement along each of its axes",
+    "zero of grasp {which}, {axis}",
+    key="displacement_zero",
+    prior="prior_m",
+    of="grasp",
+    axes="x y z",
+    changes=("grasps",),
+    told="zero of a displacement off by {size}",
+    by="worst",
+)
+TENSION_FACTOR = NuisanceRow(
+    "tension_factor",
+    "1",
+    None,
+    "a factor on the tension of each tendon, how far from one",
+    "{which}, more than stated",
+    key="tension_factor",
+    prior="prior",
+    of="tendon",
+    changes=("drives",),
+    told="{which} by {signed}",
+)
+TENSION_LOST = NuisanceRow(
+    "tension_lost_n",
+    "N",
+    None,
+    "tension of each tendon that friction takes",
+    "{which}, lost",
+    key="tension_lost",
+    prior="prior_n",
+    of="tendon",
+    changes=("drives",),
+    told="{which} {signed}",
+)
+PRESSURE_FACTOR = NuisanceRow(
+    "pressure_factor",
+    "1",
+    None,
+    "a factor on each pressure, how far from one",
+    "{which}, more than stated",
+    key="pressure_factor",
+    prior="prior",
+    of="pressure",
+    changes=("drives",),
+    told="{which} by {signed}",
+)
+PRESSURE_LOST = NuisanceRow(
+    "pressure_lost_pa",
+    "Pa",
+    None,
+    "an offset that each pressure lacks",
+    "{which}, lost",
+    key="pressure_lost",
+    prior="prior_pa",
+    of="pressure",
+    changes=("drives",),
+    told="{which} {signed}",
+)
+JOINING = NuisanceRow(
+    "joining_s",
+    "s",
+    1e-2,
+    "how much later than stated each point mass or force joins or leaves, where it does so within "
+    "the recording",
+    "{which}",
+    key="joining",
+    prior="prior_s",
+    of="load",
+    changes=("loads",),
+    step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
+    told="{which} {number}{error}{unit} {way} than {stated}",
+)
+TARE = NuisanceRow(
+    "tare",
+    "σ",
+    10.0,
+    "a constant offset of each component of a wrench, in its sigmas",
+    "tare{which} of {axis}",
+    key="tare",
+    prior="prior_sigmas",
+    of="sensor",
+    changes=("sensor",),
+    reach=FREELY,
+    told="tare up to {size}",
+    by="worst",
+)
+SENSOR_TIME = NuisanceRow(
+    "sensor_time_s",
+    "s",
+    5e-3,
+    "how much later than their times say wrenches were measured; three deviations at most",
+    "time shift of the sensor{which}",
+    key="sensor_time",
+    prior="prior_s",
+    of="sensor",
+    changes=("sensor",),
+    applies=_moves,
+    low=-3.0,
+    high=3.0,
+    told="sensor late by {size}",
+    by="worst",
+)
+SENSOR_LAG = NuisanceRow(
+    "sensor_lag_s",
+    "s",
+    None,
+    "time constant of a first-order low-pass in the sensor; from zero to three deviations",
+    "lag of the sensor{which}",
+    key="sensor_lag",
+    prior="prior_s",
+    of="sensor",
+    changes=("sensor",),
+    applies=_moves,
+    low=0.0,
+    high=3.0,
+    told="lag of the sensor {size}",
+    by="worst",
+)
+TOOL_MASS = NuisanceRow(
+    "tool_kg",
+    "kg",
+    None,
+    "a mass between a sensor and the body",
+    "mass of the tool{which}",
+    key="tool",
+    prior="prior_kg",
+    of="sensor",
+    changes=("sensor",),
+    low=0.0,
+    told="tool of {size}",
+    by="worst",
+)
+TOOL_CENTRE = NuisanceRow(
+    "tool_m",
+    "m",
+    None,
+    "its centre about the sensor's point; in the world's frame that of the grasped nodes",
+    "centre of the tool{which}, {axis}",
+    key="tool",
+    prior="prior_m",
+    beside=0.05,
+    of="sensor",
+    axes="x y z",
+    changes=("sensor",),
+    applies=lambda experiment: bool(experiment.nuisance.tool_kg),
+    told="its centre off by {size}",
+    by="worst",
+)
+
+# In the order of φ; neighbours of one component stand together.
+ROWS = (
+    *(PLACE, OFFSET, TIME, TURN, SHIFT, TILT, GRASP_TURN, GRASP_SHIFT, ZERO),
+    *(TENSION_FACTOR, TENSION_LOST, PRESSURE_FACTOR, PRESSURE_LOST, JOINING),
+    *(TARE, SENSOR_TIME, SENSOR_LAG, TOOL_MASS, TOOL_CENTRE),
+)
+
+
+class _Deviations:
+    """What `Nuisance` does with its fields."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for row in self.rows:
+            value = self.sigma(row)
             if value is not None and not value > 0:
-                raise InputError(f"{field.name} is {value:g}; expected a deviation above 0")
+                raise InputError(f"{row.name} is {value:g}; expected a deviation above 0")
 
-    def off(self, actuator: Actuator) -> tuple[float | None, float | None]:
-        """How well its factor is known, and what it loses."""
-        if isinstance(actuator, Tendon):
-            return self.tension_factor, self.tension_lost_n
-        return self.pressure_factor, self.pressure_lost_pa
+    @property
+    def rows(self) -> tuple[NuisanceRow, ...]:
+        """All that may be estimated."""
+        return ROWS
+
+    def sigma(self, row: NuisanceRow) -> float | None:
+        """Standard deviation of a row's prior; None where it is not estimated."""
+        return getattr(self, row.name)
 
     @classmethod
-    def none(cls, **deviations: float | None) -> Nuisance:
+    def none(cls, **deviations: Any) -> Nuisance:
         """Nothing is estimated but what is named."""
-        nothing: dict[str, float | None] = {field.name: None for field in fields(cls)}
-        return cls(**(nothing | deviations))
+        nothing: dict[str, Any] = {row.name: None for row in ROWS}
+        return Nuisance(**(nothing | deviations))
+
+
+_SAID = """Standard deviations of an experiment's nuisance parameters; None where not estimated.
+
+Every one has a normal prior around zero with its deviation. The defaults are those of a careful
+laboratory; `none` is for ideal data.
+
+Attributes
+----------
+"""
+
+if TYPE_CHECKING:
+
+    @dataclass(frozen=True, init=False)
+    class Nuisance(_Deviations):
+        """Made from the table."""
+
+        def __init__(self, **deviations: Any) -> None: ...
+        def __getattr__(self, name: str) -> float | None: ...
+
+else:
+    Nuisance = make_dataclass(
+        "Nuisance",
+        [(row.name, "float | None", field(default=row.sigma)) for row in ROWS],
+        bases=(_Deviations,),
+        frozen=True,
+        kw_only=True,
+        namespace={
+            "__module__": __name__,
+            "__doc__": _SAID
+            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in ROWS),
+        },
+    )

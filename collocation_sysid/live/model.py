@@ -170,12 +170,12 @@ class Model:
     @cached_property
     def samples_around(self) -> int:
         """Samples before and after one that its reading needs."""
-        return NEIGHBOURS // 2 if len(self.segment.nuisance.places("time")) else 0
+        return NEIGHBOURS // 2 if len(self.segment.nuisance.of_clock) else 0
 
     @cached_property
     def reads_plainly(self) -> bool:
         """Whether a marker is read as it is, at its place on the body, if by another clock."""
-        return not len(self.segment.nuisance.places("turn", "shift", "offset"))
+        return self.segment.nuisance.reads_plainly
 
     @cached_property
     def observation(self) -> Observation:

@@ -411,7 +411,7 @@ class Sweep:
         slope = np.zeros((*reading.tracks_m.shape, model.size))
         slope[..., self.moving] = read[..., 1:]
         if around:
-            (time,) = self.segment.nq + self.segment.nuisance.places("time")
+            (time,) = self.segment.nq + self.segment.nuisance.of_clock
             slope[..., time] = moves[..., 0]
         observation, (nodes, places) = model.observation, self.reading
         for m in observation.chart.estimated:
@@ -422,7 +422,7 @@ class Sweep:
 
     def _weights_in_time(self) -> tuple[Array, Array]:
         """Weights of the samples around one as the clock is off, and their slopes by its φ."""
-        around, places = self.model.samples_around, self.segment.nuisance.places("time")
+        around, places = self.model.samples_around, self.segment.nuisance.of_clock
         if not around:
             return np.ones(1), np.zeros(1)
         at = range(-around, around + 1)

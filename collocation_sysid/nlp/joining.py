@@ -17,6 +17,7 @@ import numpy as np
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..experiment.loads import PointMass, ramp
+from ..experiment.nuisance import JOINING
 from .dynamics import Dynamics
 from .nuisance import NuisanceMap
 
@@ -63,7 +64,7 @@ class Joinings:
         """All of them at φ."""
         nuisance, dynamics = self.nuisance, self.dynamics
         half_s, found = self.experiment.timestep_s, []
-        columns = np.flatnonzero(np.isin(nuisance.moving, nuisance.places("joining")))
+        columns = np.flatnonzero(np.isin(nuisance.moving, nuisance.places(JOINING)))
         for column, timed in zip(columns, nuisance.timed, strict=True):
             k = nuisance.moving[column]
             scale, sign = nuisance.scales[k] / half_s, 1.0 if timed.change == "from_s" else -1.0

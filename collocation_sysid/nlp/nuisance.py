@@ -1,26 +1,7 @@
 """Nuisance parameters φ of an experiment: places, clock, gravity, the body in its grasp, cameras.
 
-Every φ is a number of prior standard deviations, so that its prior is φ² in the loss. In their
-order, those that the experiment's `Nuisance` names:
-
-=====================  ====================================================================
-place of each marker   X_m on the undeformed body, two or three a marker [m], see `charts`
-camera offset          b_m of each marker, three [m]
-time shift             τ [s]
-turn of the pose       a (3), Cayley's parameters times two: to third order a rotation vector
-shift of the pose      d (3) [m]
-tilt of gravity        two angles about axes across it [rad]
-turn in the grasp      a_h (3), likewise, about axes of the undeformed body
-shift in the grasp     d_h (3) [m]
-zero of a grasp        of each axis along which a displacement's zero is not known [m]
-tare of a sensor       of each component that it measures [N] or [N m], see `sensor`
-its clock              τ, how much later than its times say it measured [s]
-its lag                T of a first-order low-pass [s]
-its tool               mass [kg], and centre (3) about the sensor's point [m]
-factor                 f less one, of each tension, and of each pressure
-lost                   b of each tension [N], and of each pressure [Pa]
-joining                how much later than stated a point mass or force joins, or leaves [s]
-=====================  ====================================================================
+Every φ is a number of prior standard deviations, so that its prior is φ² in the loss. What there
+may be is the table of `experiment.nuisance`; an entry of φ is one component of a row, on one axis.
 
 Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
 c being the middle of the undeformed body in its first pose. In the body's frame that changes
@@ -34,21 +15,36 @@ A tension T is max(0, f T − b) at the body, a pressure p is f p − b.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby
 from typing import NamedTuple, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..experiment.actuator import Actuator
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp, held_nodes
 from ..experiment.loads import Change, Force, PointMass
-from ..experiment.wrench import COMPONENTS, UNITS
+from ..experiment.nuisance import (
+    GRASP_SHIFT,
+    GRASP_TURN,
+    JOINING,
+    PLACE,
+    PRESSURE_LOST,
+    TARE,
+    TENSION_LOST,
+    TILT,
+    TIME,
+    TURN,
+    ZERO,
+    NuisanceRow,
+    Of,
+    rotation,
+)
+from ..experiment.wrench import COMPONENTS, UNITS, Wrench
 
 Load = TypeVar("Load", PointMass, Force)
 
@@ -56,32 +52,10 @@ Load = TypeVar("Load", PointMass, Force)
 LARGEST_SHIFT_SAMPLES = 2.0
 # A time shift may be this share of the recording.
 LARGEST_SHIFT_SHARE = 0.25
-# The clock and the lag of a sensor may be this many deviations of their priors.
-SENSOR_DEVIATIONS = 3.0
 # A load joins within this many standard deviations of its prior, further than any that is right,
 # and within the recording: not quite at its ends, where it would join at once or never.
 LARGEST_DELAY, NARROWER = 4.0, 1 - 1e-9
-# A place may move this many edges of the mesh in a step.
-EDGES_A_STEP = 2.0
-KINDS = (
-    "place",
-    "offset",
-    "time",
-    "turn",
-    "shift",
-    "tilt",
-    "grasp-turn",
-    "grasp-shift",
-    "factor",
-    "lost",
-    "joining",
-)
-# Those of a grasp's zero have its number behind them.
-OF_GRASP = "zero"
-# Those of a sensor have its number behind them: "tare 0".
-OF_SENSOR = ("tare", "sensor-time", "sensor-lag", "tool-mass", "tool-centre")
-# The time at which a load joins may move this many samples in a step.
-SAMPLES_A_STEP = 2.0
+MOVING = {"gravity", "grasps", "loads", "drives"}
 
 
 class Timed(NamedTuple):
@@ -96,14 +70,43 @@ class Timed(NamedTuple):
         return getattr(self.load, self.change)
 
 
+@dataclass(frozen=True)
+class Entry:
+    """One φ.
+
+    Attributes
+    ----------
+    row : NuisanceRow
+    number : int
+        Of the component: marker, grasp, actuator, load or sensor of the experiment.
+    axis : int
+        Of the vector.
+    label : str
+        With its unit.
+    sigma : float
+        Prior standard deviation, in the unit.
+    """
+
+    row: NuisanceRow
+    number: int
+    axis: int
+    label: str
+    sigma: float
+
+    @property
+    def unit(self) -> str:
+        """Of the label."""
+        return self.label.rpartition("[")[2].rstrip("]")
+
+
 @dataclass(frozen=True, eq=False)
 class NuisanceMap:
     """φ of one experiment: what each is, and the gravity and grasps it makes.
 
     Attributes
     ----------
+    entries : (k,) what each is
     names : (k,) with units, such as "swing: place of tip, x [m]"
-    kinds : (k,) of `KINDS`, or of `OF_SENSOR` with the sensor's number
     scales : (k,) prior standard deviations, in the names' units
     reach : (k,) φ that a step may move at a time: what enters linearly needs no trust region
     interval_s : float, between samples
@@ -112,13 +115,12 @@ class NuisanceMap:
     pivot_m : (3,) c
     grasp_pivot_m : (3,) c_h
     stated_off : (A, 2) f and b of tensions and pressures as stated
-    driving : (A, 2) which φ their estimates are, −1 where they have none
-    timed : of each φ of the kind "joining", what joins or leaves
+    timed : what joins or leaves, in the order of their φ
     recorded_s : first and last time of the recording
     """
 
+    entries: tuple[Entry, ...]
     names: tuple[str, ...]
-    kinds: tuple[str, ...]
     scales: Array
     reach: Array
     interval_s: float
@@ -127,38 +129,28 @@ class NuisanceMap:
     pivot_m: Array
     grasp_pivot_m: Array
     stated_off: Array
-    driving: Index
     timed: tuple[Timed, ...]
     recorded_s: tuple[float, float]
 
     @classmethod
     def of(cls, experiment: Experiment) -> NuisanceMap:
         """What the experiment wants estimated."""
-        entries = _entries(experiment)
-        kinds, labels, scales = zip(*entries, strict=True) if entries else ((), (), ())
-        scales = np.array(scales, dtype=float)
-        body = experiment.body
-        edge_m = float(body.mesh.quality().edge_mean_m)
-        linear = np.array([k in ("offset", "shift") or k.startswith("tare") for k in kinds])
-        reach = np.where(linear, 1e3, 1.0).astype(float)
-        of_place = np.array([kind == "place" for kind in kinds], dtype=bool)
-        reach[of_place] = np.minimum(1e3, EDGES_A_STEP * edge_m / scales[of_place])
-        of_joining = np.array([kind == "joining" for kind in kinds], dtype=bool)
-        joining_s = SAMPLES_A_STEP * experiment.timestep_s
-        reach[of_joining] = np.minimum(1.0, joining_s / scales[of_joining])
+        entries, body = tuple(_entries(experiment)), experiment.body
+        scales = np.array([entry.sigma for entry in entries], dtype=float)
+        steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
+        reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         held = held_nodes(experiment.grasps)
         return cls(
-            tuple(f"{experiment.name}: {label}" for label in labels),
-            tuple(kinds),
+            entries,
+            tuple(f"{experiment.name}: {entry.label}" for entry in entries),
             scales,
-            reach,
+            np.array(reach),
             experiment.timestep_s,
             experiment.duration_s,
             np.array(experiment.gravity_m_s2),
             experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
             body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
             np.array([a.off for a in experiment.actuators]).reshape(-1, 2),
-            _driving(experiment, labels),
             tuple(timed for _, timed in _timed(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
@@ -168,60 +160,102 @@ class NuisanceMap:
         """Number k of φ."""
         return len(self.names)
 
-    def places(self, *kinds: str) -> NDArray[np.int64]:
-        """Positions in φ of some kinds."""
-        return np.array([i for i, kind in enumerate(self.kinds) if kind in kinds], dtype=np.int64)
+    def valued(self, phi: Array) -> Iterator[tuple[Entry, str, float]]:
+        """Each φ but the places of markers, which say nothing by themselves: name and value."""
+        for entry, name, value in zip(self.entries, self.names, phi * self.scales, strict=True):
+            if entry.row != PLACE:
+                yield entry, name, float(value)
+
+    def places(self, *rows: NuisanceRow, of: int | None = None) -> Index:
+        """Positions in φ of some rows, of all components or of one."""
+        return self._where(lambda e: e.row in rows and of in (None, e.number))
+
+    def _where(self, chosen: Callable[[Entry], bool]) -> Index:
+        return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
 
     @cached_property
-    def moving(self) -> NDArray[np.int64]:
+    def moving(self) -> Index:
         """Positions in φ of what changes the motion: gravity, grasps, loads and what drives it."""
-        zeros = {kind for kind in self.kinds if kind.startswith(OF_GRASP)}
-        kinds = ("turn", "tilt", "grasp-turn", "grasp-shift", *zeros, "joining", "factor", "lost")
-        return self.places(*kinds)
+        return self._where(lambda e: not MOVING.isdisjoint(e.row.changes))
 
     @cached_property
-    def of_drives(self) -> NDArray[np.int64]:
+    def of_drives(self) -> Index:
         """Positions in φ of what tensions and pressures may be off by."""
-        return self.places("factor", "lost")
+        return self._where(lambda e: "drives" in e.row.changes)
 
     def drives(self, phi: Array) -> tuple[Array, Array]:
         """F and b (A, 2) of tensions and pressures, and their derivatives (2 A, k) by φ."""
-        slopes = np.zeros((self.driving.size, self.size))
-        estimated = np.flatnonzero(self.driving.ravel() >= 0)
-        places = self.driving.ravel()[estimated]
-        slopes[estimated, places] = self.scales[places]
+        slopes = np.zeros((self.stated_off.size, self.size))
+        for k in self.of_drives:
+            lost = self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)
+            slopes[2 * self.entries[k].number + lost, k] = self.scales[k]
         return self.stated_off + (slopes @ phi).reshape(-1, 2), slopes
+
+    # What markers read --------------------------------------------------------------------------
+
+    def of_markers(self, count: int) -> Index:
+        """(count, f) positions in φ of what the reading of each marker depends on."""
+        read = self._where(lambda e: e.row.reading is not None or e.row.clock is not None)
+        one = [k for k in read if self.entries[k].row.of == "marker"]
+        each = [[k for k in one if self.entries[k].number == m] for m in range(count)]
+        common = np.tile(np.setdiff1d(read, one), (count, 1))
+        return np.hstack(
+            [np.array(each, dtype=np.int64).reshape(count, -1 if count else 0), common]
+        )
+
+    @cached_property
+    def of_clock(self) -> Index:
+        """Positions in φ of what shifts the times at which markers are seen."""
+        return self._where(lambda e: e.row.clock is not None)
+
+    @cached_property
+    def reads_plainly(self) -> bool:
+        """Whether a marker is read as it is, at its place on the body, if by another clock."""
+        return all(
+            e.row.reading is None and e.row.clock in (None, TIME.clock) for e in self.entries
+        )
+
+    def late_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+        """How much later than at t_s a marker was seen, at its φ."""
+        values = self._values(phi, places)
+        return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
+
+    def read(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+        """What is read of a marker at y (3,), at its φ: first as all are seen, then as it is."""
+        values = self._values(phi, places)
+        for row in sorted(values, key=lambda row: row.of == "marker"):
+            y = y if row.reading is None else row.reading(y, values[row], t_s, self)
+        return y
+
+    # What moves the body ------------------------------------------------------------------------
 
     @cached_property
     def moves_grasps(self) -> bool:
         """Whether the body may be off in its grasps, or these in their zero."""
-        return len(np.setdiff1d(self.moving, self.places("turn", "tilt"))) > 0
+        return len(np.setdiff1d(self.moving, self.of_gravity)) > 0
 
-    def zero(self, number: int) -> NDArray[np.int64]:
+    def zero(self, number: int) -> Index:
         """Positions in φ of the zeros of a grasp, along its axes in turn."""
-        return self.places(f"{OF_GRASP} {number}")
+        return self.places(ZERO, of=number)
 
     def zero_m(self, number: int, grasp: Grasp, phi: Array) -> Array:
         """(3,) by how much a grasp is off."""
         found = np.zeros(3)
-        for axis, place in zip(grasp.zero, self.zero(number), strict=False):
-            found["xyz".index(axis)] = phi[place] * self.scales[place]
+        for place in self.zero(number):
+            found[self.entries[place].axis] = phi[place] * self.scales[place]
         return found
 
     def limits(self, samples: int) -> tuple[Array, Array]:
         """Lowest and highest φ (k,), where samples are read about this many whole ones away."""
-        low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        for k in self.places("time"):
+        low = np.array([entry.row.low for entry in self.entries])
+        high = np.array([entry.row.high for entry in self.entries])
+        for k in self.places(TIME):
             about, unit = samples * self.interval_s, self.scales[k]
             around = LARGEST_SHIFT_SAMPLES * self.interval_s
             furthest = max(around, LARGEST_SHIFT_SHARE * self.duration_s)
             low[k] = max(about - around, -furthest) / unit
             high[k] = min(about + around, furthest) / unit
-        for k, kind in enumerate(self.kinds):
-            if kind.startswith(("sensor-time", "sensor-lag", "tool-mass")):
-                low[k] = -SENSOR_DEVIATIONS if kind.startswith("sensor-time") else 0.0
-                high[k] = np.inf if kind.startswith("tool-mass") else SENSOR_DEVIATIONS
-        for k, timed in zip(self.places("joining"), self.timed, strict=True):
+        for k, timed in zip(self.places(JOINING), self.timed, strict=True):
             way = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
             low[k], high[k] = np.clip(NARROWER * way, -LARGEST_DELAY, LARGEST_DELAY)
         return low, high
@@ -230,7 +264,7 @@ class NuisanceMap:
         """The experiment with its loads joining and leaving when φ says."""
         if not self.timed:
             return experiment
-        late_s = (phi * self.scales)[self.places("joining")]
+        late_s = (phi * self.scales)[self.places(JOINING)]
 
         def moved(load: Load) -> Load:
             times = {
@@ -243,14 +277,10 @@ class NuisanceMap:
         masses, forces = map(moved, experiment.masses), map(moved, experiment.forces)
         return replace(experiment, masses=masses, forces=forces)
 
-    def of_sensor(self, kind: str, number: int) -> NDArray[np.int64]:
-        """Positions in φ of what is not known of a sensor."""
-        return self.places(f"{kind} {number}")
-
     @cached_property
-    def of_grasps(self) -> NDArray[np.int64]:
+    def of_grasps(self) -> Index:
         """Positions in φ of what moves the body in its grasps."""
-        return self.places("grasp-turn", "grasp-shift")
+        return self.places(GRASP_TURN, GRASP_SHIFT)
 
     def carried(self, points_m: Array, phi: Array) -> tuple[Array, Array]:
         """H X of points (m, 3), and its derivatives (m, 3, h) by φ of `of_grasps`."""
@@ -288,13 +318,12 @@ class NuisanceMap:
     def _moved(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """φ of the grasps, X, and H X."""
         phi, point = ca.SX.sym("phi", len(self.of_grasps)), ca.SX.sym("X", 3)
-        kinds, moved = [self.kinds[k] for k in self.of_grasps], point
-        values = phi * self.scales[self.of_grasps]
-        if turn := [k for k, kind in enumerate(kinds) if kind == "grasp-turn"]:
+        values, moved = self._values(phi, self.of_grasps), point
+        if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
-            moved = rotation(values[turn]) @ (point - pivot) + pivot
-        if shift := [k for k, kind in enumerate(kinds) if kind == "grasp-shift"]:
-            moved = moved + values[shift]
+            moved = rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
+        if GRASP_SHIFT in values:
+            moved = moved + values[GRASP_SHIFT]
         return phi, point, moved
 
     def in_grasp(self, phi: Array) -> Array:
@@ -316,9 +345,9 @@ class NuisanceMap:
         return value.ravel(), first, second
 
     @cached_property
-    def of_gravity(self) -> NDArray[np.int64]:
+    def of_gravity(self) -> Index:
         """Positions in φ of what turns gravity, in the body's frame."""
-        return self.places("tilt", "turn")
+        return self.places(TILT, TURN)
 
     @cached_property
     def _gravity(self) -> ca.Function:
@@ -329,13 +358,19 @@ class NuisanceMap:
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
         """Gravity (3,) in the body's frame, of the φ of `of_gravity`."""
-        values = phi * self.scales[self.of_gravity][:, None]
-        kinds, gravity = [self.kinds[k] for k in self.of_gravity], ca.DM(self.gravity_m_s2)
-        if tilt := [k for k, kind in enumerate(kinds) if kind == "tilt"]:
-            gravity = self._tilted(values[tilt])
-        if turn := [k for k, kind in enumerate(kinds) if kind == "turn"]:
-            gravity = rotation(values[turn]).T @ gravity
+        values, gravity = self._values(phi, self.of_gravity), ca.DM(self.gravity_m_s2)
+        if TILT in values:
+            gravity = self._tilted(values[TILT])
+        if TURN in values:
+            gravity = rotation(values[TURN]).T @ gravity
         return ca.SX(gravity)
+
+    def _values(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
+        """By row, of φ at some places, with units."""
+        sized, found = phi * self.scales[places][:, None], {}
+        for at, k in enumerate(places):
+            found.setdefault(self.entries[k].row, []).append(sized[at])
+        return {row: ca.vertcat(*each) for row, each in found.items()}
 
     def _tilted(self, angles: ca.SX) -> ca.SX:
         size = float(np.linalg.norm(self.gravity_m_s2))
@@ -348,83 +383,59 @@ class NuisanceMap:
         return ca.SX(size * tilted / ca.norm_2(tilted))
 
 
-def _entries(experiment: Experiment) -> list[tuple[str, str, float]]:
-    """Kind, label and deviation of every φ."""
-    wanted, markers, entries = experiment.nuisance, experiment.markers, []
-    axes = ("first", "second") if markers.on_surface else tuple("xyz")
-    for marker, sigma_m in zip(markers.names, experiment.place_sigma_m, strict=True):
-        if sigma_m > 0:
-            entries += [("place", f"place of {marker}, {axis} [m]", sigma_m) for axis in axes]
-
-    def add(kind: str, what: str, unit: str, sides: str, deviation: float | None) -> None:
-        if deviation:
-            entries.extend((kind, f"{what}, {s} [{unit}]", deviation) for s in sides.split())
-
-    for marker in markers.names:
-        add("offset", f"camera offset of {marker}", "m", "x y z", wanted.camera_offset_m)
-    if wanted.time_shift_s and not experiment.static:
-        entries.append(("time", "time shift [s]", wanted.time_shift_s))
-    add("turn", "turn of the pose", "rad", "x y z", wanted.pose_turn_rad)
-    add("shift", "shift of the pose", "m", "x y z", wanted.pose_shift_m)
-    if np.any(experiment.gravity_m_s2):
-        add("tilt", "tilt of gravity", "rad", "first second", wanted.gravity_rad)
-    # Nothing but what markers see tells how the body is off in its grasp.
-    if experiment.grasps and experiment.start == "equilibrium" and markers.names:
-        add("grasp-turn", "turn in the grasp", "rad", "x y z", wanted.hand_eye_rad)
-        add("grasp-shift", "shift in the grasp", "m", "x y z", wanted.hand_eye_m)
-    for k, grasp in enumerate(experiment.grasps):
-        which = f"zero of grasp {k + 1}"
-        add(f"{OF_GRASP} {k}", which, "m", " ".join(grasp.zero), wanted.displacement_zero_m)
-    for actuator in experiment.actuators:
-        factor, lost = wanted.off(actuator)
-        if factor:
-            entries.append(("factor", _factor_of(actuator.name), factor))
-        if lost:
-            entries.append(("lost", _lost_of(actuator), lost))
-    entries += [("joining", label, wanted.joining_s) for label, _ in _timed(experiment)]
-    return entries + _sensor_entries(experiment)
+def _entries(experiment: Experiment) -> Iterator[Entry]:
+    """Every φ of an experiment, in order."""
+    for _, rows in groupby(experiment.nuisance.rows, key=lambda row: row.of):
+        here = [row for row in rows if row.applies(experiment)]
+        for number, which in _components(experiment, here[0].of) if here else ():
+            for row in here:
+                for axis, name, unit, sigma in _axes(experiment, row, number):
+                    label = row.label.format(which=which, axis=name)
+                    yield Entry(row, number, axis, f"{label} [{unit}]", sigma)
 
 
-def _sensor_entries(experiment: Experiment) -> list[tuple[str, str, float]]:
-    """The same of the sensors of the grasps."""
-    wanted, entries = experiment.nuisance, []
-    wrenches = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-    for number, wrench in enumerate(wrenches):
-        which = "" if len(wrenches) == 1 else f" {number + 1}"
-
-        def add(kind: str, what: str, unit: str, deviation: float | None, number: int = number):
-            if deviation:
-                entries.append((f"{kind} {number}", f"{what} [{unit}]", deviation))
-
-        tare = wanted.tare or 0.0
-        for k in np.flatnonzero(wrench.measured):
-            what = f"tare{which} of {COMPONENTS[k]}"
-            add("tare", what, UNITS[k], tare * float(wrench.sigmas[k]))
-        if not experiment.static:
-            add("sensor-time", f"time shift of the sensor{which}", "s", wanted.sensor_time_s)
-            add("sensor-lag", f"lag of the sensor{which}", "s", wanted.sensor_lag_s)
-        add("tool-mass", f"mass of the tool{which}", "kg", wanted.tool_kg)
-        for axis in "xyz" if wanted.tool_kg else "":
-            add("tool-centre", f"centre of the tool{which}, {axis}", "m", wanted.tool_m)
-    return entries
+def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
+    """Numbers and names of all there are of a kind."""
+    names = experiment.markers.names
+    if of == "recording":
+        return [(0, "")]
+    if of == "marker":
+        return enumerate(names)
+    if of == "place":
+        return [(m, names[m]) for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()]
+    if of == "grasp":
+        return [(k, str(k + 1)) for k in range(len(experiment.grasps))]
+    if of == "load":
+        return enumerate(which for which, _ in _timed(experiment))
+    if of == "sensor":
+        count = len(_wrenches(experiment))
+        return [(k, f" {k + 1}" if count > 1 else "") for k in range(count)]
+    if of == "tendon":
+        return enumerate(tendon.name for tendon in experiment.tendons)
+    pressures = (pressure.name for pressure in experiment.pressures)
+    return enumerate(pressures, start=len(experiment.tendons))
 
 
-def _factor_of(name: str) -> str:
-    return f"{name}, more than stated [1]"
+def _axes(
+    experiment: Experiment, row: NuisanceRow, number: int
+) -> list[tuple[int, str, str, float]]:
+    """Number, name, unit and deviation of each axis of a row's component; none if exact."""
+    sigma, names = experiment.nuisance.sigma(row), row.axes.split() or [""]
+    if row == PLACE:
+        sigma = float(experiment.place_sigma_m[number])
+        names = ["first", "second"] if experiment.markers.on_surface else names
+    if not sigma:
+        return []
+    if row == TARE:
+        wrench = _wrenches(experiment)[number]
+        own = np.flatnonzero(wrench.measured).tolist()
+        return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in own]
+    found = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
+    return [each for each in found if row != ZERO or each[1] in experiment.grasps[number].zero]
 
 
-def _lost_of(actuator: Actuator) -> str:
-    return f"{actuator.name}, lost [{actuator.unit}]"
-
-
-def _driving(experiment: Experiment, labels: Sequence[str]) -> Index:
-    """(A, 2) places among the labels of what each actuator may be off by, or −1."""
-    place = {label: k for k, label in enumerate(labels)}
-    found = [
-        (place.get(_factor_of(a.name), -1), place.get(_lost_of(a), -1))
-        for a in experiment.actuators
-    ]
-    return np.array(found, dtype=np.int64).reshape(-1, 2)
+def _wrenches(experiment: Experiment) -> list[Wrench]:
+    return [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
 
 
 def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
@@ -433,15 +444,9 @@ def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
         return []
     said: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
     return [
-        (f"{said[change]} of {kind} {number} [s]", Timed(load, change))
+        (f"{said[change]} of {kind} {number}", Timed(load, change))
         for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
         for number, load in enumerate(loads, start=1)
         for change in get_args(Change)
         if experiment.changes(load, change)
     ]
-
-
-def rotation(turn: ca.SX) -> ca.SX:
-    """Rotation matrix of Cayley's parameters `turn` / 2; smooth and rational."""
-    half = ca.skew(turn / 2)
-    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(turn) / 4) * (half + half @ half)

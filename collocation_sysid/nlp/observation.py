@@ -23,8 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..experiment.markers import Markers
+from ..experiment.nuisance import PLACE
 from .charts import Chart, ShapeFunctions
-from .nuisance import NuisanceMap, rotation
+from .nuisance import NuisanceMap
 from .reading import Reading, lagrange_weights
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
@@ -85,15 +86,14 @@ class Observation:
         """(M, k) positions in φ of the places of the markers; −1 for exact ones."""
         markers, _, axes = self.chart.axes.shape
         found = np.full((markers, axes), -1)
-        found[self.chart.estimated] = self.nuisance.places("place").reshape(-1, found.shape[1])
+        found[self.chart.estimated] = self.nuisance.places(PLACE).reshape(-1, found.shape[1])
         return found
 
     # One sample -------------------------------------------------------------------------------
 
     @cached_property
     def _neighbours(self) -> int:
-        shifted = len(self.nuisance.places("time")) > 0
-        return min(NEIGHBOURS, len(self.grid_rows)) if shifted else 1
+        return min(NEIGHBOURS, len(self.grid_rows)) if len(self.nuisance.of_clock) else 1
 
     @cached_property
     def _first_neighbour(self) -> Index:
@@ -111,11 +111,7 @@ class Observation:
     @cached_property
     def _phi_places(self) -> Index:
         """(M, f) positions in φ of what each marker's reading depends on."""
-        common = self.nuisance.places("time", "turn", "shift")
-        offsets = self.nuisance.places("offset").reshape(-1, 3)
-        if not len(offsets):
-            offsets = np.zeros((len(self.markers.names), 0), dtype=np.int64)
-        return np.hstack([offsets, np.tile(common, (len(offsets), 1))])
+        return self.nuisance.of_markers(len(self.markers.names))
 
     @cached_property
     def _sample(self) -> Reading:
@@ -126,28 +122,16 @@ class Observation:
     def _reading(self, u: ca.SX, place: ca.SX) -> ca.SX:
         """The reading y of one sample."""
         nodes, phi = ca.vertsplit(u, [0, 3 * self._neighbours, u.numel()])
-        first = self._phi_places[0] if len(self._phi_places) else []
-        scale = self.nuisance.scales[first]
-        kinds = [self.nuisance.kinds[i] for i in first]
-
-        def values(kind: str) -> ca.SX:
-            chosen = [i for i, name in enumerate(kinds) if name == kind]
-            return phi[chosen] * scale[chosen]
-
+        own = (phi, self._phi_places[0] if len(self._phi_places) else np.zeros(0, dtype=np.int64))
         at = ca.reshape(nodes, 3, self._neighbours)
-        reading = at[:, 0]
-        if "time" in kinds:
+        reading, t_s = at[:, 0], ca.SX(0)
+        if len(self.nuisance.of_clock):
             step_s = float(self.markers.t_s[1] - self.markers.t_s[0])
             places = [ca.SX(k) for k in range(self._neighbours)]
-            reading = at @ lagrange_weights(place + values("time") / step_s, places)
-        if "turn" in kinds:
-            pivot = ca.DM(self.nuisance.pivot_m)
-            reading = rotation(values("turn")) @ (reading - pivot) + pivot
-        if "shift" in kinds:
-            reading += values("shift")
-        if "offset" in kinds:
-            reading += values("offset")
-        return reading
+            reading = at @ lagrange_weights(
+                place + self.nuisance.late_s(*own, t_s) / step_s, places
+            )
+        return self.nuisance.read(reading, *own, t_s)
 
     @cached_property
     def _data(self) -> Array:

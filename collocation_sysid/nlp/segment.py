@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
+from ..experiment.nuisance import TIME
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.pattern import SymmetricPattern
 from .block_band import Block, BlockBand, Term
@@ -154,7 +155,7 @@ class Segment:
     def following(self, phi: Array) -> tuple[Chart, Array]:
         """A chart where the estimates are, and φ in it; those given where they have not left."""
         nuisance, places = self.nuisance, self.observation.place_places
-        late = phi[nuisance.places("time")] * nuisance.scales[nuisance.places("time")]
+        late = phi[nuisance.places(TIME)] * nuisance.scales[nuisance.places(TIME)]
         shift = float(late.sum()) / self.experiment.timestep_s
         chart, of_places = self.chart.following(np.append(phi, 0.0)[places], shift)
         return chart, self._with_places(phi, of_places)
@@ -190,7 +191,7 @@ class Segment:
     @property
     def guess_phi(self) -> Array:
         """(k,) φ in the middle of the chart."""
-        phi, late = np.zeros(self.nuisance.size), self.nuisance.places("time")
+        phi, late = np.zeros(self.nuisance.size), self.nuisance.places(TIME)
         phi[late] = self.chart.samples * self.experiment.timestep_s / self.nuisance.scales[late]
         return self._with_places(phi, self.chart.centre)
 
@@ -650,7 +651,7 @@ class Segment:
     @cached_property
     def _tilts(self) -> Index:
         """Columns, of those that move the body, that turn gravity where it pulls at an own ρ."""
-        turning = np.isin(self.nuisance.moving, self.nuisance.places("turn", "tilt"))
+        turning = np.isin(self.nuisance.moving, self.nuisance.of_gravity)
         return np.flatnonzero(turning & bool(self.body.mass_slopes))
 
     @cached_property

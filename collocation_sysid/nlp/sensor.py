@@ -27,11 +27,19 @@ from ..arrays import Array, Index
 from ..experiment.clock import TIME_TOLERANCE_S
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp
+from ..experiment.nuisance import (
+    SENSOR_LAG,
+    SENSOR_TIME,
+    TARE,
+    TOOL_CENTRE,
+    TOOL_MASS,
+    NuisanceRow,
+)
 from ..experiment.wrench import Wrench
 from ..fem.pattern import dofs_of
 from .dynamics import Dynamics
 from .generated import Generated
-from .nuisance import SENSOR_DEVIATIONS, NuisanceMap
+from .nuisance import NuisanceMap
 from .reaction import centred_rows
 from .reading import Reading, lagrange_weights
 
@@ -209,8 +217,8 @@ class Sensor:
     @cached_property
     def limit_s(self) -> float:
         """Largest shift of the clock."""
-        here = self.phi_places("sensor-time")
-        return float(SENSOR_DEVIATIONS * self.nuisance.scales[here].sum())
+        here = self.phi_places(SENSOR_TIME)
+        return float(SENSOR_TIME.high * self.nuisance.scales[here].sum())
 
     def covered(self, rows: int) -> NDArray[np.bool_]:
         """(S,) samples that the first grid rows suffice to read, however the clock is shifted."""
@@ -241,12 +249,12 @@ class Sensor:
 
     # Its φ ------------------------------------------------------------------------------------
 
-    def phi_places(self, kind: str) -> Index:
+    def phi_places(self, row: NuisanceRow) -> Index:
         """Positions in φ of what is not known of this sensor."""
-        return self.nuisance.of_sensor(kind, self.number)
+        return self.nuisance.places(row, of=self.number)
 
-    def _value(self, kind: str, phi: Array) -> Array:
-        here = self.phi_places(kind)
+    def _value(self, row: NuisanceRow, phi: Array) -> Array:
+        here = self.phi_places(row)
         return phi[here] * self.nuisance.scales[here]
 
     # On the grid ------------------------------------------------------------------------------
@@ -276,9 +284,9 @@ class Sensor:
     @cached_property
     def tool_phi(self) -> Index:
         """Positions in φ of what a tool's share depends on; none where there is no tool."""
-        if not len(mass := self.phi_places("tool-mass")):
+        if not len(mass := self.phi_places(TOOL_MASS)):
             return mass
-        centre = self.phi_places("tool-centre")
+        centre = self.phi_places(TOOL_CENTRE)
         return np.concatenate([mass, centre, self.nuisance.of_gravity])
 
     @cached_property
@@ -323,7 +331,7 @@ class Sensor:
 
     def window(self, phi: Array, count: int) -> Index:
         """(S, u) of the first `count` times of the grid those that each sample is read between."""
-        shift, t_s = self._value("sensor-time", phi), self.on.t_s[self.grid[:count]]
+        shift, t_s = self._value(SENSOR_TIME, phi), self.on.t_s[self.grid[:count]]
         used = min(2 if self.on.static else NEIGHBOURS, count)
         late = np.searchsorted(t_s, self.wrench.t_s + shift.sum(), side="right")
         first = np.clip(late - 1 - (used - 1) // 2, 0, count - used)
@@ -332,11 +340,11 @@ class Sensor:
     @cached_property
     def read_phi(self) -> Index:
         """Positions in φ of what a sample is read by: the shift of the clock, if any, and tares."""
-        return np.concatenate([self.phi_places(kind) for kind in ("sensor-time", "tare")])
+        return np.concatenate([self.phi_places(row) for row in (SENSOR_TIME, TARE)])
 
     def _reading(self, used: int) -> Reading:
         """Of u = (Y at `used` grid times, φ of `read_phi`), with these times from the sample's."""
-        late, tared = len(self.phi_places("sensor-time")), self.tared
+        late, tared = len(self.phi_places(SENSOR_TIME)), self.tared
         scales = self.nuisance.scales[self.read_phi][:, None]
 
         def expression(u: ca.SX, places: ca.SX) -> ca.SX:
@@ -375,13 +383,13 @@ class Sensor:
 
     def lag_s(self, phi: Array) -> float | None:
         """T of the low-pass, None where there is none."""
-        lag = self._value("sensor-lag", phi)
+        lag = self._value(SENSOR_LAG, phi)
         return float(lag[0]) if len(lag) else None
 
     @property
     def tared(self) -> Index:
         """The components of its tares."""
-        return np.flatnonzero(self.wrench.measured)[: len(self.phi_places("tare"))]
+        return np.flatnonzero(self.wrench.measured)[: len(self.phi_places(TARE))]
 
     def given(self, forced: Forced, columns: Index, phi: Array, size: int) -> tuple[Array, Array]:
         """Y = L W (n, 6) with what the tool takes, and its slopes (n, 6, size).
@@ -402,7 +410,7 @@ class Sensor:
             taken, by_phi = self.tool.slopes(own, self.tool_data(count))
             value = value + taken.T
             slope[..., first + self.tool_phi] += np.moveaxis(by_phi, 2, 0)
-        for place in self.phi_places("sensor-lag"):
+        for place in self.phi_places(SENSOR_LAG):
             smoothing, by_lag = self._low_pass(phi, count)
             slope = (smoothing @ slope.reshape(count, -1)).reshape(slope.shape)
             slope[..., first + place] += self.nuisance.scales[place] * (by_lag @ value)

@@ -17,6 +17,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from ..arrays import Array, Index
+from ..experiment.nuisance import SENSOR_LAG
 from .addition import Addition
 from .collocation import Part
 from .reaction_rows import Reactions
@@ -50,7 +51,7 @@ class SensorRows(Addition):
     @cached_property
     def _lag(self) -> Index:
         """The φ of the low-pass, if there is one."""
-        return self.sensor.phi_places("sensor-lag")
+        return self.sensor.phi_places(SENSOR_LAG)
 
     @property
     def _each(self) -> int:

@@ -304,16 +304,11 @@ def _nuisance(finished: Run) -> dict[str, dict[str, Any]]:
     collocation = finished.solution.collocation
     found = {}
     for part in collocation.parts(finished.solution.z):
-        nuisance = part.segment.nuisance
-        for kind, name, phi, scale in zip(
-            nuisance.kinds, nuisance.names, part.phi, nuisance.scales, strict=True
-        ):
-            if kind == "place":
-                continue
-            found.setdefault(part.segment.experiment.name, {})[name.partition(": ")[2]] = {
-                "value": float(phi * scale),
-                "prior": float(scale),
-                "std_error": deviations[name] * scale if name in deviations else None,
+        for entry, name, value in part.segment.nuisance.valued(part.phi):
+            found.setdefault(part.segment.experiment.name, {})[entry.label] = {
+                "value": value,
+                "prior": entry.sigma,
+                "std_error": deviations[name] * entry.sigma if name in deviations else None,
             }
     return found
 

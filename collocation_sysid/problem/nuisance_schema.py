@@ -1,156 +1,31 @@
-"""The nuisance keys of a recording, made from one table of what may be estimated.
+"""The nuisance keys of a recording, made from the table of what may be estimated.
 
-A row is a key of the file, the fields of `Nuisance` that it gives with the key of each one's
-prior, and what is said of it.
+A key has the priors of one row of the table, or of several.
 """
 
 from __future__ import annotations
 
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from itertools import groupby
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from ..checked import Positive
 from ..experiment import Nuisance
+from ..experiment.nuisance import ROWS, NuisanceRow
 from .section import Section, given_keys
 
-
-class Row(NamedTuple):
-    """One key."""
-
-    key: str
-    priors: dict[str, str]
-    said: str
+KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}
 
 
-ROWS = (
-    Row(
-        "marker_offsets",
-        {"marker_offset_m": "prior_m"},
-        "Errors of the places given in reference_m, which turn with the body: prior_m, 1 mm by "
-        "default.",
-    ),
-    Row(
-        "time_shift",
-        {"time_shift_s": "prior_s"},
-        "How much later than their times say markers were seen, on the grasps' clock: prior_s, "
-        "5 ms by default.",
-    ),
-    Row(
-        "gravity",
-        {"gravity_rad": "prior_rad"},
-        "A tilt of the direction of gravity: prior_rad, 1 degree by default.",
-    ),
-    Row(
-        "hand_eye",
-        {"hand_eye_rad": "prior_rad", "hand_eye_m": "prior_m"},
-        "A constant motion of the body in its grasps: prior_rad, prior_m; 0.5 degrees and 1 mm by "
-        "default.",
-    ),
-    Row(
-        "joining",
-        {"joining_s": "prior_s"},
-        "How much later than stated each point mass or force joins or leaves, where it does so "
-        "within the recording: prior_s, 10 ms by default.",
-    ),
-    Row(
-        "pose",
-        {"pose_turn_rad": "prior_rad", "pose_shift_m": "prior_m"},
-        "A constant rigid correction of grasps and body in the cameras' frame: prior_rad, prior_m.",
-    ),
-    Row(
-        "displacement_zero",
-        {"displacement_zero_m": "prior_m"},
-        "A constant offset of each displacement along each of its axes: prior_m, 0.1 mm by "
-        "default.",
-    ),
-    Row(
-        "camera_offsets",
-        {"camera_offset_m": "prior_m"},
-        "A constant offset of every marker in the cameras' frame: prior_m.",
-    ),
-    Row(
-        "tare",
-        {"tare": "prior_sigmas"},
-        "A constant offset of every component of a wrench: prior_sigmas, 10 by default.",
-    ),
-    Row(
-        "sensor_time",
-        {"sensor_time_s": "prior_s"},
-        "How much later than their times say wrenches were measured: prior_s, 5 ms by default.",
-    ),
-    Row(
-        "sensor_lag",
-        {"sensor_lag_s": "prior_s"},
-        "Time constant of a first-order low-pass in the sensor: prior_s.",
-    ),
-    Row(
-        "tool",
-        {"tool_kg": "prior_kg", "tool_m": "prior_m"},
-        "A mass between sensor and body, and its centre about point_m: prior_kg, prior_m.",
-    ),
-    Row(
-        "tension_factor",
-        {"tension_factor": "prior"},
-        "A factor on the tension of each tendon, about one: prior.",
-    ),
-    Row(
-        "tension_lost",
-        {"tension_lost_n": "prior_n"},
-        "Tension of each tendon that friction takes: prior_n.",
-    ),
-    Row(
-        "pressure_factor",
-        {"pressure_factor": "prior"},
-        "A factor on each pressure, about one: prior.",
-    ),
-    Row(
-        "pressure_lost",
-        {"pressure_lost_pa": "prior_pa"},
-        "An offset that each pressure lacks: prior_pa.",
-    ),
-)
-
-# Priors of one number: what they are called, what they tell, and what the number is.
-PRIORS = {
-    "prior_m": ("Length", "a length is known", "Standard deviation [m]."),
-    "prior_s": ("Time", "a time is known", "Standard deviation [s]."),
-    "prior_rad": ("Angle", "a direction is known", "Standard deviation [rad]."),
-    "prior_sigmas": (
-        "Tare",
-        "the zero of a sensor is known",
-        "Standard deviation, in sigma_n and sigma_nm.",
-    ),
-    "prior": ("Share", "a factor near one is known", "Standard deviation, such as 0.05."),
-    "prior_n": (
-        "Tension",
-        "it is known what friction takes of a tension",
-        "Standard deviation [N].",
-    ),
-    "prior_pa": ("Pressure", "the zero of a pressure is known", "Standard deviation [Pa]."),
-}
-
-
-class ToolPrior(Section):
-    """How well it is known what a sensor carries beside the body."""
-
-    prior_kg: Positive = Field(description="Standard deviation of its mass, about zero [kg].")
-    prior_m: Positive = Field(
-        0.05, description="Standard deviation of each coordinate of its centre [m]."
-    )
-
-
-class PosePrior(Section):
-    """How well a pose is known; what is left out is taken as exact."""
-
-    prior_rad: Positive | None = Field(None, description="Standard deviation of a turn [rad].")
-    prior_m: Positive | None = Field(None, description="Standard deviation of a shift [m].")
+class Prior(Section):
+    """How well something is known; what is left out of several is taken as exact."""
 
     @model_validator(mode="after")
-    def _some(self) -> PosePrior:
-        if not given_keys(self, "prior_rad", "prior_m"):
-            raise ValueError("found neither prior_rad nor prior_m; expected one or both")
+    def _some(self) -> Prior:
+        priors = list(type(self).model_fields)
+        if not given_keys(self, *priors):
+            raise ValueError(f"found neither {' nor '.join(priors)}; expected one or both")
         return self
 
 
@@ -166,29 +41,35 @@ def _form(value: Any) -> str:
     return "<none>" if isinstance(value, str) else "<table>"
 
 
-@cache
-def _prior(key: str, *others: str) -> type[Section]:
-    if others:
-        return ToolPrior if key == "prior_kg" else PosePrior
-    name, known, what = PRIORS[key]
-    fields: dict[str, Any] = {key: (Positive, Field(description=what))}
-    return create_model(f"{name}Prior", __base__=Section, __doc__=f"How well {known}.", **fields)
+def _prior(key: str, rows: list[NuisanceRow]) -> type[Section]:
+    """The table of a key."""
+    # One prior alone has to be there, and what another one goes with.
+    either = len(rows) > 1 and all(row.beside is None for row in rows)
+    fields: dict[str, Any] = {}
+    for row in rows:
+        known = row.beside or (None if either else ...)
+        kind: Any = Optional[Positive] if either else Positive  # noqa: UP045
+        said = f"Standard deviation [{row.unit}]."
+        fields[row.prior] = (kind, Field(known, description=said))
+    name = "".join(word.title() for word in key.split("_")) + "Prior"
+    said = f"How well it is known: {rows[0].said}."
+    return create_model(name, __base__=Prior, __doc__=said, **fields)
 
 
 def _section() -> type[Section]:
-    fields: dict[str, Any] = {
-        row.key: (
-            or_none(_prior(*row.priors.values())) | None,
-            Field(None, description=row.said),
-        )
-        for row in ROWS
-    }
+    fields: dict[str, Any] = {}
+    for key, rows in KEYS.items():
+        said = " ".join(f"{row.said[0].upper()}{row.said[1:]}: {_said(row)}." for row in rows)
+        fields[key] = (or_none(_prior(key, rows)) | None, Field(None, description=said))
     said = (
         "What is estimated of this recording alone, each with a prior around zero.\n\n"
-        'The first five are estimated unless they are "none", and where a wrench is measured '
-        "tare and\nsensor_time."
+        'What has a prior by default is estimated unless it is "none".'
     )
     return create_model("NuisanceSection", __base__=Section, __doc__=said, **fields)
+
+
+def _said(row: NuisanceRow) -> str:
+    return row.prior if row.sigma is None else f"{row.prior}, {row.usual} by default"
 
 
 NuisanceSection = _section()
@@ -203,10 +84,10 @@ def nuisance_of(section: Section | Literal["none"]) -> Nuisance:
     if section == "none":
         return Nuisance.none()
     found: dict[str, float | None] = {}
-    for row in ROWS:
-        given = getattr(section, row.key)
+    for key, rows in KEYS.items():
+        given = getattr(section, key)
         if given == "none":
-            found |= dict.fromkeys(row.priors)
+            found |= {row.name: None for row in rows}
         elif given is not None:
-            found |= {field: getattr(given, prior) for field, prior in row.priors.items()}
+            found |= {row.name: getattr(given, row.prior) for row in rows}
     return Nuisance(**found)

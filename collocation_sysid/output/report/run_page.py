@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from ...experiment.nuisance import in_unit_for_people
 from ...fem.constants import symbol_of, unit_of
 from ...files import RESULT_FILE, is_own, read_json
 from ..remedies import remedies_for, remedy_for
 from ..replay import LARGEST, read_arrays, reading_run
 from .page import millimetres, number, own_pictures, picture, rendered
 
-SHOWN_UNITS = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°")}
-SHOWN_UNITS |= {"N": (1.0, " N"), "N m": (1e3, " mN m"), "kg": (1e3, " g")}
 MEANINGS = {
     "good": "nothing speaks against the answer and its error bars",
     "check": "usable after a look at the reasons",
@@ -211,7 +210,7 @@ def _nuisance(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 def _size(value: float | None, unit: str) -> str:
     """A number in the unit that suits it: millimetres, milliseconds or degrees."""
-    factor, shown = SHOWN_UNITS[unit]
+    factor, shown = in_unit_for_people(1.0, unit)
     # No powers of ten for the sizes of bodies.
     digits = 2 if value is None or abs(factor * value) < 99.5 else 4
     return "–" if value is None else f"{number(factor * value, digits)}{shown}"
