@@ -159,7 +159,7 @@ def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
     adjoint = adjoint_gradient(collocation, z)
     rows = [segment.grid_rows for segment in collocation.segments]
     point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
-    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    forward = 2 * collocation.loss_scale * point.fit.score
     np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
 
     def objective(at: np.ndarray) -> float:
@@ -176,7 +176,7 @@ def test_gradients_where_a_wrench_tells_the_density(make, rng):
     z = simulated(collocation, p)
     adjoint = adjoint_gradient(collocation, z)
     point = Horizon(collocation, [9]).evaluate(p, collocation.unpack(z)[1])
-    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    forward = 2 * collocation.loss_scale * point.fit.score
     np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
 
     def objective(at: np.ndarray) -> float:

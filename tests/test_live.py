@@ -16,7 +16,6 @@ import pytest
 from matplotlib.image import imread
 from problem_files import Outcome, run_command
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
-from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
@@ -32,13 +31,13 @@ from collocation_sysid.live import (
     model,
     sweep,
 )
-from collocation_sysid.live.information import Information
+from collocation_sysid.live.budget import Budget
 from collocation_sysid.live.intake import Intake
-from collocation_sysid.live.pace import Pace
 from collocation_sysid.live.sources import as_json, datagrams, paced, recorded
 from collocation_sysid.live.track import Track
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.nlp.least_squares import LeastSquares
 from collocation_sysid.statistics.uncertainty import covariance
 
 NOISE_M = 3e-4
@@ -87,7 +86,7 @@ def normal_equations(triangle: np.ndarray) -> np.ndarray:
     return triangle.T @ triangle
 
 
-def assert_same_information(ours: Information, theirs: Information, atol: float) -> None:
+def assert_same_information(ours: LeastSquares, theirs: LeastSquares, atol: float) -> None:
     """The normal equations, each entry by the sizes on the diagonal."""
     found, expected = (normal_equations(each.triangle) for each in (ours, theirs))
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -107,7 +106,7 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
         p, [leg.x + leg.tangent.step for leg in horizon.evaluate(p, reached).legs]
     )
     flat = live.model.flat(p)
-    rows = np.column_stack([point.slope, point.residual - point.slope @ flat])
+    rows = np.column_stack([point.fit.slope, point.fit.residual - point.fit.slope @ flat])
     batch = rows.T @ rows
     ours = normal_equations(live.track.information.triangle)
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
@@ -128,7 +127,8 @@ def unknown(problem: cs.Problem) -> cs.Problem:
 
 @pytest.mark.parametrize(
     "problem",
-    [swing, lambda: unknown(swing(28, Nuisance()))],
+    # Of this noise no marker ends so near an edge that rounding decides on which side.
+    [swing, lambda: unknown(swing(28, Nuisance(), seed=4))],
     ids=["with guesses", "without guesses and places"],
 )
 def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
@@ -213,24 +213,24 @@ def test_two_rows_passed_again_a_frame_follow_the_batch(scheme):
 
 
 def test_rows_are_begun_that_end_in_time():
-    pace = Pace.of(one_s=2.0, many_s=9.0, many=8)
-    assert [pace.rows(left_s) for left_s in (0.0, 1.9, 2.1, 4.1)] == [0, 0, 1, 3]
-    pace.took(3, 8.0)
-    assert pace.rows(4.1) == 1
+    budget = Budget.of(one_s=2.0, many_s=9.0, many=8)
+    assert [budget.rows(left_s) for left_s in (0.0, 1.9, 2.1, 4.1)] == [0, 0, 1, 3]
+    budget.took(3, 8.0)
+    assert budget.rows(4.1) == 1
     for _ in range(9):
-        pace.forget()
-    assert pace.rows(4.1) == 3
-    assert Pace().rows(1e-3) == 1
+        budget.forget()
+    assert budget.rows(4.1) == 3
+    assert Budget().rows(1e-3) == 1
 
 
 def test_rows_leave_time_for_what_follows_them():
-    pace = Pace.of(one_s=2.0, many_s=9.0, many=8)
-    pace.ended(1.0)
-    pace.ended(0.2)
-    assert [pace.rows(left_s) for left_s in (0.9, 2.9, 3.1, 5.1)] == [0, 0, 1, 3]
+    budget = Budget.of(one_s=2.0, many_s=9.0, many=8)
+    budget.ended(1.0)
+    budget.ended(0.2)
+    assert [budget.rows(left_s) for left_s in (0.9, 2.9, 3.1, 5.1)] == [0, 0, 1, 3]
     for _ in range(60):
-        pace.ended(0.0)
-    assert pace.rows(2.5) == 1
+        budget.ended(0.0)
+    assert budget.rows(2.5) == 1
 
 
 def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
@@ -244,30 +244,6 @@ def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
     assert run_command("replay", "problem.toml", "--rate", 0, "--json").code == 0
     assert min(frozen) > 10_000
     assert gc.get_freeze_count() == 0
-
-
-def test_an_update_of_the_triangle_is_the_sum_of_the_normal_equations(rng):
-    p, parts = rng.normal(size=3), [(rng.normal(size=5), rng.normal(size=(5, 3))) for _ in "ab"]
-    separate = [Information.none(3).with_rows(r, s, p) for r, s in parts]
-    joined = separate[0].joined(separate[1])
-    expected = sum(normal_equations(each.triangle) for each in separate)
-    np.testing.assert_allclose(normal_equations(joined.triangle), expected, atol=1e-12)
-    residual = np.concatenate([r for r, _ in parts])
-    assert joined.loss(p) == pytest.approx(residual @ residual)
-    slope = np.vstack([s for _, s in parts])
-    best = p - np.linalg.lstsq(slope, residual, rcond=None)[0]
-    wide = np.full(3, 1e3)
-    np.testing.assert_allclose(joined.best(-wide, wide), best, atol=1e-10)
-    np.testing.assert_allclose(joined.covariance, np.linalg.inv(slope.T @ slope), atol=1e-10)
-
-
-def test_the_best_between_bounds_is_that_of_bounded_least_squares(rng):
-    for _ in range(20):
-        slope, residual = rng.normal(size=(9, 6)), rng.normal(size=9)
-        known = Information.none(6).with_rows(residual, slope, np.zeros(6))
-        lower, upper = -rng.uniform(0.01, 0.3, 6), rng.uniform(0.01, 0.3, 6)
-        expected = lsq_linear(slope, -residual, (lower, upper), method="bvls", tol=1e-14).x
-        np.testing.assert_allclose(known.best(lower, upper), expected, atol=1e-7)
 
 
 def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):

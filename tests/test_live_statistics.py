@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from collocation_sysid.live.information import Information
 from collocation_sysid.live.statistics import Scatter, widened
+from collocation_sysid.nlp.least_squares import LeastSquares
 
 WAVE = 2.0 * np.cos(np.pi / 4 * np.arange(33))
 NONE = np.full((2, 3), np.nan)
@@ -85,11 +85,11 @@ def test_only_what_is_more_than_chance_counts(rng):
 FITTED, ROWS = 2, 60
 
 
-def known(size: float) -> tuple[Information, np.ndarray]:
+def known(size: float) -> tuple[LeastSquares, np.ndarray]:
     """Rows whose residuals are of a size, and the estimate."""
     slope = np.random.default_rng(0).normal(size=(ROWS, FITTED))
     p = np.array([0.3, -0.2])
-    return Information.none(FITTED).with_rows(np.full(ROWS, size), slope, p), p
+    return LeastSquares.none(FITTED).add(np.full(ROWS, size), slope, p), p
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 1.1])

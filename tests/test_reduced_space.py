@@ -33,6 +33,7 @@ from collocation_sysid.methods.secant import updated, with_curvature
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.least_squares import LeastSquares
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.simulation import with_markers
 
@@ -310,19 +311,25 @@ def test_a_misfit_far_above_the_noise_is_noted():
 # The curvature that Gauss–Newton leaves out
 
 
-def point_of(q: np.ndarray, before: Point | None = None) -> Point:
-    """Residuals (q - 1)² of every entry, scaled, and their slopes."""
+def residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(q - 1)² of every entry, scaled, and their slopes."""
     weights = np.random.default_rng(0).uniform(1, 2, len(q))
-    residual = weights * (q - 1) ** 2 + 1
-    crossed = np.zeros(len(q)) if before is None else before.slope.T @ residual
-    return Point(q, [], [], residual, np.diag(2 * weights * (q - 1)), crossed)
+    return weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1))
+
+
+def point_of(q: np.ndarray, before: Point | None = None) -> Point:
+    """A point that has these."""
+    residual, slope = residuals(q)
+    crossed = np.zeros(len(q)) if before is None else residuals(before.p)[1].T @ residual
+    return Point(q, [], [], LeastSquares.none(len(q)).add(residual, slope), crossed)
 
 
 def test_the_learned_curvature_explains_the_last_step():
     before = point_of(np.array([2.0, 3.0]))
     after = point_of(np.array([2.1, 3.2]), before)
     b = updated(np.zeros((2, 2)), before, after)
-    missing = (after.slope - before.slope).T @ after.residual
+    residual, slope = residuals(after.p)
+    missing = (slope - residuals(before.p)[1]).T @ residual
     np.testing.assert_allclose(b @ (after.p - before.p), missing)
     np.testing.assert_allclose(b, b.T)
 
@@ -331,10 +338,11 @@ def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
     triangle, right = np.triu(rng.normal(size=(4, 4))) + 3 * np.eye(4), rng.normal(size=4)
     b = rng.normal(size=(4, 4))
     b += b.T
-    joined, joined_right = with_curvature(triangle, right, b)
-    np.testing.assert_allclose(joined.T @ joined, triangle.T @ triangle + b, atol=1e-12)
-    np.testing.assert_allclose(joined.T @ joined_right, triangle.T @ right, atol=1e-12)
-    assert with_curvature(triangle, right, -100 * np.eye(4))[0] is triangle
+    fit = LeastSquares(np.column_stack([triangle, right]))
+    joined = with_curvature(fit, b)
+    np.testing.assert_allclose(joined.information, triangle.T @ triangle + b, atol=1e-12)
+    np.testing.assert_allclose(joined.score, triangle.T @ right, atol=1e-12)
+    assert with_curvature(fit, -100 * np.eye(4)) is fit
 
 
 # History and timing

@@ -72,7 +72,7 @@ def test_both_gradients_are_those_of_differences(make, huber, rng):
     adjoint = adjoint_gradient(collocation, z)
     rows = [segment.grid_rows for segment in collocation.segments]
     point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
-    forward = 2 * collocation.loss_scale * point.slope.T @ point.residual
+    forward = 2 * collocation.loss_scale * point.fit.score
     np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
     direction = rng.normal(size=len(p))
     differences = directional_derivative(

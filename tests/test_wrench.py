@@ -220,7 +220,7 @@ def assert_slopes(collocation: Collocation) -> None:
     point = Horizon(collocation, [segment.grid_rows]).evaluate(p, collocation.unpack(z)[1])
     scale = 1 / collocation.loss_scale
     assert point.loss == pytest.approx(scale * collocation.objective(z), rel=1e-9)
-    forward = 2 * point.slope.T @ point.residual
+    forward = 2 * point.fit.score
     backward = scale * adjoint_gradient(collocation, z)
     assert relative_error(backward, forward) < 1e-8
     direction = np.random.default_rng(2).standard_normal(len(p))
@@ -240,8 +240,9 @@ def test_rows_that_are_continued_sense_the_same():
     whole = Horizon(collocation, [len(x)])
     continued = whole.evaluate(p, [x], part)
     afresh = whole.evaluate(p, [x])
-    np.testing.assert_allclose(continued.residual, afresh.residual, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(continued.slope, afresh.slope, rtol=1e-9, atol=1e-7)
+    ours, theirs = continued.fit, afresh.fit
+    np.testing.assert_allclose(ours.residual, theirs.residual, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(ours.slope, theirs.slope, rtol=1e-9, atol=1e-7)
 
 
 # At the samples -----------------------------------------------------------------------------------

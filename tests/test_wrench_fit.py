@@ -197,7 +197,7 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     p, x = collocation.unpack(solution.z)
     point = Horizon(collocation, [len(x[0])]).evaluate(p, x)
     rows = np.concatenate([block.slope.reshape(-1, 5) for block in fit.blocks])
-    np.testing.assert_allclose(rows.T @ rows, point.slope.T @ point.slope, rtol=1e-6)
+    np.testing.assert_allclose(rows.T @ rows, point.fit.information, rtol=1e-6)
     seen = Problem([blind(swung())], unknown)
     told = covariance(seen.collocation(), seen.collocation().pack(p, x)).estimates
     assert told["density_kg_m3"].std_error is None

@@ -21,6 +21,7 @@ from ..nlp.collocation import Collocation
 from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..problem import Problem
+from ..statistics.information import least_squares
 from ..statistics.linearised import LinearisedFit, linearised_fit
 from .limits import Bounds, Limits
 from .motion import Motion
@@ -38,18 +39,8 @@ def shared_information(fit: LinearisedFit) -> Array:
 
     That of the measurements alone: priors of the shared parameters are left out.
     """
-    whole = np.diag(fit.prior_slope**2)
-    for block in fit.blocks:
-        slopes = block.channels[1].reshape(-1, len(fit.names))
-        whole += slopes.T @ slopes
-    own = slice(fit.shared)
-    of_q, coupled, of_phi = (
-        whole[own, own],
-        whole[own, fit.shared :],
-        whole[fit.shared :][:, fit.shared :],
-    )
-    of_q = of_q - np.diag(fit.prior_slope[own] ** 2)
-    return of_q - coupled @ np.linalg.solve(of_phi, coupled.T) if len(of_phi) else of_q
+    alone = least_squares(fit).marginal(fit.shared)
+    return alone.information - np.diag(fit.prior_slope[: fit.shared] ** 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,21 +26,20 @@ from ..checked import AtLeastOne, Positive
 from ..errors import InputError, SimulationError
 from ..methods.options import Options
 from ..nlp.lapack import one_blas_thread
+from ..nlp.least_squares import LeastSquares
 from ..problem import Problem
 from ..run import Run
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
 from ..statistics.trust import GROSS_MISFIT, Concern, Trust
+from .budget import Budget
 from .frames import Frame, Pose, as_pose, as_time, as_tracks
-from .information import Information
 from .intake import LONGEST, Intake
 from .model import TOGETHER, Model, Poses
-from .newest import Newest
-from .pace import Pace
 from .search import SEEN, Search
 from .statistics import Scatter, widened
 from .sweep import LoggedRow, Reading
-from .track import Track
+from .track import JoinedPasses, Track
 from .trust import UNSETTLED, data_concerns, estimate_concerns
 from .whole import recording_of, solved
 
@@ -165,15 +164,15 @@ class Estimator:
         self._blocks = max(2, round(options.window_s / model.interval_s / samples))
         self._bounds()
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
-        self.prior = Information.none(model.size)
+        self.prior = LeastSquares.none(model.size)
         self.track: Track | None = None
-        self._newest = Newest(self.prior, [], [])
+        self._joined = JoinedPasses(self.prior, [], [])
         self._held_m = np.full((1, 3), np.nan)
         self.again: Track | None = None
         self.log: list[LoggedRow] = []
         self.search = self._search() if problem.parameters.unguessed else None
         self.scatter = Scatter()
-        self._trust, self._rejected, self.pace = TRUST, 0, Pace()
+        self._trust, self._rejected, self.budget = TRUST, 0, Budget()
         self.last: Update | None = None
         self._rest = self._warmed_up()
 
@@ -221,7 +220,7 @@ class Estimator:
                 notes.append("nothing was seen for long: begun anew, as if at rest here")
         rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m)
         notes += said
-        self.pace.forget()
+        self.budget.forget()
         caught = self._catch_up(began, notes)
         squares, before = [], self.clock()
         while rows:
@@ -231,14 +230,14 @@ class Estimator:
         self._estimate()
         if self.track is not None and not self.track.failed and self.search is None:
             self._turn(self.track, self.track, began, TURN_FIRST)
-        self.pace.frame_s = self.clock() - before
+        self.budget.frame_s = self.clock() - before
         done = self._pass_again(began, notes, caught)
         before = self.clock()
         self._shorten()
         near = np.concatenate([*squares, np.zeros(0)])
         rms_m = float(np.sqrt(near.mean())) if len(near) else float("nan")
         estimates, trust = self._known(frame.t_s)
-        self.pace.ended(self.clock() - before)
+        self.budget.ended(self.clock() - before)
         latency_s = self.clock() - began
         self.last = Update(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
         return self.last
@@ -387,10 +386,10 @@ class Estimator:
         except SimulationError:
             return None
         self._estimates_at(trial.information, self.p)
-        self.pace = self._timed(trial, row)
+        self.budget = self._timed(trial, row)
         return poses, trial.blocks[0].kept[0].x
 
-    def _timed(self, trial: Track, row: LoggedRow) -> Pace:
+    def _timed(self, trial: Track, row: LoggedRow) -> Budget:
         """How long rows take that are passed again, the shortest times."""
         took_s: dict[int, float] = {}
         most = min(trial.rows - 1, TOGETHER, self._block_rows - 1)
@@ -400,7 +399,7 @@ class Estimator:
             began = self.clock()
             again.again([row] * count)
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
-        return Pace.of(took_s[1], took_s[most], most)
+        return Budget.of(took_s[1], took_s[most], most)
 
     def _begin(self, row: LoggedRow) -> None:
         model, guesses = self.model, []
@@ -417,10 +416,10 @@ class Estimator:
             self._bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
-            self.prior = Information.none(self.model.size)
+            self.prior = LeastSquares.none(self.model.size)
             track = Track(self.model, self.p, self.prior, self._block_rows)
             track.advance([row.poses], guesses)
-        self.track, self._newest = track, Newest.of(track, None)
+        self.track, self._joined = track, JoinedPasses.of(track, None)
 
     def _begin_anew(self) -> None:
         """Keep what is known, and wait for a start."""
@@ -438,7 +437,7 @@ class Estimator:
         """How far the estimate is from where all is linearised, in standard errors."""
         if self.track is None or self.track.failed:
             return np.inf
-        return self._apart(self.track, self.p, self._newest.points)
+        return self._apart(self.track, self.p, self._joined.points)
 
     def _apart(self, track: Track, p: Array, points: Sequence[Array]) -> float:
         """How far p is at most from points, in the standard errors of a pass."""
@@ -448,10 +447,10 @@ class Estimator:
 
     def _estimate(self) -> None:
         if self.track is not None and not self.track.failed:
-            self._newest = Newest.of(self.track, self.again)
-            self.p = self._best(self.track, self._newest.information)
+            self._joined = JoinedPasses.of(self.track, self.again)
+            self.p = self._best(self.track, self._joined.information)
 
-    def _best(self, track: Track, known: Information) -> Array:
+    def _best(self, track: Track, known: LeastSquares) -> Array:
         reach = self._trust * self.model.collocation.reach_p
         low, high = np.maximum(self.lower, track.p - reach), np.minimum(self.upper, track.p + reach)
         best = known.best(self.model.flat(low), self.model.flat(high))
@@ -462,7 +461,7 @@ class Estimator:
         size, samples = self.model.size, len(self.log) / self.model.substeps
         stay = STAY * max(1.0, samples / SEEN)
         slopes = np.diag(1 / (stay * self.model.collocation.reach_p * track.sweep.rates))
-        known = self._newest.information.with_rows(np.zeros(size), slopes, track.sweep.flat)
+        known = self._joined.information.add(np.zeros(size), slopes, track.sweep.flat)
         return self._best(track, known)
 
     def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
@@ -479,19 +478,19 @@ class Estimator:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
             return {name: Estimate(value) for name, value in values.items()}, Trust.of(grave)
         if self.counts["looked"] % LOOK_EVERY == 0:
-            self.scatter = self._newest.scatter(self.model.flat(self.p))
+            self.scatter = self._joined.scatter(self.model.flat(self.p))
         self.counts["looked"] += 1
-        estimates = self._estimates_at(self._newest.information, self.p)
+        estimates = self._estimates_at(self._joined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, self.samples)
         grave += estimate_concerns(estimates, self.moved)
         return estimates, Trust.of(grave)
 
-    def _estimates_at(self, known: Information, p: Array) -> dict[str, Estimate]:
+    def _estimates_at(self, known: LeastSquares, p: Array) -> dict[str, Estimate]:
         collocation, nq = self.model.collocation, self.model.collocation.nq
         flat, fitted = self.model.flat(p), self.model.size
         factor, quantile = widened(known, flat, fitted, self.scatter)
         rates = self.model.rates(flat)[:nq]
-        of_q = factor * known.covariance[:nq, :nq] / np.outer(rates, rates)
+        of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
         return user_estimates(collocation.parameters, p[:nq], of_q, bounded, quantiles)
@@ -502,9 +501,9 @@ class Estimator:
         """Go on with a pass in what is left of the budget; how many rows are done then."""
         while self.track is not None:
             begins = self.clock()
-            if self.again is None and self._left(done, begins - began + self.pace.turn_s):
+            if self.again is None and self._left(done, begins - began + self.budget.turn_s):
                 self.again = self._wanted(self.track, notes)
-                self.pace.turned(self.clock() - begins)
+                self.budget.turned(self.clock() - begins)
             again = self.again
             if again is None:
                 break
@@ -523,7 +522,7 @@ class Estimator:
             return 0
         lag = len(self.log) - again.rows
         elapsed_s = self.clock() - began
-        if lag > min(again.left, self._left(0, elapsed_s + self.pace.frame_s)):
+        if lag > min(again.left, self._left(0, elapsed_s + self.budget.frame_s)):
             return 0
         return self._advance(again, lag, notes)
 
@@ -534,7 +533,7 @@ class Estimator:
             again.again(self.log[were : were + count])
         except SimulationError:
             again.failed = True
-        self.pace.took(count, self.clock() - before)
+        self.budget.took(count, self.clock() - before)
         if self.search is not None and not self.search.done:
             if again.failed or again.rows >= min(self.search.rows, len(self.log)):
                 self.search.compare(again)
@@ -547,7 +546,7 @@ class Estimator:
         """Rows that there is time for."""
         if self.rows is not None:
             return self.rows - done
-        return self.pace.rows(self.budget_s - elapsed_s)
+        return self.budget.rows(self.budget_s - elapsed_s)
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
         """Begin a pass where one is wanted."""
@@ -579,12 +578,12 @@ class Estimator:
         if turned.rows < turned.turned + TOGETHER or self._apart(track, self.p, here) <= far:
             return
         before = self.clock()
-        if self.rows is None and not self._left(0, before - began + self.pace.turn_s):
+        if self.rows is None and not self._left(0, before - began + self.budget.turn_s):
             return
         p = self._next(track)
         if self._apart(track, p, here) > far:
             turned.turn(p)
-            self.pace.turned(self.clock() - before)
+            self.budget.turned(self.clock() - before)
 
     def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
         """Take a pass that has caught up in place of the first, or not."""
@@ -601,7 +600,7 @@ class Estimator:
             self._rejected = 0
             if sought:
                 notes.append("begun from another stiffness")
-            self.scatter = Newest.of(again, None).scatter(again.sweep.flat)
+            self.scatter = JoinedPasses.of(again, None).scatter(again.sweep.flat)
         else:
             reach = self.model.collocation.reach_p
             length = float(np.abs((again.p - track.p) / reach).max())

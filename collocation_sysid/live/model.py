@@ -21,13 +21,13 @@ from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
 from ..nlp.collocation import Collocation
 from ..nlp.forces import Forces
+from ..nlp.least_squares import LeastSquares
 from ..nlp.newton import NewtonOptions, Solver
 from ..nlp.observation import NEIGHBOURS, Observation
 from ..nlp.row import Row
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
 from ..problem import Problem
-from .information import Information
 
 if TYPE_CHECKING:
     from ..fem.batched.skyline import Room
@@ -158,14 +158,14 @@ class Model:
         rates[places] = flat[places]
         return rates
 
-    def stated(self, p: Array) -> Information:
+    def stated(self, p: Array) -> LeastSquares:
         """What is known before the first frame, to first order about p."""
         residual, slopes = self.collocation.prior(p)
         nq, flat = self.collocation.nq, self.flat(p)
         away = (p[:nq] - self.collocation.parameters.guess_q) / WEAK
         rows = np.vstack([np.diag(slopes), np.eye(nq, self.size) / WEAK]) / self.rates(flat)
-        none = Information.none(self.size)
-        return none.with_rows(np.concatenate([residual, away]), rows, flat)
+        none = LeastSquares.none(self.size)
+        return none.add(np.concatenate([residual, away]), rows, flat)
 
     @cached_property
     def samples_around(self) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, stdtrit
 
 from ..arrays import Array
-from .information import Information
+from ..nlp.least_squares import LeastSquares
 
 # Probability of taking noise of the σ given for larger, at each look.
 RARE = 1e-3
@@ -51,12 +51,12 @@ class Scatter:
         return cls(float(np.sqrt(square)), min(lag1, MOST) if matters else 0.0)
 
 
-def widened(known: Information, p: Array, fitted: float, scatter: Scatter) -> tuple[float, float]:
+def widened(known: LeastSquares, p: Array, fitted: float, scatter: Scatter) -> tuple[float, float]:
     """By what variances are multiplied, and the half width of 95 % intervals in deviations.
 
     Parameters
     ----------
-    known : Information
+    known : LeastSquares
         With the priors.
     p : (P,) the estimate
     fitted : float

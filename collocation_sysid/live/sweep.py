@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..methods.robust import huberised
+from ..nlp.least_squares import LeastSquares
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.rest import start_state
 from ..nlp.row import Row
 from ..nlp.tangent import Forward, GivenMotion, Memory, Step
-from .information import Information
 from .model import TOGETHER, Model, Poses
 
 # A row's correction over the body's size: the next one would be its square. Where rows are solved
@@ -116,7 +116,7 @@ class Sweep:
     ----------
     model : Model
     p : (P,)
-    known : Information
+    known : LeastSquares
         What was known before its first row.
     start : State, optional
         Where it begins; where the recording does by default.
@@ -133,7 +133,7 @@ class Sweep:
         self,
         model: Model,
         p: Array,
-        known: Information,
+        known: LeastSquares,
         start: State | None = None,
         at: Array | None = None,
     ) -> None:
@@ -452,7 +452,7 @@ class Sweep:
         """Add what markers say, of those that are there."""
         self.information = self.added(self.information, said)
 
-    def added(self, known: Information, said: Sequence[Said]) -> Information:
+    def added(self, known: LeastSquares, said: Sequence[Said]) -> LeastSquares:
         """What is known, and what markers say besides, with the loss's weights."""
         if not said:
             return known
@@ -462,7 +462,7 @@ class Sweep:
         rows, huber = at_zero[here].ravel() + slopes @ self.flat, self.model.collocation.huber
         if huber is not None:
             rows, slopes = huberised(rows, slopes, huber)
-        return known.with_rows(rows, slopes, self.flat)
+        return known.add(rows, slopes, self.flat)
 
 
 def lagrange(points: Sequence[float], wanted: float) -> Array:

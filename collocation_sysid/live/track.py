@@ -12,13 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import Array
-from .information import Information
+from ..nlp.least_squares import LeastSquares
 from .model import TOGETHER, Model, Poses
+from .statistics import Scatter
 from .sweep import Kept, LoggedRow, Said, State, Sweep
+
+# Readings that a pass may lack for its others to count; all are joined anew with each frame.
+LATE = 20
 
 
 @dataclass(eq=False)
@@ -46,7 +51,7 @@ class Track:
     ----------
     model : Model
     p : (P,)
-    prior : Information
+    prior : LeastSquares
         Of what was read before the window.
     block_rows : int
     base : Track, optional
@@ -54,7 +59,12 @@ class Track:
     """
 
     def __init__(
-        self, model: Model, p: Array, prior: Information, block_rows: int, base: Track | None = None
+        self,
+        model: Model,
+        p: Array,
+        prior: LeastSquares,
+        block_rows: int,
+        base: Track | None = None,
     ) -> None:
         first = base.blocks[0] if base is not None and base.blocks else None
         self.prior, self.base, self.block_rows = prior, base, block_rows
@@ -73,7 +83,7 @@ class Track:
         return self.sweep.p
 
     @property
-    def information(self) -> Information:
+    def information(self) -> LeastSquares:
         """All that is known at it of what is flat, see `Model.flat`, the prior included."""
         return self.sweep.information
 
@@ -179,9 +189,35 @@ class Track:
         return len(block.kept)
 
     @property
-    def measured(self) -> Information:
+    def measured(self) -> LeastSquares:
         """All that was read, within the window and before it."""
         known = self.prior
         for block in self.blocks:
             known = self.sweep.added(known, block.said)
         return known
+
+
+class JoinedPasses(NamedTuple):
+    """What two passes over the same frames know together.
+
+    With each reading as it was linearised last, and where that was.
+    """
+
+    information: LeastSquares
+    said: list[Said]
+    points: list[Array]
+
+    @classmethod
+    def of(cls, track: Track, again: Track | None) -> JoinedPasses:
+        """Of a pass, and of another that has nearly caught up with it."""
+        said = track.said
+        done = again.said if again is not None and again.base is not None else []
+        rest = said[len(done) :]
+        if again is None or again.failed or not done or len(rest) > min(LATE, len(done)):
+            return cls(track.information, said, track.points)
+        points = [*again.points, *track.points_from(again.rows)]
+        return cls(track.sweep.added(again.information, rest), [*done, *rest], points)
+
+    def scatter(self, flat: Array) -> Scatter:
+        """Of the residuals, to first order."""
+        return Scatter.of([said.at(flat) for said in self.said])

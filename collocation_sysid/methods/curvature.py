@@ -51,7 +51,7 @@ def exact_curvature(
     directions = np.column_stack([_direction(collocation, point, k) for k in range(len(point.p))])
     hessian = collocation.hessian(z, 1.0, multipliers)
     reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
-    return (reduced + reduced.T) / 2 - point.slope.T @ point.slope
+    return (reduced + reduced.T) / 2 - point.fit.information
 
 
 def _direction(collocation: Collocation, point: Point, k: int) -> Array:

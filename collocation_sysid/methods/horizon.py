@@ -14,6 +14,7 @@ from ..errors import SimulationError
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
+from ..nlp.least_squares import LeastSquares
 from ..nlp.stopwatch import Stopwatch
 from ..nlp.tangent import BlockSolver
 from .leg import Leg, Reached, Report, Seen, moved, reached, reread, seen, swept, trajectory, tried
@@ -29,22 +30,21 @@ class Point:
     p : (np,) all parameters, see `Collocation.pack`
     legs : list of Leg, one per experiment, kept where they were found
     reports : list of Report, of the legs
-    residual : (M,) rotated: of r + S_p, markers after the feasibility step, and the priors'
-    slope : (M, np) rotated alike: S and the slopes of the priors
-    crossed : (np,) S_0ᵀ residual with the slopes S_0 of the point it was tried from
+    fit : LeastSquares
+        By a step from p: of markers after the feasibility step, sensors and priors.
+    crossed : (np,) S_0ᵀ r of its residuals, with the slopes S_0 of the point it was tried from
     """
 
     p: Array
     legs: list[Any]
     reports: list[Report]
-    residual: Array
-    slope: Array
+    fit: LeastSquares
     crossed: Array
 
     @cached_property
     def loss(self) -> float:
         """Loss of the projected trajectory, priors included."""
-        return float(self.residual @ self.residual)
+        return self.fit.loss(np.zeros(len(self.p)))
 
     @cached_property
     def feasibility_m(self) -> float:
@@ -63,8 +63,7 @@ class Point:
 
     def predicted_loss(self, step: Array) -> float:
         """Loss after a step of the parameters, of the linearised problem."""
-        linear = self.residual + self.slope @ step
-        return float(linear @ linear)
+        return self.fit.loss(step)
 
 
 class Horizon:
@@ -138,12 +137,10 @@ class Horizon:
         legs = self.workers.each(run, self.solvers, *common, *columns)
         reports: list[Report] = self.workers.fetch(self.workers.each(_report, legs))
         nq, places = self.collocation.nq, self.collocation.places
-        residuals, slopes, crossed = [], [], np.zeros(len(p))
+        fit, crossed = LeastSquares.none(len(p)), np.zeros(len(p))
         for report, own in zip(reports, places, strict=True):
             self.stopwatch.add(*report.spent)
-            residuals.append(report.triangle[:, -1])
-            slopes.append(np.zeros((len(report.triangle), len(p))))
-            slopes[-1][:, own] = report.triangle[:, :-1]
+            fit = fit.joined(report.fit, own)
             crossed[own] += report.crossed
         prior, prior_slopes = self.collocation.prior(p)
         priors = [(prior, np.diag(prior_slopes))]
@@ -151,11 +148,10 @@ class Horizon:
             off = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
             priors.append((off, np.eye(nq, len(p)) / self.prior))
         for values, by in priors:
-            residuals.append(values)
-            slopes.append(by)
+            fit = fit.add(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
-        return Point(p, legs, reports, np.concatenate(residuals), np.concatenate(slopes), crossed)
+        return Point(p, legs, reports, fit, crossed)
 
     def extend(
         self, p: Array, x: Sequence[Any] | None = None, near: Point | None = None

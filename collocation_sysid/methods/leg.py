@@ -7,13 +7,13 @@ does not grow, is all that the search needs to know. Parameters p are the experi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
 from ..nlp.collocation import Part
+from ..nlp.least_squares import LeastSquares
 from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.segment import Segment
@@ -61,7 +61,8 @@ class Report:
 
     Attributes
     ----------
-    triangle : (at most k + 1, k + 1) R of QR = (S, r), residuals behind their k slopes
+    fit : LeastSquares
+        Residuals by a step of the k parameters.
     crossed : (k,) S_0ᵀ r with the slopes of the leg before; zeros where there was none
     feasibility_m : float
         Longest coordinate of the feasibility step.
@@ -74,7 +75,7 @@ class Report:
     spent : seconds as `Stopwatch.add` takes them
     """
 
-    triangle: Array
+    fit: LeastSquares
     crossed: Array
     feasibility_m: float
     moved_m: float
@@ -225,9 +226,8 @@ def _read(
     if huber is not None:
         pairs = [huberised(values, by, huber) for values, by in pairs]
     residual, slope = map(np.concatenate, zip(*pairs, strict=True))
-    rotated: Any = np.linalg.qr(np.column_stack([slope, residual]), mode="r")
     report = Report(
-        triangle=rotated,
+        fit=LeastSquares.none(slope.shape[1]).add(residual, slope),
         crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
         feasibility_m=float(np.abs(tangent.step).max()),
         moved_m=0.0 if before is None else float(np.abs(part.x - before.x).max()),

@@ -17,12 +17,12 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
-from scipy.optimize import lsq_linear
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..nlp.lapack import cholesky_in_place, one_blas_thread
+from ..nlp.least_squares import LeastSquares
 from .merit import Merit, Unconstrained
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
@@ -194,9 +194,8 @@ class _System:
         # Rounding may leave a parameter on its bound by a hair.
         low = np.minimum(np.maximum(problem.lower[border] - self.z[border], -reach), 0) - 1e-15
         high = np.maximum(np.minimum(problem.upper[border] - self.z[border], reach), 0) + 1e-15
-        right = -solve_triangular(factor, slope, lower=True)
-        answer = lsq_linear(factor.T, right, (low, high), method="bvls").x
-        return np.clip(answer, low, high)
+        right = solve_triangular(factor, slope, lower=True)
+        return LeastSquares(np.column_stack([factor.T, right])).best(low, high)
 
     # The bordered matrix ----------------------------------------------------------------------
 

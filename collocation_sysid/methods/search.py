@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from ..arrays import Array
 from ..errors import SimulationError
@@ -200,17 +199,11 @@ class Search:
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _step(self, point: Point, curvature: Array) -> Array:
-        count = len(point.p)
-        if count == 0:
-            return np.zeros(0)
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
         low, high = np.minimum(low, 0.0) - 1e-15, np.maximum(high, 0.0) + 1e-15
-        _, triangle = np.linalg.qr(np.column_stack([point.slope, point.residual]))
-        slope, right = with_curvature(triangle[:count, :count], triangle[:count, -1], curvature)
-        answer = lsq_linear(slope, -right, (low, high), method="bvls")
-        return np.clip(answer.x, low, high)
+        return with_curvature(point.fit, curvature).best(low, high)
 
     def _try(self, rung: Horizon, point: Point, step: Array) -> Point | None:
         self.sweeps += 1

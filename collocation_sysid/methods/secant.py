@@ -11,6 +11,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ..arrays import Array
+from ..nlp.least_squares import LeastSquares
 from .horizon import Point
 
 # B may not take more than this share of the curvature of SᵀS away in any direction.
@@ -20,8 +21,8 @@ LARGEST_SHARE = 0.9
 def updated(b: Array, before: Point, after: Point) -> Array:
     """B (np, np) after a step from one point to another that was tried from it."""
     step = after.p - before.p
-    change = after.slope.T @ after.residual - before.slope.T @ before.residual
-    wanted = after.slope.T @ after.residual - after.crossed  # B · step
+    change = after.fit.score - before.fit.score
+    wanted = after.fit.score - after.crossed  # B · step
     along = float(change @ step)
     if along <= 0:
         return b
@@ -33,21 +34,21 @@ def updated(b: Array, before: Point, after: Point) -> Array:
     return b + rank_two + rank_two.T - (missing @ step) / along**2 * np.outer(change, change)
 
 
-def with_curvature(triangle: Array, right: Array, b: Array) -> tuple[Array, Array]:
-    """R' and c' with R'ᵀR' = RᵀR + B and R'ᵀc' = Rᵀc; R and c as they are where that is indefinite.
+def with_curvature(fit: LeastSquares, b: Array) -> LeastSquares:
+    """A triangle with SᵀS + B in place of SᵀS; the same as it is where that is indefinite.
 
     Parameters
     ----------
-    triangle : (np, np) R, upper triangular
-    right : (np,) c
     b : (np, np)
     """
+    triangle, right = fit.slope[: len(b)], fit.residual[: len(b)]
     if not b.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
-        return triangle, right
+        return fit
     half = solve_triangular(triangle, b, trans=1)
     relative = solve_triangular(triangle, half.T, trans=1)
     relative = (relative + relative.T) / 2
     if np.linalg.eigvalsh(relative)[0] < -LARGEST_SHARE:
-        return triangle, right
+        return fit
     factor = np.linalg.cholesky(np.eye(len(b)) + relative)
-    return factor.T @ triangle, solve_triangular(factor, right, lower=True)
+    right = solve_triangular(factor, right, lower=True)
+    return LeastSquares(np.column_stack([factor.T @ triangle, right]))

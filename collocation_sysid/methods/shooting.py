@@ -253,7 +253,7 @@ class _Search:
         if self.horizon is not None:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
-            shot = _Shot(p.copy(), z, value, point.residual, point.slope)
+            shot = _Shot(p.copy(), z, value, point.fit.residual, point.fit.slope)
         else:
             slope = adjoint_gradient(collocation, z, self.recorder.stopwatch)
             shot = _Shot(p.copy(), z, collocation.objective(z), np.zeros(0), slope)

@@ -215,7 +215,7 @@ def score_covariance(
 
     The latter after Satterthwaite (1946), with a Wishart matrix for Σ; priors are exact.
     """
-    directions = information.root[:shared].T
+    directions = information.fit.root[:shared].T
     total = information.prior.copy()
     doubt = np.zeros(directions.shape[1])
     for slope, process in zip(information.slopes, processes, strict=True):

@@ -117,7 +117,7 @@ class NoiseLevel:
             of_data = self.pooled * self.shares.sum(axis=0)
             return exact + of_data, np.full(shared, max(1.0, self.freedom))
         total = exact + np.tensordot(self.by_marker, self.shares, 1)
-        directions = information.root[:shared]
+        directions = information.fit.root[:shared]
         parts = np.einsum("kr,grs,ks->kg", directions, self.shares, directions) * self.by_marker
         doubt = np.sum(parts**2 / np.maximum(self.freedoms, 1.0), axis=1)
         variances = np.einsum("kr,rs,ks->k", directions, total, directions)

@@ -317,7 +317,7 @@ def _independent(
 ) -> tuple[Array, Array]:
     """Covariance of all parameters, and the quantiles of the shared ones."""
     of_score, freedom = level.score_covariance(kind, factored, fit.shared)
-    return factored.covariance(of_score), student_ppf(0.975, freedom)
+    return factored.fit.covariance(of_score), student_ppf(0.975, freedom)
 
 
 def _dependence(fit: LinearisedFit, extra: Extra | None) -> tuple[Dependence, bool]:
@@ -376,7 +376,7 @@ def _autocorrelated(
         values, vectors = np.linalg.eigh((over + over.T) / 2)
         wide = root @ vectors
         of_score = (wide * np.maximum(values, 1.0)) @ wide.T
-    return factored.covariance(of_score), student_ppf(0.975, freedom)
+    return factored.fit.covariance(of_score), student_ppf(0.975, freedom)
 
 
 def _widens(fit: LinearisedFit, correlated: tuple[Array, Array], independent: Array) -> bool:

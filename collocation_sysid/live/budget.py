@@ -10,7 +10,7 @@ FADING, SELDOM = 0.85, 0.97
 
 
 @dataclass
-class Pace:
+class Budget:
     """Times of rows that are passed at once.
 
     Attributes
@@ -35,7 +35,7 @@ class Pace:
     after_s: float = 0.0
 
     @classmethod
-    def of(cls, one_s: float, many_s: float, many: int) -> Pace:
+    def of(cls, one_s: float, many_s: float, many: int) -> Budget:
         """From times of one row and of many."""
         more_s = (many_s - one_s) / (many - 1) if many > 1 else one_s
         return cls(one_s, min(max(more_s, 0.0), one_s))
