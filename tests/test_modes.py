@@ -15,7 +15,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.any_stiffness import _responses
-from collocation_sysid.nlp.forces import Forces, Mass
+from collocation_sysid.nlp.forces import Forces
 from collocation_sysid.nlp.modes import Modes, natural_modes
 
 ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
@@ -104,7 +104,8 @@ def test_a_point_mass_slows_a_bar_down():
     alone, tip_kg = Forces.on(body), 10 * body.mass_kg
     tied_kg = np.zeros((1, body.pattern.size))
     tied_kg[0, dofs_of(tip)] = tip_kg / len(tip)
-    forces = replace(alone, mass=Mass(body, tied_kg))
+    mass = replace(alone.mass, tied_kg=tied_kg)
+    forces = replace(alone, weight=replace(alone.weight, mass=mass))
     modes = natural_modes(body, body.nodes_m, free, THIN, forces=forces)
     # A massless cantilever's stiffness 3 E I / L³, with 33/140 of its own mass at the tip.
     spring = 3 * YOUNG_PA * SIDE_M**4 / 12 / LENGTH_M**3

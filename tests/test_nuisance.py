@@ -158,18 +158,17 @@ def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
 
 def test_a_tilt_turns_gravity_and_keeps_its_size():
     nuisance = NuisanceMap.of(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
-    gravity, slope, _ = nuisance.gravity(np.array([1.0, -2.0]))
+    gravity = nuisance.gravity(np.array([1.0, -2.0]))
     assert np.linalg.norm(gravity) == pytest.approx(9.81)
     angle = np.arccos(gravity @ nuisance.gravity_m_s2 / 9.81**2)
     assert angle == pytest.approx(np.arctan(0.05 * np.sqrt(5)), rel=1e-9)
-    np.testing.assert_allclose(gravity @ slope, 0, atol=1e-12)
 
 
 def test_without_gravity_there_is_no_tilt():
     floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
     nuisance = NuisanceMap.of(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
     assert nuisance.size == 0
-    np.testing.assert_array_equal(nuisance.gravity(np.zeros(0))[0], np.zeros(3))
+    np.testing.assert_array_equal(nuisance.gravity(np.zeros(0)), np.zeros(3))
 
 
 def test_deviations_must_be_positive():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
@@ -84,9 +84,9 @@ class Actuator(ABC, Generic[S]):
         return replace(self, factor=factor, **{self.lost: lost})
 
     @abstractmethod
+    def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
+        """C of a tension or pressure as stated, of numbers, arrays or CasADi's expressions."""
+
     def amplitude(self, t_s: Array) -> Array:
         """C at the times `t_s` (T,)."""
-
-    @abstractmethod
-    def slopes(self, t_s: Array) -> Array:
-        """Its derivatives (T, 2) by the factor and by what is lost."""
+        return self.driven(self.course.at(t_s), *self.off)

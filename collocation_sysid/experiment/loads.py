@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,16 +21,13 @@ if TYPE_CHECKING:
 Change = Literal["from_s", "until_s"]
 
 
-def ramp(u: Array, order: int = 0) -> Array:
+def ramp(u: Any) -> Any:
     """What joins around u = 0: none before −1, all after 1, with a continuous slope between.
 
     Its slope is a hat: whatever the time between two steps of an even grid at which it joins, the
-    shares add up to the steps that are left. `order` 1 or 2 is a derivative.
+    shares add up to the steps that are left. Of an array, or of CasADi's expressions.
     """
-    u = np.clip(u, -1.0, 1.0)
-    if order == 0:
-        return 0.5 + u - 0.5 * u * np.abs(u)
-    return 1 - np.abs(u) if order == 1 else -np.sign(u) * (np.abs(u) < 1)
+    return (abs(u) < 1) * (0.5 + u - 0.5 * u * abs(u)) + (u >= 1)
 
 
 def _refuse_times(from_s: float, until_s: float, what: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,14 +106,9 @@ class Pressure(Actuator[Volume]):
         corners = self.on(body).measure.faces[:, :3]
         return replace(self, faces=faces_in_four(corners, body.mesh), placed=None)
 
-    def amplitude(self, t_s: Array) -> Array:
-        """The negative of the pressure at the times `t_s` (T,) [Pa]."""
-        return self.lost_pa - self.factor * self.course.at(t_s)
-
-    def slopes(self, t_s: Array) -> Array:
-        """Its derivatives (T, 2) by factor and lost_pa."""
-        stated = self.course.at(t_s)
-        return np.column_stack([-stated, np.ones(len(stated))])
+    def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
+        """The negative of the pressure."""
+        return lost - factor * stated
 
     def bounded(self, held: NDArray[np.bool_], places_m: Array) -> Pressure:
         """The same, with a volume that the rim's motion does not change, where the rim is held.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -103,16 +103,10 @@ class Tendon(Actuator[Length]):
             )
         return Length(nodes, weights, len(body.nodes_m))
 
-    def amplitude(self, t_s: Array) -> Array:
-        """The tension at the body at the times `t_s` (T,) [N]."""
-        stated = self.course.at(t_s)
-        return np.where(stated > 0, np.maximum(0.0, self.factor * stated - self.lost_n), 0.0)
-
-    def slopes(self, t_s: Array) -> Array:
-        """Its derivatives (T, 2) by factor and lost_n."""
-        stated = self.course.at(t_s)
-        pulls = self.amplitude(t_s) > 0
-        return np.column_stack([np.where(pulls, stated, 0.0), np.where(pulls, -1.0, 0.0)])
+    def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
+        """The tension at the body: a tendon only pulls."""
+        pull = factor * stated - lost
+        return (stated > 0) * (pull > 0) * pull
 
 
 def _triple(point: Array) -> str:

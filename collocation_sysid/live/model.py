@@ -231,17 +231,7 @@ class Model:
 
     def carried(self, phi: Array) -> tuple[Array, Array]:
         """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
-        segment, nuisance = self.segment, self.segment.nuisance
-        nodes, place = self._grasped_nodes
-        moved, by_own = nuisance.carried(segment.body.nodes_m[nodes], phi)
-        slopes = np.zeros((*moved.shape, len(nuisance.moving)))
-        slopes[..., np.flatnonzero(np.isin(nuisance.moving, nuisance.of_grasps))] = by_own
-        return moved[place], slopes[place]
-
-    @cached_property
-    def _grasped_nodes(self) -> tuple[Index, Index]:
-        nodes, place = np.unique(self.segment.grasping.dofs // 3, return_inverse=True)
-        return nodes, place
+        return self.segment.grasping.places(phi)
 
     def goals(self, carried: tuple[Array, Array], poses: Sequence[Poses]) -> tuple[Array, Array]:
         """Where grasped dofs are at K poses, (K, g), and the slopes by the φ that move them."""

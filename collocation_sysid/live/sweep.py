@@ -307,7 +307,7 @@ class Sweep:
         right, slopes = (np.zeros((len(here), k, count)) for k in (size, self.segment.dofs))
         right[..., 0] = (w @ force - self.mass_kg * acceleration)[:, free]
         right[..., 1:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
-        slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta, nu)
+        slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta)
         return Linear(here.start, at, nu, right, slopes, given)
 
     def _row(self, t: int) -> Row:

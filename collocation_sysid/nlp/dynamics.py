@@ -13,9 +13,10 @@ from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
 from ..fem.memory import Carried
 from ..fem.pattern import SymmetricPattern
-from .forces import Forces, Mass
+from .forces import Forces
 from .memory import History, Recursion, recursions_of
 from .schemes import QUASI_STATIC, Scheme, as_scheme
+from .weight import Mass
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,18 +115,20 @@ class Dynamics:
             static=experiment.static,
         )
 
-    def under_gravity(self, change_m_s2: Array) -> Dynamics:
-        """The same with a constant (3,) added to gravity."""
-        return replace(self, forces=self.forces.under_gravity(change_m_s2))
+    def at(self, u: Array) -> Dynamics:
+        """The same at inputs (N, U), see `inputs`."""
+        forces = self.forces.at(u)
+        if forces is self.forces:
+            return self
+        if forces.mass is self.forces.mass:
+            return replace(self, forces=forces)
+        return replace(self, forces=forces, mass=_of_rows(self.tables, forces.mass))
 
-    def driven(self, values: Array) -> Dynamics:
-        """The same with tensions and pressures that are off by values (A, 2)."""
-        return replace(self, forces=self.forces.driven(values))
-
-    def with_loads(self, tied_kg: Array, applied_n: Array) -> Dynamics:
-        """The same with mass and forces (N, 3n) added at the evaluations."""
-        forces = self.forces.joined_by(tied_kg, applied_n)
-        return replace(self, mass=_of_rows(self.tables, forces.mass), forces=forces)
+    def to_evaluations(self, of_rows: Array) -> Array:
+        """The transpose of `of_rows`, of weights (N, …)."""
+        total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (of_rows.ndim - 1))
+        shares = of_rows / np.where(total == 0, 1.0, total)
+        return np.where(total == 0, of_rows, 0.0) + self.combine_transposed(self.tables.w, shares)
 
     def of_rows(self, at_evaluations: Array) -> Array:
         """What a row has of mass (N, …) that is there at the evaluations."""

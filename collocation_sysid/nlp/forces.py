@@ -1,65 +1,30 @@
-"""All forces on a body at some times: F(ξ, ν, t; θ) = f(ξ, ν; θ) + M(θ) g + what is applied.
+"""All forces on a body at some times: F(ξ, ν; u) = f(ξ, ν; θ) + Σ terms.
 
 Whatever acts on the body of an experiment joins here, and nothing else adds forces: the internal
-ones f of its materials and dampings, see `fem.body`, the weight of its mass with what is tied to
-it, the forces on its nodes, and tendons and pressures, see `drives`. Slopes are on the
-experiment's pattern.
+ones f of its materials and dampings, see `fem.body`, `weight`, and the `potential` of each tendon
+and pressure. Slopes are on the pattern of all couplings; slopes by θ go on with those by the other
+inputs u, term by term, see `inputs`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Carried
 from ..fem.model import Theta
-from ..fem.pattern import SymmetricPattern
-from .drives import Drives
-
-
-@dataclass(frozen=True, eq=False)
-class Mass:
-    """What moves with every dof at T times: M(θ), the body's own and what is tied to it.
-
-    Attributes
-    ----------
-    body : Body
-    tied_kg : (T, 3n)
-    """
-
-    body: Body
-    tied_kg: Array
-
-    @classmethod
-    def of(cls, experiment: Experiment, t_s: ArrayLike) -> Mass:
-        """Of an experiment at the times `t_s` (T,)."""
-        tied = np.repeat(experiment.tied_mass_kg(t_s), 3, axis=1)
-        return cls(experiment.body, compact(tied))
-
-    def rows(self, rows: slice) -> Mass:
-        """The same at some of the times."""
-        return replace(self, tied_kg=self.tied_kg[rows])
-
-    def at(self, theta: Theta) -> Array:
-        """M (T, 3n) [kg]."""
-        return _sum_of_rows(self.body.mass_of_dofs(theta), self.tied_kg)
-
-    @cached_property
-    def tied(self) -> Array | None:
-        """(3n,) or (T, 3n) what is tied; None where nothing is."""
-        if not len(self.tied_kg) or self.tied_kg.strides[0]:
-            return self.tied_kg
-        return self.tied_kg[0] if self.tied_kg[0].any() else None
-
-    def row(self, t: int | slice, theta: Theta) -> Array:
-        """The same (3n,) at one of the times, or (…, 3n) at some."""
-        return self.body.mass_of_dofs(theta) + self.tied_kg[t]
+from ..fem.pattern import Joined, SymmetricPattern
+from .force_term import ForceTerm, Places, States
+from .potential import Potential
+from .weight import Mass, Weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,125 +35,129 @@ class Forces:
 
     Attributes
     ----------
-    body : Body
-    mass : Mass
-        What gravity pulls at and γ_m damps.
-    gravity_m_s2 : (3,)
-    applied_n : (T, 3n)
-        Forces on the nodes, wherever these are.
-    drives : Drives
+    weight : Weight
+    further : tuple of ForceTerm
+    joined : Joined
+        The mesh graph, and the couplings of the further terms that have some.
     """
 
-    body: Body
-    mass: Mass
-    gravity_m_s2: Array
-    applied_n: Array
-    drives: Drives
+    weight: Weight
+    further: tuple[ForceTerm, ...]
+    joined: Joined
 
     @classmethod
     def of(cls, experiment: Experiment, t_s: ArrayLike) -> Forces:
         """Those of an experiment at the times `t_s` (T,)."""
-        applied = experiment.node_forces_n(t_s)
-        return cls(
-            experiment.body,
-            Mass.of(experiment, t_s),
-            experiment.gravity_m_s2,
-            compact(applied.reshape(len(applied), -1)),
-            Drives.of(experiment, t_s),
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        potentials = tuple(
+            Potential(actuator.measure, actuator.amplitude(times)[:, None])
+            for actuator in experiment.actuators
         )
+        return cls(Weight.of(experiment, times), potentials, experiment.joined)
 
     @classmethod
     def on(cls, body: Body) -> Forces:
         """Those on a body that nothing acts on, at one time."""
-        nothing = np.zeros((1, body.pattern.size))
-        return cls(body, Mass(body, nothing), np.zeros(3), nothing, Drives.none(body))
+        return cls(Weight.none(body), (), Joined.of((body.pattern,)))
+
+    @property
+    def body(self) -> Body:
+        """What they act on."""
+        return self.weight.body
+
+    @property
+    def mass(self) -> Mass:
+        """What gravity pulls at and γ_m damps."""
+        return self.weight.mass
 
     @property
     def pattern(self) -> SymmetricPattern:
         """Of the slopes."""
-        return self.drives.joined.pattern
+        return self.joined.pattern
+
+    @cached_property
+    def terms(self) -> tuple[ForceTerm, ...]:
+        """Beside what is internal."""
+        return (self.weight, *self.further)
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        """Where the inputs of each term begin in u, and where the last end."""
+        sizes = [term.size for term in self.terms]
+        return list(accumulate(sizes, initial=len(self.body.constants)))
+
+    @cached_property
+    def mass_by_input(self) -> dict[int, Array]:
+        """∂M/∂u (3n,) of each input, by its place in u, that M depends on."""
+        return self.weight.mass_by_input(self._ends[0])
+
+    def at(self, u: Array) -> Forces:
+        """The same at inputs (T, U)."""
+        if len(self.body.constants) == self._ends[-1]:
+            return self
+        weight, *further = (
+            term.at(u[:, start:stop])
+            for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
+        )
+        return replace(self, weight=weight, further=tuple(further))
 
     def rows(self, rows: slice) -> Forces:
         """The same at some of the times."""
-        return replace(
-            self,
-            mass=self.mass.rows(rows),
-            applied_n=self.applied_n[rows],
-            drives=self.drives.rows(rows),
-        )
-
-    def under_gravity(self, change_m_s2: Array) -> Forces:
-        """The same with a constant (3,) added to gravity."""
-        return replace(self, gravity_m_s2=self.gravity_m_s2 + change_m_s2)
-
-    def joined_by(self, tied_kg: Array, applied_n: Array) -> Forces:
-        """The same with more mass tied to it, and more forces on its nodes, (T, 3n) both."""
-        mass = replace(self.mass, tied_kg=self.mass.tied_kg + tied_kg)
-        return replace(self, mass=mass, applied_n=self.applied_n + applied_n)
+        further = tuple(term.rows(rows) for term in self.further)
+        return replace(self, weight=self.weight.rows(rows), further=further)
 
     def scaled(self, share: float) -> Forces:
-        """The same with a share of the loads, those of tendons and pressures too."""
-        return replace(
-            self,
-            gravity_m_s2=share * self.gravity_m_s2,
-            applied_n=share * self.applied_n,
-            drives=replace(self.drives, share=share * self.drives.share),
-        )
+        """The same with a share of what acts, on the same mass."""
+        further = tuple(term.scaled(share) for term in self.further)
+        return replace(self, weight=self.weight.scaled(share), further=further)
 
     def towards(self, other: Forces, share: float) -> Forces:
         """The same with a share of the way to what acts at other times."""
-        tied_kg = self.mass.tied_kg + share * (other.mass.tied_kg - self.mass.tied_kg)
-        applied_n = self.applied_n + share * (other.applied_n - self.applied_n)
-        drives = self.drives.towards(other.drives, share)
-        mass = replace(self.mass, tied_kg=tied_kg)
-        return replace(self, mass=mass, applied_n=applied_n, drives=drives)
+        further = tuple(
+            term.towards(that, share)
+            for term, that in zip(self.further, other.further, strict=True)
+        )
+        return replace(self, weight=self.weight.towards(other.weight, share), further=further)
 
     def undriven(self) -> Forces:
         """The same without tensions and pressures."""
-        return replace(self, drives=Drives.none(self.body))
-
-    def driven(self, values: Array) -> Forces:
-        """The same with tensions and pressures that are off by values (A, 2), see `Drives`."""
-        return replace(self, drives=self.drives.off_by(values))
-
-    @cached_property
-    def _gravity(self) -> Array:
-        """(3n,)."""
-        return np.tile(self.gravity_m_s2, self.body.pattern.size // 3)
+        return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
 
     def external_n(self, theta: Theta) -> Array:
         """(T, 3n) those that do not depend on the state: weight, and forces on nodes."""
-        if not self.body.mass_slopes:
-            return self._external_n
-        return self.mass.at(theta) * self._gravity + self.applied_n
+        return self.weight.force(States(np.zeros(0), np.zeros(0), np.asarray(theta)))
 
-    @cached_property
-    def _external_n(self) -> Array:
-        """The same of densities as stated; once for the iterations of a small body's row."""
-        return _sum_of_rows(self.body.dof_mass, self.mass.tied_kg) * self._gravity + self.applied_n
-
-    def total(self, xi: Array, nu: Array, theta: Array, carried: Carried | None = None) -> Array:
+    def total(self, xi: Array, nu: Array, theta: Theta, carried: Carried | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
-        internal = self.body.force(xi, nu, theta, self.mass.tied, carried)
-        return internal + self.external_n(theta) + self.drives.force(xi)
+        found = self.body.force(xi, nu, theta, self.mass.tied, carried)
+        states = self._states(xi, nu, theta)
+        for term in self.terms:
+            found = found + term.force(states)
+        return found
 
     def linearise(
         self,
         xi: Array,
         nu: Array,
-        theta: Array,
+        theta: Theta,
         out: Array | None = None,
         carried: Carried | None = None,
     ) -> Linearisation:
-        """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`).
-
-        Slopes by θ have two more columns for each of the drives.
-        """
+        """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
         at = self.body.linearise(xi, nu, theta, out, self.mass.tied, carried)
-        np.add(at.force, self.external_n(theta), out=at.force)
-        for density, slope in self.body.mass_slopes.items():
-            at.by_theta[:, :, density] += slope * self._gravity
-        return self.drives.added_to(at, xi)
+        if self.further or self._ends[-1] > len(theta):
+            spread = self.joined.spread
+            at = Linearisation(
+                at.force,
+                spread(at.by_position),
+                spread(at.by_velocity),
+                self._widened(at.by_theta),
+                spread(at.by_position_skew),
+            )
+        states = self._states(xi, nu, theta)
+        for term, places in self._placed:
+            term.add_slopes(at, places, states)
+        return at
 
     @property
     def linearisation_width(self) -> int:
@@ -200,31 +169,52 @@ class Forces:
         xi: Array,
         nu: Array,
         weights: Array,
-        theta: Array,
+        theta: Theta,
         out: Array | None = None,
         carried: Carried | None = None,
         stress_weights: Array | None = None,
     ) -> Curvature:
         """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
         tied = self.mass.tied
-        found = self.body.curvature(xi, nu, weights, theta, out, tied, carried, stress_weights)
-        for density, slope in self.body.mass_slopes.items():
-            found.theta[:, density] += weights @ (slope * self._gravity)
-        return self.drives.bent(found, xi, weights)
+        at = self.body.curvature(xi, nu, weights, theta, out, tied, carried, stress_weights)
+        if self.further or self._ends[-1] > len(theta):
+            spread, widened = self.joined.spread, self._widened
+            at = Curvature(
+                spread(at.position_position),
+                spread(at.position_velocity),
+                widened(at.position_theta),
+                widened(at.velocity_theta),
+                widened(widened(at.theta_theta).swapaxes(1, 2)),
+                widened(at.theta),
+                spread(at.position_velocity_skew),
+            )
+        states = self._states(xi, nu, theta)
+        for term, places in self._placed:
+            term.add_curvature(at, places, states, weights.reshape(states.xi.shape))
+        return at
 
     @property
     def curvature_width(self) -> int:
         """Length of one time's row of `curvature`."""
         return self.body.curvature_width
 
+    def _states(self, xi: Array, nu: Array, theta: Theta) -> States:
+        size = self.body.pattern.size
+        return States(xi.reshape(-1, size), nu.reshape(-1, size), np.asarray(theta))
 
-def compact(rows: Array) -> Array:
-    """The same rows; where all are equal they take the memory of one."""
-    return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
+    @cached_property
+    def _placed(self) -> list[tuple[ForceTerm, Places]]:
+        """Every term, and where what it adds goes."""
+        entries: Iterator[Index] = iter(self.joined.places[1:])
+        nowhere: Index = np.zeros(0, dtype=np.int64)
+        return [
+            (term, Places(slice(start, stop), nowhere if term.couplings is None else next(entries)))
+            for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
+        ]
 
-
-def _sum_of_rows(one: Array, rows: Array) -> Array:
-    """(3n,) + (T, 3n), in the memory of one row where all rows are."""
-    if len(rows) and rows.strides[0] == 0:
-        return np.broadcast_to(one + rows[0], rows.shape)
-    return one + rows
+    def _widened(self, by_theta: Array) -> Array:
+        """(…, U) slopes by θ with room for those by the inputs of the terms."""
+        further = self._ends[-1] - len(self.body.constants)
+        if not further:
+            return by_theta
+        return np.concatenate([by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1)

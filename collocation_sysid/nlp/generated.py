@@ -11,6 +11,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 
@@ -48,6 +49,14 @@ class Generated:
             np.ones((self._symbols[2].numel(), *data.shape[1:])) if weights is None else weights
         )
         return self._mapped(self._curvature, u, data, weights)[0]
+
+    @cached_property
+    def depends(self) -> NDArray[np.bool_]:
+        """(k,) whether any y depends on each of u."""
+        u, _, y = self._symbols
+        found = np.zeros(self.inputs, dtype=bool)
+        found[ca.jacobian(y, u).sparsity().get_col()] = True
+        return found
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -62,27 +62,47 @@ class Grasping:
         """The goals at φ."""
         if not self.nuisance.moves_grasps:
             return self._fixed
-        moved, slopes = (each[self._node] for each in self.nuisance.carried(self._places_m, phi))
-        rotated = np.zeros((*self._shifts.shape, len(self.nuisance.moving)))
-        rotated[..., self._columns] = np.einsum("tgj,gjk->tgk", self._turns, slopes)
-        positions = np.einsum("tgj,gj->tg", self._turns, moved) + self._shifts
+        places, slopes = self.places(phi)
+        turns, shifts = self._poses
+        by_phi = self._zeros + np.einsum("tgj,gjk->tgk", turns, slopes)
+        positions = np.einsum("tgj,gj->tg", turns, places) + shifts
+        positions += self._zeros @ phi[self.nuisance.moving]
+        by_phi[np.isnan(positions)] = 0.0
+        return Held(self.dofs, positions, by_phi)
+
+    def places(self, phi: Array) -> tuple[Array, Array]:
+        """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
+        places, by_own = self.nuisance.in_grasps.slopes(*self._instances(phi))
+        slopes = np.zeros((3, len(self.nuisance.moving), places.shape[1]))
+        slopes[:, self._columns] = by_own
+        return places.T[self._node], np.moveaxis(slopes, 2, 0)[self._node]
+
+    def curvature(self, phi: Array, weights: Array) -> Array:
+        """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
+        u, points = self._instances(phi)
+        pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._poses[0]), weights)
+        of_nodes = np.zeros_like(points.T)
+        np.add.at(of_nodes, self._node, pulled)
+        found = np.zeros((len(self.nuisance.moving),) * 2)
+        second = self.nuisance.in_grasps.curvature(u, points, of_nodes.T).sum(axis=2)
+        found[np.ix_(self._columns, self._columns)] = second
+        return found
+
+    def _instances(self, phi: Array) -> tuple[Array, Array]:
+        """φ and X of the grasped nodes."""
+        points = self.experiment.body.nodes_m[self._nodes[0]].T
+        return np.repeat(phi[self.nuisance.of_grasps, None], points.shape[1], axis=1), points
+
+    @cached_property
+    def _zeros(self) -> Array:
+        """(N, g, m) by how much goals move with the zeros of displacements."""
+        found = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
         for number, grasp in enumerate(self.experiment.grasps):
             rows = np.flatnonzero(grasp.holds(self.t_s))
             for axis, place in zip(grasp.zero, self.nuisance.zero(number), strict=False):
                 along = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.moving == place)
-                positions[np.ix_(rows, along)] += self.nuisance.scales[place] * phi[place]
-                rotated[np.ix_(rows, along, column)] = self.nuisance.scales[place]
-        rotated[np.isnan(positions)] = 0.0
-        return Held(self.dofs, positions, rotated)
-
-    def curvature(self, phi: Array, weights: Array) -> Array:
-        """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
-        second = self.nuisance.carried_curvature(self._places_m, phi)
-        pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._turns), weights)
-        found = np.zeros((len(self.nuisance.moving),) * 2)
-        of_dofs = np.einsum("gj,gjkl->kl", pulled, second[self._node])
-        found[np.ix_(self._columns, self._columns)] = of_dofs
+                found[np.ix_(rows, along, column)] = self.nuisance.scales[place]
         return found
 
     @cached_property
@@ -94,10 +114,6 @@ class Grasping:
     @property
     def _node(self) -> Index:
         return self._nodes[1]
-
-    @property
-    def _places_m(self) -> Array:
-        return self.experiment.body.nodes_m[self._nodes[0]]
 
     @property
     def _columns(self) -> Index:
@@ -120,11 +136,3 @@ class Grasping:
             turns[np.ix_(here, place)] = turned[:, axis]
             shifts[np.ix_(here, place)] = moved[:, axis]
         return turns, shifts
-
-    @property
-    def _turns(self) -> Array:
-        return self._poses[0]
-
-    @property
-    def _shifts(self) -> Array:
-        return self._poses[1]

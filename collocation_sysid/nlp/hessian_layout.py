@@ -22,8 +22,8 @@ class HessianLayout:
     band : place of each entry of the dynamics' band; None where the band is all there is
     loss, scale : place of each entry of the loss, and its factor in scaled variables
     phi : place of each entry (i <= j) of φ by φ, row after row
-    coupled : place of each entry of φ by q and x that the dynamics has
-    driven : (variables k,) places of the entries of other φ by all x, those of one x together
+    by_q : (nq k,) places of the entries of φ that move the body by q, those of one q together
+    by_x : (variables k,) those of some of them by all x, those of one x together
     diagonal : places of the diagonal of x
     """
 
@@ -35,8 +35,8 @@ class HessianLayout:
     loss: Index
     scale: Array
     phi: Index
-    coupled: Index
-    driven: Index
+    by_q: Index
+    by_x: Index
     diagonal: Index
 
     @property
@@ -60,8 +60,8 @@ class HessianLayout:
         columns: Index,
         nphi: int,
         length_m: float,
-        coupled: tuple[Index, Index],
-        drives: Index,
+        moving: Index,
+        by_state: Index,
     ) -> HessianLayout:
         """Merge the band in the columns of x with the loss's entries.
 
@@ -71,8 +71,7 @@ class HessianLayout:
         rows, columns : entries of the loss by (x, φ), upper triangle, sorted by column
         nphi : number of φ
         length_m : unit of the scaled x
-        coupled : rows and columns of the dynamics' entries of φ by (q, x), columns from the first φ
-        drives : (k,) which φ have entries by all x
+        moving, by_state : (k,) which φ have entries by q, and by all x
         """
         of_x = columns < variables
         band_columns = np.repeat(np.arange(variables), np.diff(band.indptr))
@@ -89,10 +88,10 @@ class HessianLayout:
         dense = np.array(triangle, dtype=np.int64).reshape(-1, 2)
         tall = height + nphi
         of_phi = (columns[~of_x] - variables) * tall + nq + rows[~of_x]
-        of_dynamics = coupled[1] * tall + coupled[0]
-        of_drives = (drives * tall + nq + np.arange(variables)[:, None]).ravel()
+        by_q = (moving * tall + np.arange(nq)[:, None]).ravel()
+        by_x = (by_state * tall + nq + np.arange(variables)[:, None]).ravel()
         among_phi = dense[:, 1] * tall + height + dense[:, 0]
-        phi_codes = np.unique(np.concatenate([of_phi, of_dynamics, of_drives, among_phi]))
+        phi_codes = np.unique(np.concatenate([of_phi, by_q, by_x, among_phi]))
         loss[~of_x] = len(merged) + np.searchsorted(phi_codes, of_phi)
         first, second = np.triu_indices(nphi)
         placed = None if merged is codes else np.searchsorted(merged, codes)
@@ -105,8 +104,8 @@ class HessianLayout:
             loss=loss,
             scale=length_m ** ((rows < variables).astype(float) + (columns < variables)),
             phi=len(merged) + np.searchsorted(phi_codes, second * tall + height + first),
-            coupled=len(merged) + np.searchsorted(phi_codes, of_dynamics),
-            driven=len(merged) + np.searchsorted(phi_codes, of_drives),
+            by_q=len(merged) + np.searchsorted(phi_codes, by_q),
+            by_x=len(merged) + np.searchsorted(phi_codes, by_x),
             diagonal=diagonal if placed is None else placed[diagonal],
         )
 

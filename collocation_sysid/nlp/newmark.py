@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
-from .forces import Forces, Mass
+from .forces import Forces
 from .lapack import one_blas_thread
 from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
 from .sensor import Forced
+from .weight import Weight
 
 Progress = Callable[[float], None]
 
@@ -119,7 +120,7 @@ class _Stepper:
         return self.solvers.holding(self.experiment.held(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
-        return Mass.of(self.experiment, time_s).row(0, self.theta)
+        return Weight.of(self.experiment, time_s).mass.row(0, self.theta)
 
     def _after_a_change(self, state: _State, goal_s: float) -> _State:
         """The state with the accelerations after nodes are let go."""

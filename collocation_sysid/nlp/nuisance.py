@@ -45,6 +45,7 @@ from ..experiment.nuisance import (
     rotation,
 )
 from ..experiment.wrench import COMPONENTS, UNITS, Wrench
+from .generated import Generated
 
 Load = TypeVar("Load", PointMass, Force)
 
@@ -183,13 +184,21 @@ class NuisanceMap:
         """Positions in φ of what tensions and pressures may be off by."""
         return self._where(lambda e: "drives" in e.row.changes)
 
-    def drives(self, phi: Array) -> tuple[Array, Array]:
-        """F and b (A, 2) of tensions and pressures, and their derivatives (2 A, k) by φ."""
-        slopes = np.zeros((self.stated_off.size, self.size))
+    def drive_places(self, number: int) -> tuple[int, int]:
+        """Positions in φ of the factor and of what is lost of an actuator, −1 where it has none."""
+        found = [-1, -1]
         for k in self.of_drives:
-            lost = self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)
-            slopes[2 * self.entries[k].number + lost, k] = self.scales[k]
-        return self.stated_off + (slopes @ phi).reshape(-1, 2), slopes
+            if self.entries[k].number == number:
+                found[self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)] = int(k)
+        return found[0], found[1]
+
+    def drives(self, phi: Array) -> Array:
+        """F and b (A, 2) of tensions and pressures."""
+        found, values = self.stated_off.copy(), phi * self.scales
+        for number in range(len(found)):
+            for column, place in enumerate(self.drive_places(number)):
+                found[number, column] += 0.0 if place < 0 else values[place]
+        return found
 
     # What markers read --------------------------------------------------------------------------
 
@@ -282,79 +291,38 @@ class NuisanceMap:
         """Positions in φ of what moves the body in its grasps."""
         return self.places(GRASP_TURN, GRASP_SHIFT)
 
-    def carried(self, points_m: Array, phi: Array) -> tuple[Array, Array]:
-        """H X of points (m, 3), and its derivatives (m, 3, h) by φ of `of_grasps`."""
-        if not len(self.of_grasps):
-            return points_m, np.zeros((len(points_m), 3, 0))
-        own = np.repeat(phi[self.of_grasps, None], len(points_m), axis=1)
-        value, first = self._carried.map(len(points_m))(own, points_m.T)
-        slopes = first.full().reshape(3, len(points_m), -1).transpose(1, 0, 2)
-        return value.full().T, slopes
-
-    def carried_curvature(self, points_m: Array, phi: Array) -> Array:
-        """Second derivatives (m, 3, h, h) of H X by φ of `of_grasps`."""
-        if not len(self.of_grasps):
-            return np.zeros((len(points_m), 3, 0, 0))
-        own, count = phi[self.of_grasps], len(points_m)
-        second = self._carried_curvature.map(count)(
-            np.repeat(own[:, None], count, axis=1), points_m.T
-        )
-        shaped = [h.full().reshape(len(own), count, -1).transpose(1, 0, 2) for h in second]
-        return np.stack(shaped, axis=1)
-
     @cached_property
-    def _carried(self) -> ca.Function:
-        phi, point, moved = self._moved
-        first = ca.densify(ca.jacobian(moved, phi))
-        return ca.Function("carried", [phi, point], [moved, first])
+    def in_grasps(self) -> Generated:
+        """H X of a point X, of the φ of `of_grasps`."""
+        return Generated(self._carried, len(self.of_grasps), 3)
 
-    @cached_property
-    def _carried_curvature(self) -> ca.Function:
-        phi, point, moved = self._moved
-        second = [ca.densify(ca.hessian(moved[i], phi)[0]) for i in range(3)]
-        return ca.Function("carried_curvature", [phi, point], second)
-
-    @cached_property
-    def _moved(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """φ of the grasps, X, and H X."""
-        phi, point = ca.SX.sym("phi", len(self.of_grasps)), ca.SX.sym("X", 3)
-        values, moved = self._values(phi, self.of_grasps), point
+    def _carried(self, phi: ca.SX, point: ca.SX) -> ca.SX:
+        values = self._values(phi, self.of_grasps)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
-            moved = rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
+            point = rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
         if GRASP_SHIFT in values:
-            moved = moved + values[GRASP_SHIFT]
-        return phi, point, moved
+            point = point + values[GRASP_SHIFT]
+        return point
 
     def in_grasp(self, phi: Array) -> Array:
         """H as a 4×4 matrix [[R, p], [0, 1]]."""
-        images, _ = self.carried(np.vstack([np.zeros(3), np.eye(3)]), phi)
+        points = np.hstack([np.zeros((3, 1)), np.eye(3)])
+        images = self.in_grasps.value(np.repeat(phi[self.of_grasps, None], 4, axis=1), points)
         matrix = np.eye(4)
-        matrix[:3] = np.column_stack([(images[1:] - images[0]).T, images[0]])
+        matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
         return matrix
 
-    def gravity(self, phi: Array) -> tuple[Array, Array, Array]:
-        """Gravity (3,) in the body's frame, and its derivatives by φ: (3, k) and (3, k, k)."""
-        own, first = self.of_gravity, np.zeros((3, self.size))
-        second = np.zeros((3, self.size, self.size))
-        if not len(own):
-            return self.gravity_m_s2, first, second
-        value, slopes, *curvatures = (part.full() for part in self._gravity(phi[own]))
-        first[:, own] = slopes
-        second[:, own[:, None], own] = curvatures
-        return value.ravel(), first, second
+    def gravity(self, phi: Array) -> Array:
+        """Gravity (3,) in the body's frame."""
+        if not len(self.of_gravity):
+            return self.gravity_m_s2
+        return ca.evalf(self.gravity_expression(ca.SX(phi[self.of_gravity]))).full().ravel()
 
     @cached_property
     def of_gravity(self) -> Index:
         """Positions in φ of what turns gravity, in the body's frame."""
         return self.places(TILT, TURN)
-
-    @cached_property
-    def _gravity(self) -> ca.Function:
-        phi = ca.SX.sym("phi", len(self.of_gravity))
-        gravity = self.gravity_expression(phi)
-        second = [ca.densify(ca.hessian(gravity[i], phi)[0]) for i in range(3)]
-        return ca.Function("gravity", [phi], [gravity, ca.jacobian(gravity, phi), *second])
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
         """Gravity (3,) in the body's frame, of the φ of `of_gravity`."""

@@ -92,8 +92,7 @@ class Reactions(Addition):
         by_x = np.empty(motion.band.nnz)
         motion.fill(by_x, part.forces, dynamics, setting.theta, setting.mass_moves)
         by_p = np.zeros((len(part.x), self.shape[1], len(self.segment.moving)))
-        nu = dynamics.evaluation_states(part.x)[1]
-        slopes = setting.force_slopes(slice(first, None), part.forces.by_theta, nu)
+        slopes = setting.force_slopes(slice(first, None), part.forces.by_theta)
         by_p[first:] = slopes[:, self.dofs]
         by_p = dynamics.combine(dynamics.tables.w, by_p)
         acceleration = dynamics.acceleration(part.x)[:, self.dofs]

@@ -24,7 +24,7 @@ from .charts import Chart
 from .dynamics import Dynamics
 from .held import Grasping, Held
 from .hessian_layout import HessianLayout
-from .joining import Joinings
+from .inputs import Inputs
 from .motion_rows import MotionRows, ahead
 from .nuisance import NuisanceMap
 from .observation import Observation
@@ -33,6 +33,7 @@ from .row import Row
 from .schemes import Scheme
 from .sensor import Grid, Sensor, sensed_dofs, sensors_of
 from .setting import Setting
+from .terms import inputs_of, with_inputs
 from .unsymmetric import adding_skew, skew_values
 
 T = TypeVar("T", bound=np.generic)
@@ -114,8 +115,8 @@ class Segment:
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """The equations of motion under gravity as stated."""
-        return Dynamics.of(self.experiment, self.scheme, self.substeps)
+        """The equations of motion with inputs as stated."""
+        return with_inputs(Dynamics.of(self.experiment, self.scheme, self.substeps), self.nuisance)
 
     @cached_property
     def nuisance(self) -> NuisanceMap:
@@ -337,31 +338,16 @@ class Segment:
         return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.moving])
 
     def setting(self, q: Array, phi: Array) -> Setting:
-        """The physical parameters at (q, φ)."""
-        theta_q, theta_qq = self.constants.derivatives(q)
-        dynamics, gravity_phi = self.dynamics, np.zeros((3, 0))
-        gravity_phi_phi = np.zeros((3, 0, 0))
-        moving, joining = self.nuisance.moving, self.joinings.at(phi)
-        drives = self.nuisance.drives(phi)
-        if joining:
-            dynamics = dynamics.with_loads(
-                np.sum([np.outer(load.share[0], load.mass_kg) for load in joining], axis=0),
-                np.sum([load.share[0, :, None] * load.force_n for load in joining], axis=0),
-            )
-        if len(moving):
-            dynamics = dynamics.driven(drives[0])
-            gravity, first, second = self.nuisance.gravity(phi)
-            dynamics = dynamics.under_gravity(gravity - self.nuisance.gravity_m_s2)
-            gravity_phi, gravity_phi_phi = first[:, moving], second[:, moving][:, :, moving]
-        theta = self.constants.theta(q)
-        held = self.grasping.at(phi)
-        slopes = gravity_phi, gravity_phi_phi, drives[1][:, moving]
-        return Setting(theta, theta_q, theta_qq, dynamics, *slopes, held, joining)
+        """The equations of motion at (q, φ)."""
+        p = np.concatenate([q, phi[self.nuisance.moving]])
+        u, by_p = self.inputs.at(p)
+        dynamics, held = self.dynamics.at(u), self.grasping.at(phi)
+        return Setting(self.inputs, p, self.nq, u, by_p, dynamics, held)
 
     @cached_property
-    def joinings(self) -> Joinings:
-        """Loads that join or leave at estimated times."""
-        return Joinings(self.experiment, self.nuisance, self.dynamics)
+    def inputs(self) -> Inputs:
+        """What parameters do to the equations of motion."""
+        return inputs_of(self.experiment, self.parameters, self.nuisance, self.dynamics.evaluated_s)
 
     def corrected(self, phi: Array) -> Experiment:
         """The experiment in the body's frame, as φ has gravity, grasps, loads and drives."""
@@ -374,14 +360,14 @@ class Segment:
                 replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
                 for k, g in enumerate(grasps)
             )
-        off = iter(self.nuisance.drives(phi)[0])
+        off = iter(self.nuisance.drives(phi))
         tendons, pressures = (
             tuple(actuator.off_by(*next(off)) for actuator in actuators)
             for actuators in (self.experiment.tendons, self.experiment.pressures)
         )
         changed = replace(
             self.experiment,
-            gravity_m_s2=self.nuisance.gravity(phi)[0],
+            gravity_m_s2=self.nuisance.gravity(phi),
             grasps=grasps,
             tendons=tendons,
             pressures=pressures,
@@ -452,8 +438,8 @@ class Segment:
         dynamics = setting.dynamics
         self.motion_rows.fill(values, forces, dynamics, setting.theta, setting.mass_moves)
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
-        rows, nu = slice(dynamics.first_row, None), dynamics.evaluation_states(x)[1]
-        by_p[rows] = setting.force_slopes(rows, forces.by_theta, nu)
+        rows = slice(dynamics.first_row, None)
+        by_p[rows] = setting.force_slopes(rows, forces.by_theta)
         by_p = dynamics.combine(dynamics.tables.w, dynamics.without_taken(by_p))
         if setting.mass_moves:
             whole = slice(None)
@@ -584,7 +570,6 @@ class Segment:
         by_q : (nq, nq) second derivatives by q
         """
         dynamics, band = setting.dynamics, self.hessian
-        first = dynamics.first_row
         curvature = self._curvature(x, setting, weights.forces, memory_weights)
         layout = self.hessian_layout
         of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)
@@ -594,43 +579,28 @@ class Segment:
         skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
-        by_xi = setting.by_q(curvature.position_theta)
-        by_nu = curvature.velocity_theta @ (setting.theta_q / dynamics.step_s)
-        by_theta = dynamics.combine_transposed(dynamics.state_weights, by_xi)
-        by_theta += dynamics.combine_transposed(dynamics.tables.q, by_nu)
-        by_theta -= (by_inertia := self._inertia_curvature(x, setting, weights.rows))[0]
-        of_band[band.top_positions] = self.length_m * by_theta.reshape(band.top_positions.shape)
+        by_x, twice = setting.curvature(x, curvature, weights.rows)
+        of_q = self.length_m * by_x[..., : self.nq]
+        of_band[band.top_positions] = of_q.reshape(band.top_positions.shape)
         if layout.band is not None:
             values[: layout.x_entries] = 0
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi, bent)
-        if layout.driven.size:
-            of_drives = setting.by_drive(curvature.position_theta)[..., self._driving]
-            of_x = dynamics.combine_transposed(dynamics.state_weights, of_drives)
-            values[layout.driven] += self.length_m * of_x.ravel()
-        mass_kg = dynamics.forces.mass.at(setting.theta)
-        pull = (weights.forces * mass_kg).sum(axis=0).reshape(-1, 3).sum(axis=0)
-        by_phi = np.zeros((self.nuisance.size, self.nuisance.size))
-        by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] = np.einsum(
-            "i,ijk->jk", pull, setting.gravity_phi_phi
-        )
+        values[layout.by_x] += self.length_m * by_x[..., self.by_state].ravel()
+        values[layout.by_q] += twice[: self.nq, self.nq :].ravel()
+        by_phi = 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
+        of_motion = twice[self.nq :, self.nq :]
         if setting.held.moves:
             of_goals = np.zeros((self.grid_rows, self.dofs))
             by_time = weights.multipliers.reshape(self.constraint_times, self.rows_per_time)
-            of_goals[first:, self.row_dofs] = -by_time / self.length_m
+            of_goals[dynamics.first_row :, self.row_dofs] = -by_time / self.length_m
             grasped = ~np.isnan(setting.held.positions_m)
             of_goals = np.where(grasped, of_goals[:, setting.held.dofs], 0.0)
-            by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += self.grasping.curvature(
-                phi, of_goals
-            )
-        by_phi += self._add_coupling(x, setting, weights, values)
-        by_phi += 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
+            of_motion = of_motion + self.grasping.curvature(phi, of_goals)
+        by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += of_motion
         values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
-        theta_theta = curvature.theta_theta.sum(axis=0)
-        theta_gradient = curvature.theta.sum(axis=0) - by_inertia[1]
-        by_q = setting.theta_q.T @ theta_theta @ setting.theta_q
-        return by_q + np.einsum("k,kab->ab", theta_gradient, setting.theta_qq)
+        return twice[: self.nq, : self.nq]
 
     def _curvature(
         self, x: Array, setting: Setting, weights: Array, memory_weights: Sequence[Array]
@@ -649,67 +619,9 @@ class Segment:
         return curvature
 
     @cached_property
-    def _tilts(self) -> Index:
-        """Columns, of those that move the body, that turn gravity where it pulls at an own ρ."""
-        turning = np.isin(self.nuisance.moving, self.nuisance.of_gravity)
-        return np.flatnonzero(turning & bool(self.body.mass_slopes))
-
-    @cached_property
-    def _driving(self) -> Index:
-        """Among the φ that move the body, those of tensions and pressures."""
-        return np.flatnonzero(np.isin(self.nuisance.moving, self.nuisance.of_drives))
-
-    def _weight_curvature(self, weights: Array, setting: Setting) -> Array:
-        """Second derivatives (m, nq) of weights · M g by the φ that turn gravity, and q."""
-        by_q = np.zeros((3, self.nq))
-        for density, slope in self.body.mass_slopes.items():
-            pull = (weights.sum(axis=0) * slope).reshape(-1, 3).sum(axis=0)
-            by_q += np.outer(pull, setting.theta_q[density])
-        return setting.gravity_phi[:, self._tilts].T @ by_q
-
-    def _inertia_curvature(
-        self, x: Array, setting: Setting, weights: Array
-    ) -> tuple[Array | float, Array | float]:
-        """Of weights · M a: second derivatives by x and q, (N, 3n, nq), and the first by θ."""
-        slopes, dynamics = self.body.mass_slopes, self.dynamics
-        if not slopes:
-            return 0.0, 0.0
-        of_theta = np.zeros(len(setting.theta))
-        pulled = dynamics.combine_transposed(dynamics.tables.s, weights) / dynamics.step_s**2
-        acceleration, of_x = dynamics.acceleration(x), 0.0
-        for density, slope in slopes.items():
-            of_theta[density] = np.einsum("ti,ti,i->", weights, acceleration, slope)
-            of_x = of_x + (pulled * slope)[..., None] * setting.theta_q[density]
-        return of_x, of_theta
-
-    def _add_coupling(self, x: Array, setting: Setting, weights: Weights, values: Array) -> Array:
-        """Second derivatives by what turns gravity, and by when loads join, and by q and x.
-
-        They go into `values`; those (k, k) of the loads by φ are returned.
-        """
-        by_phi = np.zeros((len(self.nuisance.moving),) * 2)
-        coupled = [self._weight_curvature(weights.forces, setting).ravel()]
-        for load in setting.joining:
-            by_q, by_x, own = setting.curvature(load, x, weights.forces, weights.rows)
-            coupled += [by_q, self.length_m * by_x[:, load.dofs].ravel()]
-            by_phi[load.column] += own
-            by_phi[:, load.column] += np.where(np.arange(len(own)) == load.column, 0.0, own)
-        values[self.hessian_layout.coupled] += np.concatenate(coupled)
-        whole = np.zeros((self.nuisance.size, self.nuisance.size))
-        whole[np.ix_(self.nuisance.moving, self.nuisance.moving)] = by_phi
-        return whole
-
-    @property
-    def _coupled(self) -> tuple[Index, Index]:
-        """Rows (q, then x) and columns (φ) of what `_add_coupling` writes."""
-        of_q, moving = np.arange(self.nq), self.nuisance.moving
-        rows = [np.tile(of_q, len(self._tilts))]
-        columns = [np.repeat(moving[self._tilts], self.nq)]
-        for load in self.joinings.at(np.zeros(self.nuisance.size)):
-            of_x = np.add.outer(np.arange(self.grid_rows) * self.dofs, load.dofs).ravel()
-            rows.append(np.concatenate([of_q, self.nq + of_x]))
-            columns.append(np.full(len(rows[-1]), moving[load.column]))
-        return np.concatenate(rows), np.concatenate(columns)
+    def by_state(self) -> Index:
+        """Which of (q, φ that move the body) are φ that change forces together with the state."""
+        return self.nq + np.flatnonzero(self.inputs.by_state[self.nq :])
 
     @cached_property
     def _curvature_rows(self) -> Array:
@@ -730,6 +642,6 @@ class Segment:
             columns,
             self.nuisance.size,
             self.length_m,
-            self._coupled,
-            self.nuisance.of_drives,
+            self.nuisance.moving,
+            self.nuisance.moving[self.by_state - self.nq],
         )

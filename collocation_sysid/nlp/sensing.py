@@ -152,8 +152,7 @@ class Sensing:
         first, whole = dynamics.first_row, np.zeros_like(x)
         whole[:, dofs] = -dynamics.combine_transposed(t.w, weights)
         at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
-        nu = dynamics.evaluation_states(x)[1]
-        slopes = setting.force_slopes(slice(first, None), at.by_theta, nu)
+        slopes = setting.force_slopes(slice(first, None), at.by_theta)
         by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
         if setting.mass_moves:
             acceleration = dynamics.acceleration(x)[:, dofs]

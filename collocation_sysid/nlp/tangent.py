@@ -181,7 +181,7 @@ class BlockSolver:
         """
         count = 1 + len(self.segment.moving)
         columns = np.zeros((*x.shape, count))
-        history, theta_q = self.dynamics.history(x, setting.theta), setting.columns(count)
+        history, theta_q = self.dynamics.history(x, setting.theta), setting.columns()
         violation, indefinite, done = 0.0, 0, 0
         if known is not None:
             violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
@@ -223,7 +223,7 @@ class BlockSolver:
         shape = (x.shape[1], len(self.segment.moving))
         march = Forward(self, setting, (len(self.free), shape[1]), held=held)
         given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
-        march.remember(history, setting.columns(shape[1], first=0))
+        march.remember(history, setting.columns(first=0))
         acceleration = self.dynamics.acceleration(x)
         yield from np.zeros((self.dynamics.first_row, *shape))
         for step in self._steps(x, setting, history=history):
@@ -456,7 +456,7 @@ class GivenMotion:
         held, dynamics = setting.held, solver.dynamics
         if not held.moves:
             return None
-        rows, shared = dynamics.rows, setting.theta_q.shape[1]
+        rows, shared = dynamics.rows, setting.nq
         goals = held.positions_m[:rows]
         columns = np.zeros((*goals.shape, shared + held.by_phi.shape[2]))
         columns[..., shared:] = held.by_phi[:rows]
@@ -559,7 +559,7 @@ class Forward:
 
     def force_slopes(self, step: Step) -> Array:
         """∂F/∂p (3n, m)."""
-        return self.setting.force_slopes(step.t, step.by_theta, step.velocity)
+        return self.setting.force_slopes(step.t, step.by_theta)
 
     def inertia_slopes(self, step: Step, acceleration: Array) -> Array | float:
         """∂(M a)/∂p on the free dofs."""

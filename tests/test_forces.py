@@ -1,0 +1,186 @@
+"""Forces beside those of the elements: what they are, their derivatives, and those of inputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checks import assert_derivative
+from problems_small import GUESS, driven_bar, hung_cube, nodes_where
+from test_density import parameters, with_core
+
+from collocation_sysid.experiment import Experiment, Force, Nuisance, PointMass
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.force_term import States
+from collocation_sysid.nlp.forces import Forces
+from collocation_sysid.nlp.segment import Segment
+from collocation_sysid.nlp.unsymmetric import whole
+
+# Of a tendon whose tension grows and a pressure that stays.
+BAR = driven_bar()
+FROM_S, TO_S, SHARE = np.array([0.02, 0.03]), np.array([0.05, 0.07]), 0.25
+ROWS = slice(2, 5)
+
+
+def tension_n(t_s: np.ndarray) -> np.ndarray:
+    return 0.02 + 0.5 * t_s
+
+
+def joined_cube() -> Experiment:
+    """A cube of two densities that a mass and a force join, under gravity that may be tilted."""
+    cube = with_core(hung_cube(8))
+    tip = nodes_where(cube.body, 2, 0.0)
+    return replace(
+        cube,
+        masses=(PointMass(tip, 0.01, 0.02),),
+        forces=(Force(tip, [0.01, 0.02, 0.03], from_s=0.03, until_s=0.06),),
+        nuisance=Nuisance.none(joining_s=0.01, gravity_rad=0.03, pose_turn_rad=0.02),
+    )
+
+
+CASES = {
+    "tendon and pressure": lambda: Collocation([BAR], GUESS),
+    "weight and loads": lambda: Collocation([joined_cube()], parameters()),
+}
+
+
+@pytest.fixture(params=CASES)
+def segment(request) -> Segment:
+    return CASES[request.param]().segments[0]
+
+
+def states(segment: Segment, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities at the evaluations of `ROWS`."""
+    nodes_m = segment.body.nodes_m.ravel()
+    count = len(range(*ROWS.indices(segment.grid_rows)))
+    xi = nodes_m + rng.normal(scale=2e-4, size=(count, len(nodes_m)))
+    return xi, 0.1 * rng.normal(size=xi.shape)
+
+
+def some_inputs(segment: Segment, rng: np.random.Generator) -> np.ndarray:
+    """U (T, U), shaken."""
+    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.moving))])
+    u = segment.inputs.at(p)[0][ROWS]
+    return u * (1 + 0.1 * rng.normal(size=u.shape[1]))
+
+
+def forces_at(segment: Segment, u: np.ndarray) -> tuple[Forces, np.ndarray]:
+    """The forces at inputs, and θ."""
+    whole = np.broadcast_to(u[0], (segment.grid_rows, u.shape[1])).copy()
+    whole[ROWS] = u
+    at = segment.dynamics.at(whole)
+    return at.forces.rows(ROWS), u[0, : len(segment.body.constants)]
+
+
+def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rng):
+    xi = states(Collocation([BAR], GUESS).segments[0], rng)[0][:2]
+    tendon, pressure = BAR.actuators
+    expected = -tension_n(FROM_S)[:, None] * tendon.measure.gradient(xi)
+    expected += 20.0 * pressure.measure.gradient(xi)
+    given = States(xi, np.zeros_like(xi), np.zeros(0))
+    found = sum(term.force(given) for term in Forces.of(BAR, FROM_S).further)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
+    tendon, pressure = BAR.actuators
+    stated = tension_n(FROM_S)
+    np.testing.assert_allclose(tendon.off_by(1.2, 0.003).amplitude(FROM_S), 1.2 * stated - 0.003)
+    np.testing.assert_array_equal(tendon.off_by(1.0, 1.0).amplitude(FROM_S), 0.0)
+    np.testing.assert_allclose(pressure.off_by(0.9, 2.0).amplitude(FROM_S), -(0.9 * 20.0 - 2.0))
+
+
+def test_forces_on_the_way_to_other_times_lie_between_them(segment, rng):
+    x, v = states(segment, rng)
+    theta = segment.constants.theta(segment.parameters.guess_q)
+    here, there = (Forces.of(segment.experiment, t_s) for t_s in (FROM_S, TO_S))
+    ends = [each.total(x[:2], v[:2], theta) for each in (here, there)]
+    for share in (0.0, SHARE, 1.0):
+        found = here.towards(there, share).total(x[:2], v[:2], theta)
+        np.testing.assert_allclose(found, (1 - share) * ends[0] + share * ends[1], atol=1e-12)
+
+
+def test_a_share_is_one_of_all_that_acts(segment, rng):
+    x, _ = states(segment, rng)
+    whole, still = Forces.of(segment.experiment, FROM_S), np.zeros_like(x[:2])
+    theta = segment.constants.theta(segment.parameters.guess_q)
+    internal = segment.body.force(x[:2], still, theta)
+    outer = whole.total(x[:2], still, theta) - internal
+    found = whole.scaled(SHARE).total(x[:2], still, theta) - internal
+    np.testing.assert_allclose(found, SHARE * outer, atol=1e-12)
+    assert np.abs(outer).max() > 1e-3
+
+
+def matrix_times(forces: Forces, lower: np.ndarray, skew: np.ndarray, ways: np.ndarray):
+    """(T, 3n) products with matrices given by symmetric and skew parts."""
+    parts = zip(lower, skew, ways, strict=True)
+    return np.stack([whole(forces.pattern, a, b) @ way for a, b, way in parts])
+
+
+def test_slopes_of_forces_are_those_of_what_they_are(segment, rng):
+    (xi, nu), u = states(segment, rng), some_inputs(segment, rng)
+    forces, theta = forces_at(segment, u)
+    at = forces.linearise(xi, nu, theta)
+    np.testing.assert_allclose(at.force, forces.total(xi, nu, theta), atol=1e-12)
+    none = np.zeros((len(xi), 0))
+
+    def of_inputs(change: np.ndarray) -> np.ndarray:
+        other, theta = forces_at(segment, u * (1 + change))
+        return other.total(xi, nu, theta)
+
+    def by_x(way: np.ndarray) -> np.ndarray:
+        return matrix_times(forces, at.by_position, at.by_position_skew, way)
+
+    def by_v(way: np.ndarray) -> np.ndarray:
+        return matrix_times(forces, at.by_velocity, none, way)
+
+    assert_derivative(lambda x: forces.total(x, nu, theta), by_x, xi, rng, 1e-6, scale=1e-3)
+    assert_derivative(lambda v: forces.total(xi, v, theta), by_v, nu, rng, 1e-6)
+    by_u = np.einsum("tiu,tu->tiu", at.by_theta, u)
+    for one in np.eye(u.shape[1]):
+        assert_derivative(of_inputs, lambda d: by_u @ d, np.zeros(len(one)), rng, 1e-6, one)
+
+
+def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
+    (xi, nu), u = states(segment, rng), some_inputs(segment, rng)
+    w = rng.normal(size=xi.shape)
+    forces, theta = forces_at(segment, u)
+    at = forces.curvature(xi, nu, w, theta)
+    none = np.zeros((len(xi), 0))
+
+    def slopes(x: np.ndarray, v: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Of wᵀ F by x, v and u."""
+        other, theta = forces_at(segment, u * (1 + change))
+        here = other.linearise(x, v, theta)
+        by_x = matrix_times(forces, here.by_position, -here.by_position_skew, w)
+        by_v = matrix_times(forces, here.by_velocity, none, w)
+        return by_x, by_v, np.einsum("ti,tiu->tu", w, here.by_theta)
+
+    steady = np.zeros(u.shape[1])
+    np.testing.assert_allclose(at.theta, slopes(xi, nu, steady)[2], atol=1e-12)
+
+    def twice(way: np.ndarray) -> np.ndarray:
+        return matrix_times(forces, at.position_position, none, way)
+
+    assert_derivative(lambda x: slopes(x, nu, steady)[0], twice, xi, rng, 1e-6, scale=1e-3)
+    found = np.einsum("tiu,tu->tiu", at.position_theta, u)
+    rates = np.einsum("tiu,tu->tiu", at.velocity_theta, u)
+    both = np.einsum("tiu,tu->tiu", at.theta_theta, u)
+    for one in np.eye(len(steady)):
+        for k, mixed in enumerate((found, rates, both)):
+            if np.abs(mixed @ one).max() > 1e-12:
+                of_u = lambda d, k=k: slopes(xi, nu, d)[k]  # noqa: E731
+                assert_derivative(of_u, lambda d, m=mixed: m @ d, steady, rng, 1e-6, one)
+            else:
+                change = slopes(xi, nu, 1e-3 * one)[k] - slopes(xi, nu, steady)[k]
+                np.testing.assert_allclose(change, 0.0, atol=1e-10)
+
+
+def test_without_any_nothing_is_added():
+    body = hung_cube().body
+    x = body.nodes_m.ravel()[None]
+    theta = np.array([1e3, 1e3, 0.0, 0.0])
+    alone = Forces.on(body)
+    np.testing.assert_array_equal(alone.total(x, 0 * x, theta), body.force(x, 0 * x, theta))
+    assert alone.linearise(x, 0 * x, theta).by_theta.shape[2] == len(theta)
