@@ -21,6 +21,7 @@ from collocation_sysid.experiment import (
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.selection import Box, Named
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.nlp.force_term import States
 from collocation_sysid.nlp.forces import Forces
 from collocation_sysid.nlp.newton import Solver
 from collocation_sysid.nlp.rest import rest_state
@@ -125,7 +126,9 @@ def test_a_pressed_patch_with_a_held_rim_has_the_force_of_the_pressure():
     held = np.flatnonzero(~inside | (body.nodes_m[:, 2] < 1e-9))
     top = Pressure(Box((-1, -1, 0.0099), (1, 1, 1)), 100.0)
     experiment = driven(body, [Grasp(held, STILL)], pressures=[top])
-    force = -Forces.of(experiment, [0.0]).drives.force(body.nodes_m.reshape(1, -1))
+    here = States(body.nodes_m.reshape(1, -1), np.zeros((1, 0)), np.zeros(0))
+    (pressure,) = Forces.of(experiment, [0.0]).further
+    force = -pressure.force(here)
     up = force.reshape(-1, 3)[inside & (body.nodes_m[:, 2] > 0.009)]
     np.testing.assert_allclose(up[:, :2], 0, atol=1e-15)
     np.testing.assert_allclose(up[:, 2], 100.0 * 1e-4, rtol=1e-12)
