@@ -29,6 +29,7 @@ from ..fem.constants import (
     usual_value,
 )
 from ..fem.moduli import ENGINEERING, engineering
+from .generated import Generated
 
 
 @dataclass(frozen=True)
@@ -413,62 +414,53 @@ def _stated(item: Parameter) -> str:
     return f"{item.name}{start} in [{item.lower:g}, {item.upper:g}]"
 
 
+@dataclass(frozen=True, eq=False)
 class ThetaMap:
-    """The constants θ of a body, and moduli derived from them, as functions of q.
+    """The constants θ of a body, and moduli derived from them, as functions of q."""
 
-    Parameters
-    ----------
-    parameters : Parameters
-    body : Body
+    parameters: Parameters
+    body: Body
 
-    Raises
-    ------
-    InputError
-        If a constant is missing or given twice.
-    """
-
-    def __init__(self, parameters: Parameters, body: Body) -> None:
-        q = ca.SX.sym("q", len(parameters.free))
-        theta = ca.vertcat(*body.assembled(parameters.expressions(q)))
-        self._theta = _with_derivatives("theta", q, theta)
-        self._known: tuple[Array, tuple[Array, Array, Array]] | None = None
-        self.derived_names, derived = _derived(parameters.names, body, theta)
-        self._derived = _with_derivatives("derived", q, derived)
+    def expression(self, q: ca.SX, _: ca.SX | None = None) -> ca.SX:
+        """(k,) θ."""
+        return ca.vertcat(*self.body.assembled(self.parameters.expressions(q)))
 
     def theta(self, q: Sequence[float] | Array) -> Array:
         """(k,) constants at q."""
-        return self._at(q)[0].copy()
+        return self._theta.value(*_once(q))[:, 0]
 
-    def derivatives(self, q: Array) -> tuple[Array, Array]:
-        """∂θ/∂q (k, nq) and ∂²θ/∂q² (k, nq, nq)."""
-        _, jacobian, hessians = self._at(q)
-        return jacobian.copy(), hessians.copy()
+    def slopes(self, q: Array) -> Array:
+        """∂θ/∂q (k, nq)."""
+        return self._theta.slopes(*_once(q))[1][..., 0]
 
-    def _at(self, q: Sequence[float] | Array) -> tuple[Array, Array, Array]:
-        """θ, its Jacobian and its Hessians at q; methods ask for them several times at a point."""
-        q = np.asarray(q, dtype=np.float64)
-        if self._known is None or not np.array_equal(self._known[0], q):
-            self._known = q.copy(), _evaluated(self._theta, q)
-        return self._known[1]
+    @property
+    def derived_names(self) -> tuple[str, ...]:
+        """Names of the derived moduli."""
+        return self._derived[0]
 
     def derived(self, q: Array) -> tuple[Array, Array]:
-        """Values of `derived_names`, and their derivatives by q."""
-        return _evaluated(self._derived, np.asarray(q))[:2]
+        """Their values, and derivatives by q."""
+        values, slopes = self._derived[1].slopes(*_once(q))
+        return values[:, 0], slopes[..., 0]
+
+    @cached_property
+    def _theta(self) -> Generated:
+        return Generated(self.expression, len(self.parameters.free), 0)
+
+    @cached_property
+    def _derived(self) -> tuple[tuple[str, ...], Generated]:
+        names, body = self.parameters.names, self.body
+        found, _ = _derived(names, body, self.expression(ca.SX.sym("q", self._theta.inputs)))
+
+        def values(q: ca.SX, _: ca.SX) -> ca.SX:
+            return _derived(names, body, self.expression(q))[1]
+
+        return found, Generated(values, self._theta.inputs, 0)
 
 
-def _with_derivatives(name: str, q: ca.SX, values: ca.SX) -> ca.Function:
-    """Values, their Jacobian and their Hessians in one column: each output takes 50 µs."""
-    hessians = [ca.hessian(values[k], q)[0] for k in range(values.shape[0])]
-    columns = [ca.vec(ca.densify(each)) for each in (values, ca.jacobian(values, q), *hessians)]
-    return ca.Function(name, [q], [ca.vertcat(*columns)])
-
-
-def _evaluated(function: ca.Function, q: Array) -> tuple[Array, Array, Array]:
-    """Values (k,), their Jacobian (k, nq) and their Hessians (k, nq, nq)."""
-    size, numbers = len(q), function(q).full().ravel()
-    count = len(numbers) // (1 + size + size**2)
-    values, jacobian, hessians = np.split(numbers, [count, count * (1 + size)])
-    return values, jacobian.reshape(size, count).T, hessians.reshape(count, size, size)
+def _once(q: Sequence[float] | Array) -> tuple[Array, Array]:
+    """One instance at q."""
+    return np.asarray(q, dtype=np.float64)[:, None], np.zeros((0, 1))
 
 
 def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str, ...], ca.SX]:

@@ -15,7 +15,7 @@ from ..experiment.nuisance import JOINING
 from .dynamics import Dynamics
 from .inputs import Input, Inputs
 from .nuisance import NuisanceMap, Timed
-from .parameters import Parameters
+from .parameters import Parameters, ThetaMap
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
@@ -30,11 +30,12 @@ def inputs_of(
     experiment: Experiment, parameters: Parameters, nuisance: NuisanceMap, evaluated_s: Array
 ) -> Inputs:
     """U of an experiment, at the times of the evaluations (N,)."""
-    body, nq, still = experiment.body, len(parameters.free), np.zeros((0, 1))
+    constants, still = ThetaMap(parameters, experiment.body), np.zeros((0, 1))
+    nq = len(parameters.free)
     place = {phi: nq + k for k, phi in enumerate(nuisance.moving.tolist())}
 
     def theta(p: ca.SX, _: ca.SX) -> ca.SX:
-        return ca.vertcat(*body.assembled(parameters.expressions(p[:nq])))
+        return constants.expression(p[:nq])
 
     def value(p: ca.SX, phi: int) -> ca.SX:
         """Of a φ, with its unit; zero of none."""
@@ -61,7 +62,7 @@ def inputs_of(
 
         return Input(1, driven, actuator.course.at(evaluated_s)[None])
 
-    found = [Input(len(body.constants), theta, still)]
+    found = [Input(len(experiment.body.constants), theta, still)]
     if len(nuisance.of_gravity):
         found.append(Input(3, gravity, still, by_state=False))
     joining = zip(nuisance.places(JOINING).tolist(), nuisance.timed, strict=True)

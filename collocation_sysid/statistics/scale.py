@@ -77,7 +77,7 @@ def _moved(
     slopes, changes = [], []
     for key, body in bodies.items():
         constants = ThetaMap(usual, body)
-        theta, (slope, _) = constants.theta(usual.guess_q), constants.derivatives(usual.guess_q)
+        theta, slope = constants.theta(usual.guess_q), constants.slopes(usual.guess_q)
         change = _multiplied(body, theta, slope, stated)
         if key in held or change is None:
             change = np.zeros(len(slope))
