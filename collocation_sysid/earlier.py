@@ -68,7 +68,8 @@ class Earlier:
         collocation, nuisance, places_m = solution.collocation, {}, {}
         for part in collocation.parts(solution.z):
             segment = part.segment
-            nuisance |= {name: value for _, name, value in segment.nuisance.valued(part.phi)}
+            name = segment.experiment.name
+            nuisance |= {f"{name}: {e.label}": v for e, _, v in segment.nuisance.valued(part.phi)}
             markers = segment.experiment.markers.names
             places = segment.places_m(part.phi)
             places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))
@@ -116,10 +117,10 @@ class Earlier:
         """
         p, matches = collocation.guess_p, 0
         for segment in collocation.segments:
-            nuisance = segment.nuisance
-            for k, (name, scale) in enumerate(zip(nuisance.names, nuisance.scales, strict=True)):
+            for place, entry in zip(segment.local.places, segment.nuisance.entries, strict=True):
+                name = f"{segment.experiment.name}: {entry.label}"
                 if name in self.nuisance:
-                    p[segment.first.phi + k] = self.nuisance[name] / scale
+                    p[place] = self.nuisance[name] / entry.sigma
                     matches += 1
         return p, matches
 

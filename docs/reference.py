@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 from collocation_sysid.cli import app
+from collocation_sysid.problem.nuisance_schema import KEYS
 from collocation_sysid.problem.schema import ProblemFile
 
 Schema = Mapping[str, Any]
@@ -116,6 +117,18 @@ def _toml(value: Any) -> str:
 
 
 # The command line ---------------------------------------------------------------------------------
+
+
+def nuisances() -> str:
+    """The table of what may be unknown of a recording, as the page on motion capture has it."""
+    lines = ["| key of `[experiment.nuisance]` | what | by default |", "|---|---|---|"]
+    for key, rows in KEYS.items():
+        said = "; ".join(row.said for row in rows)
+        priors = ", ".join(f"{row.prior} = {row.sigma:.4g}" for row in rows if row.sigma)
+        usual = ", ".join(row.usual for row in rows if row.unit != "σ")
+        default = f"`{{ {priors} }}` {usual}".strip() if priors else '"none"'
+        lines.append(f"| `{key}` | {said} | {default} |")
+    return "\n".join(lines)
 
 
 def command_line() -> str:

@@ -140,6 +140,11 @@ def test_the_reference_of_the_problem_file_has_every_key(reference):
     assert "## `[solver.reduced-space]`" in page
 
 
+def test_the_page_on_motion_capture_has_the_table_of_nuisance_parameters(reference):
+    page = (ROOT / "docs" / "howto" / "motion_capture.md").read_text()
+    assert reference.nuisances() in page
+
+
 def test_the_reference_lists_what_is_public_and_nothing_else():
     page = (ROOT / "docs" / "api.md").read_text()
     listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)

@@ -6,14 +6,15 @@ limits, tables and texts follow from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, listed
 
 DEGREE = float(np.pi / 180)
 # What enters linearly needs no trust region.
@@ -23,6 +24,8 @@ EDGES_A_STEP = SAMPLES_A_STEP = 2.0
 
 Of = Literal["recording", "place", "marker", "grasp", "tendon", "pressure", "load", "sensor"]
 Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives"]
+# What recordings say that share something, besides "recording" for those that do not.
+SCOPE, SCOPES = r"shared( \S+)?", '"shared", or "shared" and a word for each of several groups'
 # Units for people.
 SHOWN = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°"), "kg": (1e3, " g")}
 SHOWN |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
@@ -68,6 +71,8 @@ class NuisanceRow:
         What the terminal says, with {size}, {way} and {which}.
     by : {"length", "worst", "each"}
         It says the longest vector, the value farthest from its prior, or each.
+    same : callable
+        Of an experiment: what must be the same in recordings that share it, by its name.
     reading : callable, optional
         ``reading(y, values, t_s, data) -> y``, what it makes of a marker's reading y (3,), an
         expression of CasADi: of its values (one, or as many as axes), the time, and the
@@ -95,6 +100,7 @@ class NuisanceRow:
     step: Callable[[Any], float] | None = None
     told: str = ""
     by: Literal["length", "worst", "each"] = "each"
+    same: Callable[[Any], dict[str, Any]] = lambda experiment: {}
     reading: Callable[[Any, Any, Any, Any], Any] | None = None
     clock: Callable[[Any, Any, Any], Any] | None = None
 
@@ -141,6 +147,11 @@ def _edges(experiment: Any) -> float:
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
+def _grasped(experiment: Any) -> dict[str, Any]:
+    nodes = {int(node) for grasp in experiment.grasps for node in grasp.nodes}
+    return {"body": id(experiment.body), "nodes in its grasps": nodes}
+
+
 PLACE = NuisanceRow(
     "marker_offset_m",
     "m",
@@ -154,6 +165,7 @@ PLACE = NuisanceRow(
     changes=(),
     reach=FREELY,
     step=_edges,
+    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
 )
 OFFSET = NuisanceRow(
     "camera_offset_m",
@@ -181,6 +193,7 @@ TIME = NuisanceRow(
     changes=("clock",),
     applies=_moves,
     told="markers seen {size} {way} than their times say{limit}",
+    same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
 TURN = NuisanceRow(
@@ -224,6 +237,7 @@ TILT = NuisanceRow(
     applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     told="gravity tilted by {size}",
     by="length",
+    same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
 GRASP_TURN = NuisanceRow(
     "hand_eye_rad",
@@ -238,6 +252,7 @@ GRASP_TURN = NuisanceRow(
     applies=_seen_in_grasp,
     told="body turned in its grasp by {size}",
     by="length",
+    same=_grasped,
 )
 GRASP_SHIFT = NuisanceRow(
     "hand_eye_m",
@@ -252,6 +267,7 @@ GRASP_SHIFT = NuisanceRow(
     applies=_seen_in_grasp,
     told="body shifted in its grasp by {size}",
     by="length",
+    same=_grasped,
 )
 ZERO = NuisanceRow(
     "displacement_zero_m",
@@ -417,11 +433,19 @@ ROWS = (
 class _Deviations:
     """What `Nuisance` does with its fields."""
 
+    scope: Mapping[str, str]
+
     def __post_init__(self) -> None:
         for row in self.rows:
             value = self.sigma(row)
             if value is not None and not value > 0:
                 raise InputError(f"{row.name} is {value:g}; expected a deviation above 0")
+        names = [row.name for row in self.rows]
+        for name, word in self.scope.items():
+            if name not in names:
+                raise InputError(f"found the scope of {name!r}; expected one of {listed(names)}")
+            if not re.fullmatch(SCOPE, word):
+                raise InputError(f"the scope of {name} is {word!r}; expected {SCOPES}")
 
     @property
     def rows(self) -> tuple[NuisanceRow, ...]:
@@ -448,6 +472,11 @@ Attributes
 ----------
 """
 
+_SCOPE_SAID = """
+scope : mapping of the name of a field to "shared", or "shared" and a word
+    Those that are the same in all recordings that have the word; each recording has its own else.
+"""
+
 if TYPE_CHECKING:
 
     @dataclass(frozen=True, init=False)
@@ -460,13 +489,17 @@ if TYPE_CHECKING:
 else:
     Nuisance = make_dataclass(
         "Nuisance",
-        [(row.name, "float | None", field(default=row.sigma)) for row in ROWS],
+        [
+            *((row.name, "float | None", field(default=row.sigma)) for row in ROWS),
+            ("scope", "Mapping[str, str]", field(default_factory=dict)),
+        ],
         bases=(_Deviations,),
         frozen=True,
         kw_only=True,
         namespace={
             "__module__": __name__,
             "__doc__": _SAID
-            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in ROWS),
+            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in ROWS)
+            + _SCOPE_SAID,
         },
     )

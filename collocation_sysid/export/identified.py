@@ -142,7 +142,7 @@ class Identified:
         segment = collocation.segments[names.index(experiment) if experiment else 0]
         with reading_run(folder):
             values = {item.name: answer.values[item.name] for item in problem.parameters.items}
-        phi = answer.nuisance_of(collocation)[0][segment.first.phi :][: segment.nuisance.size]
+        phi = answer.nuisance_of(collocation)[0][segment.local.places]
         with reading_run(folder):
             replay = Replay.from_arrays(segment.experiment.name, read_arrays(folder))
             body = segment.body

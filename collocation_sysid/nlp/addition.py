@@ -65,8 +65,7 @@ class Addition(ABC):
     @property
     def phi_columns(self) -> Index:
         """(k,) where in z the experiment's φ are."""
-        first = self.first_phi + self.segment.first.phi - self.segment.nq
-        return first + np.arange(self.segment.nuisance.size)
+        return self.first_phi + self.segment.local.places - self.segment.nq
 
     def given(self, part: Part, z: Array) -> Part:
         """The experiment with what it takes of these variables."""

@@ -9,7 +9,8 @@ Variables z, in this order:
 q                  of each estimated parameter, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
-φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by experiment
+φ_e                nuisance parameters of experiment e, see `nlp.nuisance`; experiment by
+                   experiment, what several share with the first of them, see `nlp.sharing`
 =================  =========================================================================
 
 The memory of bodies follows from them, or is among them, see `nlp.explicit`.
@@ -45,6 +46,7 @@ from .schemes import Scheme
 from .segment import First, Segment, Weights
 from .sensing import Sensing
 from .setting import Setting
+from .sharing import locals_of, shared_charts
 
 
 @dataclass(frozen=True)
@@ -169,17 +171,17 @@ class Collocation:
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
         """One of each experiment that is fitted."""
-        options = (self.explicit_grasps, self.huber)
-        found, first = [], First(self.nq, self.nq, 0)
-        for experiment in self.experiments:
-            if not experiment.validation:
-                chart = self.charts.get(experiment.name)
-                if chart is None or not chart.suits(experiment):
-                    chart = Chart.of(experiment)
-                grid = self.scheme, 1 if experiment.static else self.substeps
-                found.append(Segment(experiment, self.parameters, *grid, *options, first, chart))
-                first = found[-1].after
-        return tuple(found)
+        fitted = [each for each in self.experiments if not each.validation]
+        options, found = (self.explicit_grasps, self.huber), list[Segment]()
+        for experiment, local in zip(fitted, locals_of(fitted, self.nq), strict=True):
+            chart = self.charts.get(experiment.name)
+            if chart is None or not chart.suits(experiment):
+                chart = Chart.of(experiment)
+            grid = self.scheme, 1 if experiment.static else self.substeps
+            first = found[-1].after if found else First(self.nq, 0)
+            here = first, local, chart
+            found.append(Segment(experiment, self.parameters, *grid, *options, *here))
+        return _read_alike(found, [segment.chart for segment in found])
 
     @property
     def nq(self) -> int:
@@ -189,7 +191,7 @@ class Collocation:
     @property
     def nphi(self) -> int:
         """Number of the nuisance parameters φ, all together."""
-        return self.segments[-1].after.phi - self.nq
+        return int(np.concatenate(self.places).max(initial=self.nq - 1)) + 1 - self.nq
 
     @property
     def variables(self) -> int:
@@ -254,15 +256,18 @@ class Collocation:
     def parts_at(self, p: Array, positions: Sequence[Array]) -> list[Part]:
         """Every experiment at p and positions, or their first rows."""
         return [
-            Part(segment, p[: self.nq], p[segment.places[self.nq :]], x)
+            Part(segment, p[: self.nq], p[segment.local.places], x)
             for segment, x in zip(self.segments, positions, strict=True)
         ]
 
     @property
     def names(self) -> tuple[str, ...]:
         """What each entry of p is: the parameters' names, then the nuisance parameters."""
-        nuisance = [name for segment in self.segments for name in segment.nuisance.names]
-        return (*(item.name for item in self.parameters.free), *nuisance)
+        found = [item.name for item in self.parameters.free] + [""] * self.nphi
+        for segment in self.segments:
+            for place, name in zip(segment.local.places, segment.nuisance.names, strict=True):
+                found[place] = name
+        return tuple(found)
 
     def prior(self, p: Array) -> tuple[Array, Array]:
         """Residuals of the priors at p, and their slopes; φ counts in its deviations."""
@@ -276,15 +281,18 @@ class Collocation:
     def bounds_p(self) -> tuple[Array, Array]:
         """Lower and upper bounds of p."""
         lower, upper = self.parameters.bounds_q
-        limits = [segment.nuisance.limits(segment.chart.samples) for segment in self.segments]
-        low, high = (np.concatenate(side) for side in zip(*limits, strict=True))
+        low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
+        for segment in self.segments:
+            here = segment.local.places - self.nq
+            least, most = segment.nuisance.limits(segment.chart.samples)
+            low[here], high[here] = np.maximum(low[here], least), np.minimum(high[here], most)
         return np.concatenate([lower, low]), np.concatenate([upper, high])
 
     # Where recordings are read ----------------------------------------------------------------
 
     def following(self, p: Array) -> tuple[Collocation, Array]:
         """The problem read where the estimates p are, and p in it; itself if they left no chart."""
-        found = [s.following(p[s.places[self.nq :]]) for s in self.segments]
+        found = [s.following(p[s.local.places]) for s in self.segments]
         if all(chart is s.chart for (chart, _), s in zip(found, self.segments, strict=True)):
             return self, p
         return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])
@@ -308,25 +316,30 @@ class Collocation:
     def _read_in(
         self, charts: Sequence[Chart], p: Array, phis: Sequence[Array]
     ) -> tuple[Collocation, Array]:
-        other, moved = copy(self), p.copy()
-        segments = [s.with_chart(c) for s, c in zip(self.segments, charts, strict=True)]
-        for segment, phi in zip(segments, phis, strict=True):
-            moved[segment.places[self.nq :]] = phi
+        other, moved = copy(self), self._put_together(p[: self.nq], phis)
+        segments = _read_alike(self.segments, charts)
         by_name = {s.experiment.name: s.chart for s in segments}
-        vars(other).update(charts=by_name, segments=tuple(segments))
-        for stale in ("hessian_structure", "hessian_diagonals"):
+        vars(other).update(charts=by_name, segments=segments)
+        for stale in ("hessian_structure", "hessian_diagonals", "_hessian_of_phi"):
             vars(other).pop(stale, None)
         return other, moved
 
     @property
     def guess_p(self) -> Array:
         """The guess of p; φ is zero, or where the charts are."""
-        return np.concatenate([self.parameters.guess_q, *(s.guess_phi for s in self.segments)])
+        return self._put_together(self.parameters.guess_q, [s.guess_phi for s in self.segments])
+
+    def _put_together(self, q: Array, phis: Sequence[Array]) -> Array:
+        """P of the φ of each experiment; shared ones as the first has them."""
+        p = np.concatenate([q, np.zeros(self.nphi)])
+        for segment, phi in reversed([*zip(self.segments, phis, strict=True)]):
+            p[segment.local.places] = phi
+        return p
 
     @property
     def reach_p(self) -> Array:
         """What a trust region of one allows each entry of p."""
-        return np.concatenate([np.ones(self.nq), *(s.nuisance.reach for s in self.segments)])
+        return self._put_together(np.ones(self.nq), [s.nuisance.reach for s in self.segments])
 
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of z; equal for what is given."""
@@ -353,7 +366,7 @@ class Collocation:
         for part in parts:
             of_x, of_phi = part.segment.observation.gradient(part.x, part.phi)
             by_x.append(of_x.ravel() * part.segment.length_m)
-            by_p[part.segment.places[self.nq :]] += of_phi
+            by_p[part.segment.local.places] += of_phi
             if part.felt and part.segment.sensors:
                 through_x, of_p = part.sensing.gradient(part.x)
                 by_x[-1] += through_x.ravel() * part.segment.length_m
@@ -378,13 +391,24 @@ class Collocation:
             indptr.append(used + segment.jacobian.indptr[1:])
             indices.append(segment.first.row + segment.jacobian.indices)
             used += segment.jacobian.nnz
+        rows, counts, _ = self._jacobian_of_phi
+        return np.concatenate([*indptr, used + np.cumsum(counts)]), np.concatenate([*indices, rows])
+
+    @cached_property
+    def _jacobian_of_phi(self) -> tuple[Index, Index, Index | slice]:
+        """Rows of the entries in the columns of φ, how many each has, and their order."""
+        rows, columns = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
         for segment in self.segments:
-            moves = np.isin(np.arange(segment.nuisance.size), segment.nuisance.moving)
-            indptr.append(used + np.cumsum(moves * segment.constraints))
-            rows = segment.first.row + np.arange(segment.constraints)
-            indices.append(np.tile(rows, int(moves.sum())))
-            used += len(indices[-1])
-        return np.concatenate(indptr), np.concatenate(indices)
+            moving = segment.local.places[segment.nuisance.moving] - self.nq
+            own = segment.first.row + np.arange(segment.constraints)
+            rows.append(np.tile(own, len(moving)))
+            columns.append(np.repeat(moving, segment.constraints))
+        row, column = np.concatenate(rows), np.concatenate(columns)
+        counts = np.bincount(column, minlength=self.nphi)
+        if np.all(column[1:] >= column[:-1]):
+            return row, counts, slice(None)
+        order = np.lexsort((row, column))
+        return row[order], counts, order
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_structure`."""
@@ -407,7 +431,7 @@ class Collocation:
             rows[segment.rows], columns[:, segment.rows] = found, by_p[:, : self.nq].T
             by_phi.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
-        values[used:] = np.concatenate(by_phi)
+        values[used:] = np.concatenate(by_phi)[self._jacobian_of_phi[2]]
         return rows, values
 
     def jacobian(self, z: Array) -> sp.csc_array:
@@ -447,17 +471,31 @@ class Collocation:
             shift = np.where(layout.x_indices < self.nq, 0, segment.first.x - self.nq)
             indices.append(layout.x_indices + shift)
             used += layout.x_entries
+        codes, _ = self._hessian_of_phi
+        columns = np.searchsorted(codes, np.arange(1, self.nphi + 1) * self.variables)
+        return np.concatenate([*indptr, used + columns]), np.concatenate(
+            [*indices, codes % self.variables]
+        )
+
+    @cached_property
+    def _hessian_of_phi(self) -> tuple[Index, list[Index]]:
+        """Entries in the columns of φ, as column · variables + row; where each experiment's are.
+
+        In z all φ stand after all x. Experiments that share a φ share entries.
+        """
+        codes = []
         for segment in self.segments:
             layout, first = segment.hessian_layout, segment.first
-            indptr.append(used + layout.phi_indptr[1:])
-            # In z all φ stand after all x.
-            first_phi = first.phi - self.nq + self.variables - self.nphi
-            ends = np.array([self.nq, self.nq + segment.variables])
-            shifts = np.array([0, first.x - self.nq, first_phi - ends[1]])
-            kind = np.searchsorted(ends, layout.phi_indices, side="right")
-            indices.append(layout.phi_indices + shifts[kind])
-            used += len(layout.phi_indices)
-        return np.concatenate(indptr), np.concatenate(indices)
+            in_z = self.of_phi.start - self.nq + segment.local.places
+            whole = np.concatenate(
+                [np.arange(self.nq), first.x + np.arange(segment.variables), in_z]
+            )
+            row = whole[layout.phi_indices]
+            column = np.repeat(in_z, np.diff(layout.phi_indptr))
+            row, column = np.minimum(row, column), np.maximum(row, column)
+            codes.append((column - self.of_phi.start) * self.variables + row)
+        found, places = np.unique(np.concatenate(codes), return_inverse=True)
+        return found, np.split(places, np.cumsum([len(each) for each in codes])[:-1])
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
@@ -500,14 +538,15 @@ class Collocation:
         With weights of the memory's equations, by the number of the experiment, see `Segment`.
         """
         values = np.empty(len(self.hessian_structure[1])) if out is None else out
-        used, phi = self.nq * (self.nq + 1) // 2, self._first_hessian_phi
+        used, (codes, places) = self.nq * (self.nq + 1) // 2, self._hessian_of_phi
+        of_phi = np.zeros(len(codes))
         by_q = np.zeros((self.nq, self.nq))
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
             segment = part.segment
             of_x = segment.hessian_layout.x_entries
-            of_phi = segment.hessian_layout.entries - of_x
-            here = np.empty(of_x + of_phi) if of_phi else values[used : used + of_x]
+            alone = len(places[number]) == 0
+            here = values[used : used + of_x] if alone else np.empty(of_x + len(places[number]))
             by_q += segment.hessian_values(
                 part.x,
                 part.phi,
@@ -518,9 +557,11 @@ class Collocation:
                 (memory_weights or {}).get(number, ()),
                 part.bent,
             )
-            if of_phi:
-                values[used : used + of_x], values[phi : phi + of_phi] = here[:of_x], here[of_x:]
-            used, phi = used + of_x, phi + of_phi
+            if not alone:
+                values[used : used + of_x] = here[:of_x]
+                of_phi[places[number]] += here[of_x:]
+            used += of_x
+        values[used:] = of_phi
         _, slopes = self.parameters.prior(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
@@ -528,17 +569,12 @@ class Collocation:
         values[: len(rows)] = by_q[rows[order], columns[order]]
         return values
 
-    @property
-    def _first_hessian_phi(self) -> int:
-        """Where the columns of φ begin in the values of the Hessian."""
-        of_x = sum(segment.hessian_layout.x_entries for segment in self.segments)
-        return self.nq * (self.nq + 1) // 2 + of_x
-
     def hessian_phi(self, number: int) -> Index:
         """Places in the values of the Hessian of an experiment's φ by φ, `np.triu_indices`."""
-        layouts = [segment.hessian_layout for segment in self.segments[: number + 1]]
-        before = sum(len(layout.phi_indices) for layout in layouts[:-1])
-        return self._first_hessian_phi + before + layouts[-1].phi - layouts[-1].x_entries
+        codes, places = self._hessian_of_phi
+        layout = self.segments[number].hessian_layout
+        first = len(self.hessian_structure[1]) - len(codes)
+        return first + places[number][layout.phi - layout.x_entries]
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Largest violation of the first-order conditions of the whole NLP, in its scaling.
@@ -612,3 +648,10 @@ class Collocation:
     def values(self, z: Array) -> dict[str, float]:
         """The parameters of z by the user's names."""
         return self.parameters.values(z[: self.nq])
+
+
+def _read_alike(segments: Sequence[Segment], charts: Sequence[Chart]) -> tuple[Segment, ...]:
+    """The segments read in charts, of which those of shared φ are the same."""
+    parts = zip(segments, charts, strict=True)
+    same = shared_charts((s.local, s.nuisance, chart) for s, chart in parts)
+    return tuple(s.with_chart(chart) for s, chart in zip(segments, same, strict=True))

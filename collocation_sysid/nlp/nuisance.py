@@ -134,22 +134,27 @@ class NuisanceMap:
     recorded_s: tuple[float, float]
 
     @classmethod
-    def of(cls, experiment: Experiment) -> NuisanceMap:
-        """What the experiment wants estimated."""
+    def of(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
+        """What the experiment wants estimated; the pivot is another recording's where one is given.
+
+        What recordings share has the same name in all of them.
+        """
         entries, body = tuple(_entries(experiment)), experiment.body
+        scope = experiment.nuisance.scope
+        middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
         scales = np.array([entry.sigma for entry in entries], dtype=float)
         steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         held = held_nodes(experiment.grasps)
         return cls(
             entries,
-            tuple(f"{experiment.name}: {entry.label}" for entry in entries),
+            tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
             scales,
             np.array(reach),
             experiment.timestep_s,
             experiment.duration_s,
             np.array(experiment.gravity_m_s2),
-            experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0),
+            middle_m if pivot_m is None else pivot_m,
             body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
             np.array([a.off for a in experiment.actuators]).reshape(-1, 2),
             tuple(timed for _, timed in _timed(experiment)),

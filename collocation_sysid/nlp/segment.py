@@ -33,6 +33,7 @@ from .row import Row
 from .schemes import Scheme
 from .sensor import Grid, Sensor, sensed_dofs, sensors_of
 from .setting import Setting
+from .sharing import Local
 from .terms import inputs_of, with_inputs
 from .unsymmetric import adding_skew, skew_values
 
@@ -43,10 +44,9 @@ CHARTED = ("observation", "hessian_layout")
 
 @dataclass(frozen=True)
 class First:
-    """Where a segment begins: its x in z, its φ in p = (q, φ_1, φ_2, …), and its rows in g."""
+    """Where a segment begins: its x in z, and its rows in g."""
 
     x: int
-    phi: int
     row: int
 
 
@@ -81,6 +81,8 @@ class Segment:
         Grasped nodes get rows of their own instead of bounds. Those that are held only for a
         while always do, and so do all where the body may be off in its grasps.
     first : First
+    local : Local
+        Where its φ are in p = (q, φ_1, φ_2, …).
     chart : Chart
         Where the recording is read.
     """
@@ -92,6 +94,7 @@ class Segment:
     explicit_grasps: bool
     huber: float | None
     first: First
+    local: Local
     chart: Chart
 
     def __getstate__(self) -> dict[str, Any]:
@@ -121,7 +124,7 @@ class Segment:
     @cached_property
     def nuisance(self) -> NuisanceMap:
         """The experiment's φ."""
-        return NuisanceMap.of(self.experiment)
+        return NuisanceMap.of(self.experiment, self.local.pivot_m)
 
     @cached_property
     def observation(self) -> Observation:
@@ -271,12 +274,12 @@ class Segment:
     @property
     def places(self) -> Index:
         """Its (q, φ) in p."""
-        return np.concatenate([np.arange(self.nq), self.first.phi + np.arange(self.nuisance.size)])
+        return np.concatenate([np.arange(self.nq), self.local.places])
 
     @property
     def after(self) -> First:
         """Where the next segment begins."""
-        return First(self.columns.stop, self.first.phi + self.nuisance.size, self.rows.stop)
+        return First(self.columns.stop, self.rows.stop)
 
     # Grasps and scales ------------------------------------------------------------------------
 
@@ -589,7 +592,7 @@ class Segment:
         values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi, bent)
         values[layout.by_x] += self.length_m * by_x[..., self.by_state].ravel()
         values[layout.by_q] += twice[: self.nq, self.nq :].ravel()
-        by_phi = 2 * loss_weight * np.eye(self.nuisance.size)  # the prior
+        by_phi = np.diag(2 * loss_weight * self.local.counted)  # the prior
         of_motion = twice[self.nq :, self.nq :]
         if setting.held.moves:
             of_goals = np.zeros((self.grid_rows, self.dofs))

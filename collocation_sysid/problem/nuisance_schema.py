@@ -5,27 +5,44 @@ A key has the priors of one row of the table, or of several.
 
 from __future__ import annotations
 
+import re
 from itertools import groupby
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Optional
 
-from pydantic import Discriminator, Field, Tag, create_model, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, create_model, model_validator
 
 from ..checked import Positive
 from ..experiment import Nuisance
-from ..experiment.nuisance import ROWS, NuisanceRow
+from ..experiment.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
 from .section import Section, given_keys
 
 KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}
 
 
+def _scope(word: str) -> str:
+    if word != "recording" and not re.fullmatch(SCOPE, word):
+        raise ValueError(f'found {word!r}; expected "recording", {SCOPES}')
+    return word
+
+
 class Prior(Section):
     """How well something is known; what is left out of several is taken as exact."""
 
+    scope: Annotated[str, AfterValidator(_scope)] = Field(
+        "recording",
+        description="Whose it is: that of each recording by itself, or the same in all that say "
+        + SCOPES
+        + ".",
+    )
+
+    usual: ClassVar[bool] = False
+
     @model_validator(mode="after")
     def _some(self) -> Prior:
-        priors = list(type(self).model_fields)
-        if not given_keys(self, *priors):
-            raise ValueError(f"found neither {' nor '.join(priors)}; expected one or both")
+        priors = [key for key in type(self).model_fields if key != "scope"]
+        if not given_keys(self, *priors) and (self.scope == "recording" or not self.usual):
+            expected = "one or both" if len(priors) > 1 else "it"
+            raise ValueError(f"found no {' and no '.join(priors)}; expected {expected}")
         return self
 
 
@@ -43,17 +60,19 @@ def _form(value: Any) -> str:
 
 def _prior(key: str, rows: list[NuisanceRow]) -> type[Section]:
     """The table of a key."""
-    # One prior alone has to be there, and what another one goes with.
-    either = len(rows) > 1 and all(row.beside is None for row in rows)
+    # What another prior goes with has to be there.
+    needed = any(row.beside is not None for row in rows)
     fields: dict[str, Any] = {}
     for row in rows:
-        known = row.beside or (None if either else ...)
-        kind: Any = Optional[Positive] if either else Positive  # noqa: UP045
+        known = row.beside or (... if needed else None)
+        kind: Any = Positive if needed else Optional[Positive]  # noqa: UP045
         said = f"Standard deviation [{row.unit}]."
         fields[row.prior] = (kind, Field(known, description=said))
     name = "".join(word.title() for word in key.split("_")) + "Prior"
     said = f"How well it is known: {rows[0].said}."
-    return create_model(name, __base__=Prior, __doc__=said, **fields)
+    made = create_model(name, __base__=Prior, __doc__=said, **fields)
+    made.usual = any(row.sigma is not None for row in rows)
+    return made
 
 
 def _section() -> type[Section]:
@@ -84,10 +103,15 @@ def nuisance_of(section: Section | Literal["none"]) -> Nuisance:
     if section == "none":
         return Nuisance.none()
     found: dict[str, float | None] = {}
+    scope: dict[str, str] = {}
     for key, rows in KEYS.items():
         given = getattr(section, key)
         if given == "none":
             found |= {row.name: None for row in rows}
         elif given is not None:
-            found |= {row.name: getattr(given, row.prior) for row in rows}
-    return Nuisance(**found)
+            known = {row.name: getattr(given, row.prior) for row in rows}
+            # A scope alone leaves the deviations as they are.
+            found |= known if any(known.values()) else {}
+            if given.scope != "recording":
+                scope |= {row.name: given.scope for row in rows}
+    return Nuisance(**found, scope=scope)

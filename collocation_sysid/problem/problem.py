@@ -19,6 +19,7 @@ from ..methods.options import Options
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
+from ..nlp.sharing import locals_of
 from ..nlp.simulation import require_steps
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
@@ -268,6 +269,7 @@ class Problem:
                 where="transcription.substeps",
             )
         self.parameters.fit(self.bodies)
+        locals_of([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
             try:
                 as_scheme(self.scheme, experiment.start_rule)

@@ -92,7 +92,9 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, 
     for name, numbers in recordings_of(fit).items():
         blocks = [fit.blocks[k] for k in numbers]
         local = fit.names[fit.shared :]
-        own = fit.shared + np.flatnonzero([other.startswith(f"{name}: ") for other in local])
+        # What recordings share they have to find alone, too.
+        mine = [other.startswith((f"{name}: ", "shared")) for other in local]
+        own = fit.shared + np.flatnonzero(mine)
         columns = np.concatenate([np.arange(fit.shared), own])
         prior = np.where(columns < fit.shared, 0.0, fit.prior_slope[columns])
         slopes = [block.slope[..., columns] for block in blocks]
