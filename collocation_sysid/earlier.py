@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,12 +10,13 @@ import numpy as np
 
 from .arrays import Array
 from .errors import InputError
-from .files import RESULT_FILE, damage_refused, read_json
+from .files import RESULT_FILE, damage_refused
 from .methods.solution import Solution
 from .methods.start import marched
 from .nlp.collocation import Collocation
 from .nlp.segment import Segment
 from .problem import Problem
+from .result import Result
 from .statistics.linearised import Derived
 
 
@@ -45,21 +46,32 @@ class Earlier:
         InputError
             If it is not one, or damaged.
         """
-        folder = Path(folder)
-        result = read_json(folder / RESULT_FILE, "the folder of an earlier run")
+        return cls.of_result(Result.read(folder, "the folder of an earlier run"), Path(folder))
+
+    @classmethod
+    def of_result(cls, result: Result, folder: Path) -> Earlier:
+        """What the result of a run's folder holds.
+
+        Raises
+        ------
+        InputError
+            If it is damaged.
+        """
+        values = {name: each.value for name, each in result.values.items()}
+        nuisance = {
+            f"{experiment}: {name}": each.value
+            for experiment, named in result.nuisance.items()
+            for name, each in named.items()
+        }
+        places_m = {
+            experiment: {name: place.position_m for name, place in named.items()}
+            for experiment, named in result.places.items()
+        }
+        points = np.array([place for named in places_m.values() for place in named.values()])
         with damage_refused(folder, RESULT_FILE, "solve that problem again"):
-            found = {**result["derived"], **result["parameters"]}
-            values = {name: float(each["value"]) for name, each in found.items()}
-            nuisance = {
-                f"{experiment}: {name}": float(each["value"])
-                for experiment, named in result["nuisance"].items()
-                for name, each in named.items()
-            }
-            places_m = {
-                experiment: {name: _point(each["position_m"]) for name, each in named.items()}
-                for experiment, named in result.get("places", {}).items()
-            }
-            _refuse_infinite(values | nuisance)
+            numbers = np.array([*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat])
+            if not np.isfinite(numbers).all():
+                raise ValueError("a value that is not finite")
         return cls(folder, values, nuisance, places_m)
 
     @classmethod
@@ -137,16 +149,3 @@ class Earlier:
         p = np.clip(p, *collocation.bounds_p)
         positions, failure = marched(collocation, p)
         return None if failure is not None else collocation.pack(p, positions)
-
-
-def _point(position_m: Sequence[float]) -> Array:
-    point = np.array(position_m, dtype=float)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"a place {position_m}")
-    return point
-
-
-def _refuse_infinite(values: Mapping[str, float]) -> None:
-    for name, value in values.items():
-        if not np.isfinite(value):
-            raise ValueError(f"{name} is {value}")

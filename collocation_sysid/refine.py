@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TypeVar
 
+from .answer import Answer
 from .earlier import Earlier
 from .errors import InputError
 from .experiment import refinement
@@ -14,10 +15,11 @@ from .methods.reduced_space import ReducedSpace
 from .methods.solution import Solution
 from .nlp.schemes import as_scheme
 from .problem import Problem
-from .run import Run, solve
+from .solving import solve
 from .statistics.estimates import Estimate
-from .statistics.numerical import Refinement, numerical_errors
+from .statistics.numerical import Level, Refinement, numerical_errors
 
+A = TypeVar("A", bound=Answer)
 MOST_LEVELS = 3
 # Last step of the logarithms: far below any error bar.
 TOLERANCE = 1e-6
@@ -38,7 +40,7 @@ def finer_mesh(problem: Problem) -> Problem:
 FINER = {"step": finer_step, "mesh": finer_mesh}
 
 
-def refine(finished: Run, levels: int = 2, say: Callable[[str], None] | None = None) -> Run:
+def refine(finished: A, levels: int = 2, say: Callable[[str], None] | None = None) -> A:
     """A converged run with its numerical error, see `refinement_of`."""
     answer = Earlier.of(finished.solution)
     problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
@@ -52,8 +54,8 @@ def refinement_of(
     estimates: Mapping[str, Estimate],
     levels: int = 2,
     say: Callable[[str], None] | None = None,
-    known: Sequence[Mapping[str, Any]] = (),
-    keep: Callable[[Refinement], None] | None = None,
+    known: Sequence[Level] = (),
+    keep: Callable[[Refinement], object] | None = None,
 ) -> Refinement:
     """Solve again at finer discretisations, each from the answer before.
 
@@ -70,8 +72,8 @@ def refinement_of(
         2, or 3 to observe the orders.
     say : callable, optional
         Called with what is being done now.
-    known : sequence of dict
-        Levels that were solved before, as in `Refinement.levels`.
+    known : sequence of Level
+        Those that were solved before.
     keep : callable, optional
         Called after each level with what is found so far.
 
@@ -87,15 +89,15 @@ def refinement_of(
     fitted = [experiment for experiment in problem.experiments if not experiment.validation]
     coarse = replace(problem, experiments=fitted, notes=())
     moving = any(not experiment.static for experiment in fitted)
-    solved = {(each["halved"], each["times"]): dict(each) for each in known}
-    found: list[dict[str, Any]] = []
+    solved = {(each.halved, each.times): each for each in known}
+    found: list[Level] = []
     for kind, finer in FINER.items():
         at, start = coarse, answer
         for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
             at = finer(at)
             if (kind, level) in solved:
                 found.append(solved[kind, level])
-                start = replace(answer, values={**answer.values, **found[-1]["values"]})
+                start = replace(answer, values={**answer.values, **found[-1].values})
                 continue
             if say is not None:
                 say(f"solving again: {kind} halved {level}×")
@@ -108,11 +110,9 @@ def refinement_of(
 
 
 def _of_levels(
-    levels: Sequence[dict[str, Any]], problem: Problem, estimates: Mapping[str, Estimate]
+    levels: Sequence[Level], problem: Problem, estimates: Mapping[str, Estimate]
 ) -> Refinement:
-    by_step, by_mesh = (
-        [each["values"] for each in levels if each["halved"] == kind] for kind in FINER
-    )
+    by_step, by_mesh = ([each.values for each in levels if each.halved == kind] for kind in FINER)
     order = as_scheme(problem.scheme).order
     errors = numerical_errors(estimates, by_step, by_mesh, order, problem.parameters.linear)
     return Refinement(errors, tuple(levels))
@@ -128,14 +128,14 @@ def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
     return solution
 
 
-def _level(kind: str, level: int, solution: Solution) -> dict[str, Any]:
+def _level(kind: str, level: int, solution: Solution) -> Level:
     segments = solution.collocation.segments
-    return {
-        "halved": kind,
-        "times": level,
-        "timesteps": sum(segment.grid_rows for segment in segments),
-        "nodes": sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
-        "iterations": solution.iterations,
-        "time_s": solution.timing.total,
-        "values": dict(Earlier.of(solution).values),
-    }
+    return Level(
+        halved=kind,
+        times=level,
+        timesteps=sum(segment.grid_rows for segment in segments),
+        nodes=sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
+        iterations=solution.iterations,
+        time_s=solution.timing.total,
+        values=dict(Earlier.of(solution).values),
+    )

@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from .answer import Answer
 from .arrays import Array, root_mean
 from .check import BodyFinding, Findings, Glance, Recording
 from .check.hold import hold_sentence
@@ -29,7 +30,7 @@ from .nlp.segment import Segment
 from .output.remedies import remedies_for
 from .problem import Problem
 from .rollout import Rollout
-from .run import Run
+from .statistics.concern import Concern
 from .statistics.numerical import Refinement
 from .statistics.places import Place
 from .statistics.scale import relative_sentence
@@ -136,7 +137,7 @@ def _cells(line: Iteration) -> list[str]:
     ]
 
 
-def summary(finished: Run, folder: Path) -> RenderableType:
+def summary(finished: Answer, folder: Path) -> RenderableType:
     """The answer of a run on one screen."""
     solution = finished.solution
     parts: list[RenderableType] = [Text(solution.message, style=COLOURS[finished.trust.verdict])]
@@ -151,22 +152,23 @@ def summary(finished: Run, folder: Path) -> RenderableType:
     return Group(*parts)
 
 
-def answer(finished: Run) -> RenderableType:
+def answer(finished: Answer) -> RenderableType:
     """Verdict, values, intervals and what these hold."""
     trust = finished.trust
     style = COLOURS[trust.verdict]
     return Group(
         Text(f"Verdict: {trust.verdict}", style=f"bold {style}"),
         *(Text(f"  {reason}", style=style) for reason in trust.reasons),
-        *_how_to(trust.reasons),
+        *_how_to(trust.concerns),
         parameter_table(finished),
         *_numerical(finished),
     )
 
 
-def _how_to(concerns: Sequence[str]) -> list[Text]:
+def _how_to(concerns: Sequence[Concern]) -> list[Text]:
     """The pages that say how to cure what gives concern."""
-    pages = dict.fromkeys(f"docs/howto/{each.page}.md" for each in remedies_for(concerns))
+    remedies = remedies_for(concerns).values()
+    pages = dict.fromkeys(f"docs/howto/{each.page}.md" for each in remedies)
     return [Text(f"what to do: {', '.join(pages)}", style="dim")] if pages else []
 
 
@@ -177,7 +179,7 @@ def plain_text(shown: RenderableType) -> str:
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
 
 
-def parameter_table(finished: Run) -> Table:
+def parameter_table(finished: Answer) -> Table:
     """Parameters and derived moduli with their error bars."""
     table = Table("", "value", "±", "95 % interval", "guess", box=None, pad_edge=False)
     for column in table.columns[1:]:
@@ -237,7 +239,7 @@ def _order(order: float | None) -> str:
     return "" if order is None else f"{order:.1f}"
 
 
-def _numerical(finished: Run) -> list[RenderableType]:
+def _numerical(finished: Answer) -> list[RenderableType]:
     """What the intervals hold, and what is known of the numerical error."""
     found, holds = finished.refinement, finished.interval_holds
     if not holds:
@@ -260,7 +262,7 @@ def _numerical(finished: Run) -> list[RenderableType]:
     return [Text(said), Text(f"the step moves, to first order: {', '.join(moved)}")]
 
 
-def _damping(finished: Run) -> list[Text]:
+def _damping(finished: Answer) -> list[Text]:
     """The law that γ_r belongs to."""
     parts = [part for body in finished.problem.bodies for part in body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
@@ -268,7 +270,7 @@ def _damping(finished: Run) -> list[Text]:
     return [Text(f"{GAMMA_R.symbol} is that of damping = {' and '.join(said)}")] if laws else []
 
 
-def _scale(finished: Run) -> list[Text]:
+def _scale(finished: Answer) -> list[Text]:
     """What the moduli rest on, where nothing else sets their scale."""
     said = relative_sentence(finished.problem.experiments, finished.problem.parameters)
     return [] if said is None else [Text(said)]
@@ -291,7 +293,7 @@ def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
     return [f"{symbol} {unit}".strip(), f"{estimate.value:.5g}", spread, interval]
 
 
-def _nuisance(finished: Run) -> list[Text]:
+def _nuisance(finished: Answer) -> list[Text]:
     """One line for each experiment that has nuisance parameters, with their priors."""
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
@@ -324,7 +326,7 @@ def _places(places: Mapping[str, Place]) -> list[str]:
     return said
 
 
-def _of_rows(part: Part, finished: Run) -> list[str]:
+def _of_rows(part: Part, finished: Answer) -> list[str]:
     """What was found of each row of the table but the places, beside its prior."""
     nuisance, said = part.segment.nuisance, []
     values = part.phi * nuisance.scales
@@ -344,7 +346,7 @@ def _of_rows(part: Part, finished: Run) -> list[str]:
     return said
 
 
-def _told(part: Part, own: Sequence[int], values: Array, finished: Run) -> str:
+def _told(part: Part, own: Sequence[int], values: Array, finished: Answer) -> str:
     """The sentence of a row about a vector, or a number."""
     nuisance, k = part.segment.nuisance, own[0]
     entry, name = nuisance.entries[k], nuisance.names[k]
@@ -373,13 +375,13 @@ def _short(value: float) -> str:
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
-def _residuals(finished: Run) -> list[Text]:
+def _residuals(finished: Answer) -> list[Text]:
     """What the largest residuals suggest."""
     largest = sorted(finished.diagnoses, key=lambda d: -d.rms_m)[:SHOWN_DIAGNOSES]
     return [Text(f"residuals: {diagnosis.sentence}") for diagnosis in largest]
 
 
-def _fit(finished: Run) -> list[Text]:
+def _fit(finished: Answer) -> list[Text]:
     """How well the markers and the equations are met, and how long that took."""
     solution = finished.solution
     violated = (
@@ -448,7 +450,7 @@ def closer_table(findings: Findings) -> RenderableType:
         Text(""),
         *_sentences("note", findings.notes, "default"),
         *_sentences("warning", findings.warnings, "yellow"),
-        *_how_to(findings.warnings),
+        *_how_to(findings.concerns),
         _check_verdict(findings),
     )
 

@@ -16,10 +16,10 @@ from .nlp.schemes import as_scheme
 from .nlp.stability import instabilities
 from .problem import Problem
 from .rollout import Rollout
+from .statistics.concern import Concern
 from .statistics.diagnostics import MarkerDiagnosis
 from .statistics.scale import scale_concern
 from .statistics.trust import (
-    Concern,
     clock_concerns,
     fit_concerns,
     marker_concerns,
@@ -47,15 +47,15 @@ def concerns(
     status = solution.status
     yield from body_concerns(solution)
     if not status.converged:
-        yield f"the solve did not converge: {solution.message}", "doubtful"
+        yield Concern("solve/lost", "doubtful", {"said": solution.message})
         return
     if status is Status.ACCEPTABLE:
-        yield "the solve converged to the acceptable tolerance only", "check"
+        yield Concern("solve/acceptable")
     if uncertainty is not None:
         yield from fit_concerns(uncertainty)
         yield from parameter_concerns(uncertainty)
     elif solution.collocation.nq:
-        yield "no error bars could be found", "doubtful"
+        yield Concern("solve/no-error-bars", "doubtful")
     yield from allowance_concerns(solution)
     yield from marker_concerns(diagnoses)
     for part in solution.collocation.parts(solution.z):
@@ -74,7 +74,7 @@ def concerns(
     for segment in collocation.segments:
         turn = fastest_turn(segment.experiment, collocation.substeps)
         if turn.angle_rad > TOO_FAST:
-            yield turn.brief, "check"
+            yield Concern("scheme/turn", data={"said": turn.brief})
     for motion in motions:
         if motion.first is not None and motion.first.damping_ratio < 1:
             yield from scheme_concerns(
@@ -92,11 +92,11 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
         if not said and (odd := odd_material(body, body.theta(solution.parameters))) is not None:
             said = [odd]
         for sentence in said:
-            yield sentence, "doubtful"
+            yield Concern("description/body", "doubtful", {"said": sentence})
     experiments = [segment.experiment for segment in solution.collocation.segments]
     unscaled = scale_concern(experiments, solution.collocation.parameters)
     if unscaled is not None:
-        yield unscaled, "doubtful"
+        yield Concern("scale/unknown", "doubtful", {"said": unscaled})
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
@@ -110,12 +110,7 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
         sigma_m = float(np.max(experiment.markers.sigma_m))
         share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
         if share > NO_CAMERA:
-            yield (
-                f"sigma_m = {1e3 * sigma_m:.3g} mm is {share:.2g} of the body's size, more than "
-                "cameras miss: if the model's error decides, error bars of independent errors are "
-                "too short",
-                "check",
-            )
+            yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
 
 
 def _of_rollout(
@@ -130,7 +125,7 @@ def _of_rollout(
         if not fitted and not found and predicted_n is not None and fit_n is not None:
             found = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
         return found
-    return [(f"the roll-out of '{name}' failed: {rollout}", "doubtful")]
+    return [Concern("roll-out/failed", "doubtful", {"experiment": name, "said": rollout})]
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:

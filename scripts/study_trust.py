@@ -119,7 +119,7 @@ def judged(fault: str, seed: int) -> Outcome:
             refuse_other_scale(experiment, usual_constants(problem.parameters))
         found = run(problem, seek_causes=False)
         if found.trust.verdict == "good":
-            found = replace(found, causes=likely_causes(found))
+            found = replace(found, causes=likely_causes(found.solution))
     except (InputError, SimulationError) as error:
         return Outcome(fault, seed, "refused", (str(error),), None, None)
     errors = errors_of(found, truth)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from problem_files import TRUTH, run_command, settings, write_problem
+from results_small import a_result, value
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -22,6 +23,8 @@ from collocation_sysid.output.animation import Film, animate, film_samples
 from collocation_sysid.output.page import surface_strain
 from collocation_sysid.output.replay import headline, read_run
 from collocation_sysid.output.view import frame_files, view
+from collocation_sysid.statistics.concern import Concern
+from collocation_sysid.statistics.trust import Trust
 
 NODES = 36
 
@@ -195,9 +198,8 @@ def test_a_page_is_coloured_by_the_field_asked_for(run, tmp_path):
 def test_page_and_film_say_what_was_found(run, tmp_path):
     result, (swing, _) = read_run(run)
     assert headline(result).startswith("E = ")
-    assert headline(result).endswith(f"verdict: {result['trust']['verdict']}")
-    found = {"value": 1543.21, "std_error": 123.4}
-    one = {"derived": {"core.young_pa": found}, "parameters": {}, "trust": {"verdict": "check"}}
+    assert headline(result).endswith(f"verdict: {result.trust.verdict}")
+    one = a_result({"core.young_pa": value(1543.21, 123.4)}, trust=Trust((Concern("solve/moves"),)))
     assert headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
     run_command("view", run, "--html", tmp_path / "page.html")
     assert headline(result) in (tmp_path / "page.html").read_text(encoding="utf-8")

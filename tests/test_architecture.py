@@ -14,17 +14,20 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"},
+    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
+    | {"tree"},
     {"fem"},
     {"experiment"},
     {"nlp"},
     {"methods"},
     {"statistics"},
     {"problem"},
-    {"check", "earlier", "rollout", "second_start", "verdict", "run", "refine"},
+    {"check", "result", "earlier", "rollout", "second_start", "verdict", "solving", "answer"}
+    | {"refine"},
     {"output", "synthesis", "beginning"},
     {"export"},
     {"terminal", "heartbeat", "method_tables"},
+    {"run"},
     {"live"},
     {"design", "study"},
     {"cli"},

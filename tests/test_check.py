@@ -124,7 +124,7 @@ def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
 def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
     motion = checked_motion(tiny, *SILICONE, "parameters.gamma_r_s.guess=0.02")
     first = replace(motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05)
-    said = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))[0]
+    said = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))[0].sentence
     assert "takes a damping ratio of 0.05 from the first mode" in said
     assert "found will be too high" in said
     assert f"set transcription.substeps = {motion.substeps_needed}" in said
@@ -133,7 +133,9 @@ def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
 def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
     motion = checked(tiny, *SILICONE).motions[0]
     first = replace(motion.modes[0], steps_per_period=5.0, samples_per_period=2.5)
-    steps, samples = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))
+    found = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))
+    assert [each.topic for each in found] == ["scheme", "information"]
+    steps, samples = (each.sentence for each in found)
     assert "only 5.0 steps a period" in steps
     assert f"substeps = {motion.substeps_needed}" in steps
     assert "only 2.5 samples a period" in samples

@@ -41,7 +41,9 @@ from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 
-ROLLOUT, RUN = (import_module(f"collocation_sysid.{name}") for name in ("rollout", "run"))
+ROLLOUT, RUN, SOLVING = (
+    import_module(f"collocation_sysid.{name}") for name in ("rollout", "run", "solving")
+)
 RESULT_KEYS = {
     "schema": set(),
     "status": set(),
@@ -274,13 +276,13 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch
     found = []
 
     def solved(solver, collocation, watch, start=None):
-        solution = RUN.ReducedSpace()(collocation, watch, start)
-        status = solution.status if not found else RUN.Status.INTERRUPTED
+        solution = SOLVING.ReducedSpace()(collocation, watch, start)
+        status = solution.status if not found else SOLVING.Status.INTERRUPTED
         found.append(replace(solution, status=status))
         return found[-1]
 
-    monkeypatch.setattr(RUN, "_read_where_found", solved)
-    monkeypatch.setattr(RUN, "second_start", lambda first: first.collocation.parameters)
+    monkeypatch.setattr(SOLVING, "read_where_found", solved)
+    monkeypatch.setattr(SOLVING, "second_start", lambda first: first.collocation.parameters)
     method = settings("solver.method=reduced-space")
     outcome = run_command("solve", "problem.toml", *method, "--out", "run")
     assert (outcome.code, len(found)) == (130, 2)

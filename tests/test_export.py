@@ -272,7 +272,12 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
     run = tmp_path / "run"
     shutil.copytree(run_folder, run)
     result = json.loads((run / "result.json").read_text())
-    result["trust"] = {"verdict": "doubtful", "reasons": ["the residuals swing"]}
+    swings = {
+        "code": "residuals/swing",
+        "grade": "doubtful",
+        "data": {"said": "the residuals swing"},
+    }
+    result["trust"] = {"concerns": [swings]}
     result["parameters"]["mu_pa"]["at_bound"] = True
     (run / "result.json").write_text(json.dumps(result))
     ended = run_command("export", run, "--to", to, "--out", tmp_path / "out")

@@ -22,6 +22,7 @@ from problems_small import (
     quadratic_bar,
     released_cube,
 )
+from results_small import a_result, lines, uncertainty, value
 
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
@@ -53,6 +54,7 @@ from collocation_sysid.output.pictures.shapes import COLOURS, Field
 from collocation_sysid.output.pictures.spectrum import spectral_density
 from collocation_sysid.output.replay import Replay
 from collocation_sysid.output.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
+from collocation_sysid.result import Result
 
 THETA = np.array([*TRUTH.values()])
 TIMES = 0.01 * np.arange(20.0)
@@ -378,7 +380,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
 def test_quadratic_bodies_are_drawn_by_their_corners(tmp_path):
     seen = replay(quadratic_bar)
     assert seen.surface.max() < len(seen.undeformed_m)
-    files = save_pictures(tmp_path, album([seen], history(), ["mu_pa"]))
+    files = save_pictures(tmp_path, album([seen], told()))
     assert all(imread(file)[..., :3].std() > 0.01 for file in files)
 
 
@@ -403,6 +405,15 @@ def two_parameters(rho=0.8) -> Confidence:
     correlation = np.array([[1.0, rho], [rho, 1.0]])
     covariance = correlation * np.outer(deviation, deviation)
     return Confidence(["lambda_pa", "mu_pa"], np.array([5.0, 7.0]), covariance, np.full(2, 1.96))
+
+
+def told(covariance: np.ndarray | None = None) -> Result:
+    """A result of these two parameters, with a history."""
+    given = two_parameters()
+    pairs = zip(given.names, given.values.tolist(), strict=True)
+    known = uncertainty(given.names, given.covariance if covariance is None else covariance)
+    parameters = {name: value(each) for name, each in pairs}
+    return a_result(parameters, uncertainty=known, history=lines(history()))
 
 
 @pytest.mark.parametrize("rho", [-0.95, 0.0, 0.8])
@@ -434,18 +445,12 @@ def test_wide_intervals_are_read_as_factors(tmp_path):
 
 
 def test_what_is_not_determined_is_left_out():
-    result = {
-        "uncertainty": {
-            "names": ["lambda_pa", "mu_pa"],
-            "covariance": [[None, None], [None, 0.01]],
-            "quantiles": [1.96, 1.96],
-        },
-        "parameters": {"lambda_pa": {"value": 1.0}, "mu_pa": {"value": 2.0}},
-    }
-    found = Confidence.from_result(result)
+    covariance = np.array([[np.nan, np.nan], [np.nan, 0.01]])
+    found = Confidence.of(told(covariance))
+    assert found is not None
     assert found.names == ["mu_pa"]
     assert found.covariance.tolist() == [[0.01]]
-    assert Confidence.from_result({"uncertainty": None}) is None
+    assert Confidence.of(a_result()) is None
 
 
 def test_a_tone_stands_out_at_its_frequency():
@@ -478,7 +483,7 @@ def test_modes_are_numbered_and_near_ones_together():
 
 def test_a_run_has_all_its_pictures(tmp_path):
     seen = replay()
-    pictures = album([seen], history(), ["lambda_pa", "mu_pa"], two_parameters())
+    pictures = album([seen], told())
     files = save_pictures(tmp_path, pictures)
     assert {file.stem for file in files} == {
         "confidence",
@@ -498,7 +503,7 @@ def test_a_run_has_all_its_pictures(tmp_path):
 
 def test_type_can_be_read_in_a_column():
     seen = replay()
-    pictures = album([seen], history(), ["lambda_pa", "mu_pa"], two_parameters())
+    pictures = album([seen], told())
     for name, figure in pictures.items():
         assert figure.get_size_inches()[0] * 25.4 <= 2.1 * COLUMN_MM
         sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]
@@ -507,7 +512,7 @@ def test_type_can_be_read_in_a_column():
 
 def test_validation_is_drawn_by_its_simulation():
     seen = replace(replay(), positions_m=None, markers_m=None)
-    pictures = album([seen], [], [])
+    pictures = album([seen], a_result())
     assert "shapes_hung cube" in pictures
     assert len(pictures["error_hung cube"].axes[0].lines) == 1
 
@@ -517,7 +522,7 @@ def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
     seen = replay()
     positions, markers = seen.positions_m.copy(), seen.markers_m.copy()
     positions[first:], markers[first:] = wrong, wrong
-    pictures = album([replace(seen, positions_m=positions, markers_m=markers)], [], [])
+    pictures = album([replace(seen, positions_m=positions, markers_m=markers)], a_result())
     assert ("shapes_hung cube" in pictures) == (first > 0)
     save_pictures(tmp_path, pictures)
 
@@ -536,10 +541,11 @@ def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
         "import collocation_sysid.output.animation, collocation_sysid.output.redraw as r;"
-        "r.album([], [], []);"
+        "from results_small import a_result; r.album([], a_result());"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    here = Path(__file__).parent
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=here).returncode == 0
 
 
 def test_grasped_nodes_on_the_sides_are_marked():

@@ -117,7 +117,7 @@ def test_halving_the_step_leads_to_the_truth(refined):
         by_step = numerical_error(
             name,
             refined.estimates[name],
-            [level["values"][name] for level in refined.refinement.levels[:2]],
+            [level.values[name] for level in refined.refinement.levels[:2]],
             [],
         )
         assert abs(by_step.extrapolated - TRUTH[name]) < 0.15 * abs(wrong)
@@ -125,9 +125,9 @@ def test_halving_the_step_leads_to_the_truth(refined):
 
 def test_finer_answers_start_from_the_coarser(refined):
     assert refined.refinement is not None
-    halved = [(level["halved"], level["times"]) for level in refined.refinement.levels]
+    halved = [(level.halved, level.times) for level in refined.refinement.levels]
     assert halved == [("step", 1), ("step", 2), ("mesh", 1), ("mesh", 2)]
-    assert max(level["iterations"] for level in refined.refinement.levels) <= 6
+    assert max(level.iterations for level in refined.refinement.levels) <= 6
     assert set(refined.refinement.errors) == {*FREE, "young_pa", "poisson"}
 
 
@@ -155,9 +155,9 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
 
     assert concerns(101.4) == []
     assert numerical_concerns(estimates, None) == []
-    ((said, strength),) = concerns(97.77)
-    assert strength == "check"
-    assert "mu_pa by +3 %, 3 standard errors" in said
+    (found,) = concerns(97.77)
+    assert (found.code, found.grade) == ("scheme/step", "check")
+    assert "mu_pa by +3 %, 3 standard errors" in found.sentence
 
 
 def test_other_numbers_of_levels_are_refused(answer):

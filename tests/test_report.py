@@ -6,14 +6,20 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from problem_files import TRUTH, pictures_drawn, run_command, settings, write_problem
+from results_small import ROLLOUT, a_result, value
 
-from collocation_sysid.output.remedies import LAST, REMEDIES, remedies_for, remedy_for
+from collocation_sysid.output.remedies import REMEDIES
 from collocation_sysid.output.report.run_page import verdict
+from collocation_sysid.result import Result, SimulatedExperiment
+from collocation_sysid.statistics.concern import Concern
+from collocation_sysid.statistics.trust import Trust
+from collocation_sysid.tree import as_json
 
 pytestmark = pytest.mark.long
 
@@ -95,31 +101,22 @@ def test_text_is_escaped(run_folder: Path, tmp_path: Path):
     assert "<script>" not in (copy / "report.html").read_text()
 
 
-def result_with(**changes) -> dict:
-    parameter = {"value": 100.0, "std_error": 1.0, "fixed": False}
-    return {
-        "message": "Converged.",
-        "converged": True,
-        "parameters": {"lambda_pa": parameter | changes},
-        "fit": {"rms_m": 1e-3},
-        "rollout": {"rms_m": 0.8e-3, "max_m": 2e-3, "experiments": {}},
-    }
-
-
 def test_the_verdict_tells_how_well_parameters_are_identified():
-    assert "λ is least well, but well identified: ±2 %." in verdict(result_with())
-    assert "λ is weakly identified: ±39 %." in verdict(result_with(std_error=20.0))
-    assert "No error bar for λ: see the notes." in verdict(result_with(std_error=None))
-    assert "the roll-out misses by 0.8 mm, at most 2 mm" in verdict(result_with())[-1]
+    def said(std_error: float | None) -> list[str]:
+        return verdict(a_result({"lambda_pa": value(100.0, std_error)}))
+
+    assert "λ is least well, but well identified: ±2 %." in said(1.0)
+    assert "λ is weakly identified: ±39 %." in said(20.0)
+    assert "No error bar for λ: see the notes." in said(None)
+    assert "the roll-out misses by 0.8 mm, at most 2 mm" in said(1.0)[-1]
 
 
 def test_the_verdict_tells_of_failures_and_predictions():
-    result = result_with()
-    result["rollout"]["experiments"] = {
-        "a": {"failed": "no step", "fitted": True},
-        "b": {"rms_m": 3e-3, "fitted": False},
+    experiments = {
+        "a": SimulatedExperiment(True, failed="no step"),
+        "b": SimulatedExperiment(False, rms_m=3e-3, max_m=4e-3),
     }
-    said = verdict(result)
+    said = verdict(a_result(rollout=replace(ROLLOUT, experiments=experiments)))
     assert "The roll-out of 'a' failed: no step." in said
     assert "'b' was predicted, not fitted: 3 mm RMS." in said
 
@@ -195,43 +192,22 @@ def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
 def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
     copy = tmp_path / "run"
     shutil.copytree(run_folder, copy)
-    result = json.loads((copy / "result.json").read_text())
-    reasons = [
-        "the step moves mu_pa by 3 %, 4 standard errors: halve it",
-        "mu_pa ended at its bound",
-    ]
-    result["trust"] = {"verdict": "check", "reasons": reasons}
-    (copy / "result.json").write_text(json.dumps(result))
+    whole = Result.read(copy)
+    data = {"name": "mu_pa", "percent": 3.0, "errors": 4.0}
+    concerns = (
+        Concern("scheme/step", data=data),
+        Concern("information/bound", data=data | {"names": ["mu_pa"]}),
+    )
+    (copy / "result.json").write_text(as_json(replace(whole, trust=Trust.of(concerns))))
     run_command("report", copy)
     page = (copy / "report.html").read_text()
-    for remedy in remedies_for(reasons):
-        assert page.count(f'href="#{remedy.anchor}"') == page.count(f'id="{remedy.anchor}"') == 1
+    for topic in ("scheme", "information"):
+        assert page.count(f'href="#cure-{topic}"') == page.count(f'id="cure-{topic}"') == 1
     assert "docs/howto/scheme.md" in page
+    assert "mu_pa ended at its bound" in page
     assert "usable after a look at the reasons" in page
 
 
 def test_every_remedy_names_a_page_that_is_there():
     howto = Path(__file__).parents[1] / "docs" / "howto"
-    for remedy in (*REMEDIES, LAST):
-        assert (howto / f"{remedy.page}.md").is_file()
-    assert remedy_for("something new") is LAST
-
-
-@pytest.mark.parametrize(
-    ("warning", "page"),
-    [
-        ("the residuals are 3 times as large as sigma_m says", "verdict"),
-        ("sigma_n seems 4 times too large for these residuals", "verdict"),
-        ("only the ratios of E can be told (E/ρ): …; fix a density", "forces"),
-        ("the body is 120 m large; expected 0.0001 to 10 m", "wrong_description"),
-        ("'swing': gravity seems to point along +y (5 times nearer)", "wrong_description"),
-        ("the grasp of 'swing' cuts through elements", "wrong_description"),
-        ("only about 1.0 tet4 elements lie across the body's 30 mm", "mesh"),
-        ("marker 'tip' of 'swing' is never seen: leave it out of names", "motion_capture"),
-        ("the first mode of 'swing' (3 Hz at the guess) has only 5.0 steps a period", "scheme"),
-        ("the first mode of 'swing' (3 Hz at the guess) has only 3.0 samples a period", "trust"),
-        ("interior-point will take about 40 GB, more than this machine's 24 GB", "large"),
-    ],
-)
-def test_a_warning_leads_to_the_page_that_cures_it(warning: str, page: str):
-    assert remedy_for(warning).page == page
+    assert all((howto / f"{remedy.page}.md").is_file() for remedy in REMEDIES.values())

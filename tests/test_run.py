@@ -14,9 +14,11 @@ from collocation_sysid import Problem, run
 from collocation_sysid.experiment import read_markers, write_markers_csv
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.output.record import result
+from collocation_sysid.result import Result
 from collocation_sysid.rollout import Rollout
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.profiling import profile_of
+from collocation_sysid.tree import as_json, content, read
 
 NUISANCE = """
 [experiment.nuisance]
@@ -68,12 +70,12 @@ def finished(two: Path):
 
 
 def test_nuisance_is_reported_with_unit_prior_and_error(finished):
-    nuisance = result(finished)["nuisance"]["swing"]
+    nuisance = result(finished).nuisance["swing"]
     first = [nuisance[f"camera offset of low, {axis} [m]"] for axis in "xyz"]
     for found, truth in zip(first, OFFSET_M, strict=True):
-        assert found["prior"] == 0.003
-        assert 0 < found["std_error"] < 2e-4
-        assert abs(found["value"] - truth) < 4 * found["std_error"]
+        assert found.prior == 0.003
+        assert 0 < found.std_error < 2e-4
+        assert abs(found.value - truth) < 4 * found.std_error
 
 
 def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(finished):
@@ -91,15 +93,44 @@ def test_the_material_is_found_within_its_error_bars(finished):
 
 
 def test_the_result_says_what_its_error_bars_are_based_on(finished):
-    found = result(finished)["uncertainty"]
+    found = content(result(finished))["uncertainty"]
     assert (found["noise"], found["errors"]) == ("given", "independent")
     assert found["reduced_chi_squared"] == pytest.approx(1.0, abs=0.3)
     assert np.shape(found["correlation"]) == (4, 4)
     assert any("mu_pa" in sentence for sentence in found["verdicts"])
 
 
+def test_a_result_is_read_as_it_was_written(finished):
+    written = result(finished)
+    text = as_json(written)
+    assert as_json(read(Result, json.loads(text))) == text
+    assert "NaN" not in text
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("fit",), [1]),
+        (("converged",), "yes"),
+        (("parameters", "mu_pa", "value"), "x"),
+        (("parameters", "mu_pa", "ci95"), [1.0]),
+        (("trust", "concerns"), [{"code": "noise/larger", "grade": "fine", "data": {}}]),
+        (("history",), [{"iteration": 1}]),
+        (("iterations",), 1.5),
+        (("iterations",), True),
+    ],
+)
+def test_a_result_of_another_kind_is_not_read(finished, keys, value):
+    stored = place = content(result(finished))
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = value
+    with pytest.raises((TypeError, KeyError, ValueError, AttributeError)):
+        read(Result, stored)
+
+
 def test_every_marker_is_diagnosed(finished):
-    found = result(finished)["residuals"]
+    found = content(result(finished))["residuals"]
     assert [item["marker"] for item in found] == ["low", "mid", "side"]
     assert all(item["sentence"] for item in found)
     json.dumps(found)

@@ -81,7 +81,7 @@ def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
     assert (ratio[[0, 2, 3]] < 1.3).all()
     (note,) = [note for note in found.notes if "disagree on mu_pa" in note]
     assert "model error decides" in note
-    assert any("disagree on mu_pa" in said for said, _ in fit_concerns(found))
+    assert any("disagree on mu_pa" in each.sentence for each in fit_concerns(found))
     assert not any("disagree" in note for note in calm.notes)
 
 

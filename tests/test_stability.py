@@ -195,7 +195,8 @@ def test_what_grows_is_told_with_its_rate(law, told):
     concerns = stability_concerns(instabilities(collocation, z))
     assert bool(concerns) == told
     if told:
-        (sentence, _), = concerns  # fmt: skip
+        (concern,) = concerns
+        sentence = concern.sentence
         assert "'bar' is not stable" in sentence
         assert "disturbances grow by" in sentence
 

@@ -89,8 +89,8 @@ def test_it_is_told_what_was_chosen_and_why():
     many = finer.solution.collocation.substeps
     assert said.startswith("with one step a sample, the step moves ")
     assert said.endswith(f"solved again with {many}")
-    assert result(finer)["problem"]["substeps"] == many
-    assert result(finer)["iterations"] > found(3e-4, many).solution.iterations
+    assert result(finer).problem.substeps == many
+    assert result(finer).iterations > found(3e-4, many).solution.iterations
 
 
 def test_the_guess_and_the_way_from_it_are_kept():
@@ -172,7 +172,7 @@ def test_refine_goes_on_from_the_steps_that_were_chosen():
     finer = found(3e-4)
     refined = refine(finer).refinement
     assert refined is not None
-    rows = {level["halved"]: level["timesteps"] for level in refined.levels}
+    rows = {level.halved: level.timesteps for level in refined.levels}
     many = finer.solution.collocation.substeps
     assert rows == {"step": 25 * 2 * many + 1, "mesh": 25 * many + 1}
     assert refined.holds == ("noise", "step", "mesh")
@@ -189,9 +189,9 @@ def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
         assert f"{low:.5g} … {high:.5g}" in said
         assert "Verdict: check" in said
         assert "intervals hold the noise and the step, not the mesh" in said
-    found_mu = result(coarse)["parameters"]["mu_pa"]
-    assert found_mu["ci95"] == [low, high]
-    assert found_mu["ci95_holds"] == ["noise", "step"]
-    assert found_mu["ci95_noise"] == list(coarse.noise_estimates["mu_pa"].ci95 or ())
+    found_mu = result(coarse).parameters["mu_pa"]
+    assert found_mu.ci95 == (low, high)
+    assert found_mu.ci95_holds == ("noise", "step")
+    assert found_mu.ci95_noise == coarse.noise_estimates["mu_pa"].ci95
     assert f"[{low:.5g}, {high:.5g}]" in repr(coarse)
     assert ", check: " in repr(coarse)

@@ -16,8 +16,10 @@ from problem_files import run_command, settings, write_problem
 from collocation_sysid import Run, run
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.output.record import result
+from collocation_sysid.output.remedies import REMEDIES
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.cause import Cause
+from collocation_sysid.statistics.concern import SENTENCES, Concern
 from collocation_sysid.statistics.trust import (
     Trust,
     fit_concerns,
@@ -29,6 +31,7 @@ from collocation_sysid.statistics.trust import (
 )
 from collocation_sysid.statistics.uncertainty import uncertainty_of
 from collocation_sysid.terminal import plain_text, summary
+from collocation_sysid.tree import as_json, content, read
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -57,9 +60,26 @@ def verdict_of_fit(errors: np.ndarray) -> Trust:
 
 
 def test_the_gravest_concern_gives_the_verdict():
-    assert Trust.of([]) == Trust("good")
-    assert Trust.of([("a", "check"), ("a", "check")]) == Trust("check", ("a",))
-    assert Trust.of([("a", "check"), ("b", "doubtful")]) == Trust("doubtful", ("b", "a"))
+    light, grave = Concern("solve/acceptable"), Concern("solve/no-error-bars", "doubtful")
+    assert Trust.of([]).verdict == "good"
+    assert Trust.of([light, light]) == Trust((light,))
+    assert Trust.of([light, grave]) == Trust((grave, light))
+    assert (Trust((light,)).verdict, Trust((grave, light)).verdict) == ("check", "doubtful")
+
+
+def test_a_concern_keeps_its_code_and_its_numbers_in_files():
+    found = Trust.of(nuisance_concerns(["time"], [4.0], [-9.0], [9.0]))
+    stored = json.loads(as_json(found))
+    assert stored["reasons"] == ["time is 4.0 deviations of its prior away from zero"]
+    (concern,) = stored["concerns"]
+    assert concern["code"] == "nuisance/far"
+    assert concern["data"] == {"name": "time", "deviations": 4.0}
+    assert read(Trust, stored) == found
+
+
+@pytest.mark.parametrize("code", SENTENCES)
+def test_every_topic_has_a_remedy(code):
+    assert Concern(code).topic in REMEDIES
 
 
 def test_white_residuals_of_the_stated_size_are_good():
@@ -109,30 +129,30 @@ def test_nuisance_parameters_far_from_their_prior():
     nowhere, infinite = np.zeros(100), np.full(100, np.inf)
     assert not nuisance_concerns(many, nowhere, -infinite, infinite)
     assert not nuisance_concerns(many, nowhere + 3.5, -infinite, infinite)  # one in forty such runs
-    ((said, strength),) = nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
-    assert (said, strength) == ("time is 4.0 deviations of its prior away from zero", "check")
+    (found,) = nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
+    assert (found.code, found.grade) == ("nuisance/far", "check")
     for phi, low, high in ((-7.0, -9.0, 9.0), (2.0, -2.0, 2.0), (2.0, 2.0, 6.0)):
-        ((_, strength),) = nuisance_concerns(["time"], [phi], [low], [high])
-        assert strength == "doubtful"
+        (found,) = nuisance_concerns(["time"], [phi], [low], [high])
+        assert found.grade == "doubtful"
 
 
 def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
     assert not rollout_concerns("a", 1.05, 1.0, 1.0, fitted=True)
     assert not rollout_concerns("a", 0.1, 0.001, 1.0, fitted=True)  # far below the noise
-    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=True)[0][1] for rms in (1.5, 4.0)]
+    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=True)[0].grade for rms in (1.5, 4.0)]
     assert strengths == ["check", "doubtful"]
     assert not rollout_concerns("a", 2.0, 1.0, 1.0, fitted=False)
-    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=False)[0][1] for rms in (4.0, 20.0)]
+    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=False)[0].grade for rms in (4.0, 20.0)]
     assert strengths == ["check", "doubtful"]
 
 
 def test_a_scheme_that_damps_or_slows_is_a_concern():
     assert not scheme_concerns("a", 0.05, 0.0, 0.01)
     (damped,) = scheme_concerns("a", 0.05, 0.02, 0.0)
-    assert damped[1] == "check"
-    assert "0.02 to the 0.05" in damped[0]
-    assert scheme_concerns("a", 0.05, 0.06, 0.0)[0][1] == "doubtful"
-    assert scheme_concerns("a", 0.05, 0.0, -0.05)[0][1] == "check"
+    assert damped.grade == "check"
+    assert "0.02 to the 0.05" in damped.sentence
+    assert scheme_concerns("a", 0.05, 0.06, 0.0)[0].grade == "doubtful"
+    assert scheme_concerns("a", 0.05, 0.0, -0.05)[0].grade == "check"
 
 
 def test_what_noise_alone_would_leave():
@@ -157,7 +177,7 @@ def judged(fault: str, seed: int = 100) -> Run:
 @pytest.mark.parametrize("seed", [100, slow(101)])
 def test_faultless_twins_are_good(seed):
     found = judged("none", seed)
-    assert found.trust == Trust("good")
+    assert found.trust == Trust(())
     assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
 
 
@@ -205,7 +225,7 @@ def test_a_step_too_coarse_for_the_error_bars_is_not_good(substeps, good):
 def test_the_verdict_is_shown_stored_and_fed():
     found = judged("none")
     assert ", good: " in repr(found)
-    assert result(found)["trust"] == {"verdict": "good", "reasons": []}
+    assert content(result(found))["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
     lines = plain_text(summary(found, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
     assert "γ_r is that of damping = rayleigh, which also brakes rotation" in lines
@@ -214,7 +234,8 @@ def test_the_verdict_is_shown_stored_and_fed():
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
     assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
     caused = replace(found, causes=(Cause("clock", "the clock is late", 9.0),))
-    assert caused.trust == Trust("doubtful", ("likely: the clock is late",))
+    assert caused.trust.verdict == "doubtful"
+    assert caused.trust.reasons == ("likely: the clock is late",)
 
 
 def test_an_answer_that_did_not_converge_is_doubtful():

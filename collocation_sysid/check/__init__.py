@@ -26,6 +26,7 @@ from ..nlp.sensor_rows import SensorRows
 from ..nlp.stability import instabilities
 from ..problem import Problem
 from ..statistics.cause import Cause
+from ..statistics.concern import Concern, as_said
 from ..statistics.numerical import MOST_SUBSTEPS
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
@@ -105,7 +106,9 @@ class Findings:
     holds : tuple of Hold, one for each grasp
     causes : tuple of Cause
         What is likely described wrongly; their sentences are the first warnings.
-    notes, warnings : tuple of str
+    notes : tuple of str
+    concerns : tuple of Concern
+        What will go wrong, with the remedy; `warnings` are their sentences.
     """
 
     bodies: tuple[BodyFinding, ...]
@@ -131,16 +134,21 @@ class Findings:
     holds: tuple[Hold, ...]
     causes: tuple[Cause, ...]
     notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    concerns: tuple[Concern, ...]
 
     @property
     def derivatives_agree(self) -> bool:
         """Whether both derivative checks pass."""
         return max(self.jacobian_error, self.hessian_error) < AGREEMENT
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What will go wrong, a sentence each that ends with the remedy."""
+        return tuple(concern.sentence for concern in self.concerns)
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON and tables."""
-        return asdict(self)
+        return asdict(self) | {"warnings": self.warnings}
 
 
 def glance(problem: Problem) -> Glance:
@@ -207,20 +215,24 @@ def check_problem(
     )
     causes, holds = description_causes(problem), _holds(problem, bodies)
     still = stillness_notes(problem.experiments, problem.parameters)
-    still += scale_notes(problem.experiments, problem.parameters)
-    warnings = [cause.sentence for cause in causes] + still + _body_warnings(bodies)
+    scale = scale_notes(problem.experiments, problem.parameters)
+    concerns = as_said("description/doubt", (cause.sentence for cause in causes))
+    concerns += as_said("information/still", still) + as_said("scale/unknown", scale)
+    concerns += as_said("mesh/elements", _body_warnings(bodies))
     for hold in holds:
-        warnings += hold_warnings(hold)
+        concerns += as_said("description/grasp", hold_warnings(hold))
     for motion in motions:
-        warnings += motion_warnings(motion)
-    warnings += [said for said, _ in stability_concerns(instabilities(simulated, z))]
+        concerns += motion_warnings(motion)
+    concerns += stability_concerns(instabilities(simulated, z))
     for experiment in problem.experiments:
-        warnings += turning_warnings(experiment, problem.first_substeps)
+        turns = turning_warnings(experiment, problem.first_substeps)
+        concerns += as_said("scheme/turn", turns)
     for recording in recordings:
         body = next(each for each in bodies if recording.experiment in each.experiments)
-        warnings += recording_warnings(recording, body.edges_m[1], body.diagonal_m)
-    warnings += cost_warnings(chosen, found_costs) if chosen else []
-    said = {*still, *(cause.sentence for cause in causes)}
+        seen = recording_warnings(recording, body.edges_m[1], body.diagonal_m)
+        concerns += as_said("markers/recording", seen)
+    concerns += as_said("memory/short", cost_warnings(chosen, found_costs) if chosen else [])
+    said = {*still, *scale, *(cause.sentence for cause in causes)}
     known = [note for note in problem.notes if note not in said]
     notes = [*known, *([scan.sentence] if scan else []), *start_notes]
     for motion in motions:
@@ -258,7 +270,7 @@ def check_problem(
         holds=holds,
         causes=causes,
         notes=tuple(notes),
-        warnings=tuple(warnings),
+        concerns=tuple(concerns),
     )
 
 

@@ -16,6 +16,7 @@ from ..nlp.newton import Solver
 from ..nlp.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
 from ..nlp.rest import rest_state
 from ..nlp.schemes import Scheme
+from ..statistics.concern import Concern, as_said
 
 COUNT = 6
 # A scheme may add this share of the physical damping ratio, or this ratio where there is little.
@@ -161,24 +162,24 @@ def _damping_limit(mode: ModeFinding) -> float:
     return max(DAMPING_SHARE * mode.damping_ratio, LITTLE_DAMPING)
 
 
-def motion_warnings(motion: Motion) -> list[str]:
-    """What the time grid and the length of the recording will spoil, one sentence each."""
+def motion_warnings(motion: Motion) -> list[Concern]:
+    """What the time grid and the length of the recording will spoil."""
     mode = motion.first
     if mode is None:
         return []
-    which = _first_mode(motion, mode)
-    warnings = _grid_warnings(motion, mode)
+    which, unseen = _first_mode(motion, mode), []
     if mode.samples_per_period < FEW_SAMPLES:
-        warnings.append(
+        unseen.append(
             f"{which} has only {mode.samples_per_period:.1f} samples a period, too few to see it: "
             f"record at {FEW_STEPS * mode.frequency_hz:.2g} Hz or more"
         )
     if motion.duration_s * mode.frequency_hz < 1:
-        warnings.append(
+        unseen.append(
             f"{which} takes longer for a period than the {motion.duration_s:.3g} s recorded, which "
             "leaves the damping uncertain: record longer"
         )
-    return warnings
+    grid = as_said("scheme/grid", _grid_warnings(motion, mode))
+    return [*grid, *as_said("information/recording", unseen)]
 
 
 def _grid_warnings(motion: Motion, mode: ModeFinding) -> list[str]:

@@ -84,9 +84,9 @@ def design(
     from ..design import design as designed
     from ..design.display import DesignProgress, design_summary
     from ..design.folder import DESIGN_FILE, as_dict, write_design
-    from ..output.record import as_json as json_text
     from ..output.writers import require_replaceable
     from ..problem import Problem
+    from ..tree import as_json as json_text
 
     folder = out or Path("runs") / f"{run_name(problem)}-design"
     names = tuple(name.strip() for name in for_.split(",")) if for_ is not None else ()

@@ -67,12 +67,12 @@ def solve(
     """
     from ..methods.described import require_method
     from ..methods.solution import Status
-    from ..output.record import as_json as json_text
     from ..output.record import result
     from ..output.writers import require_replaceable
     from ..problem import Problem
     from ..run import run
     from ..terminal import Progress, summary
+    from ..tree import as_json as json_text
 
     if method is not None:
         require_method(method, "--method")

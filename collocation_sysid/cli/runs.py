@@ -44,9 +44,10 @@ def refine(
     numerical error of each parameter, with an interval for noise and discretisation. What was
     solved before, as of a call that was interrupted, is not solved again.
     """
-    from ..output.record import as_json as json_text
     from ..output.refined import refine_run
     from ..terminal import refinement_table
+    from ..tree import as_json as json_text
+    from ..tree import content
 
     def say(what: str) -> None:
         if not quiet:
@@ -60,11 +61,11 @@ def refine(
         errors.print(Text(said), soft_wrap=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
     if as_json:
-        typer.echo(json_text({**found.as_dict(), "trust": result["trust"]}))
+        typer.echo(json_text({**content(found), "trust": result.trust}))
     else:
         show(refinement_table(found))
-        for reason in result["trust"]["reasons"]:
-            show(Text(f"{result['trust']['verdict']}: {reason}"))
+        for reason in result.trust.reasons:
+            show(Text(f"{result.trust.verdict}: {reason}"))
 
 
 @commands.command(
@@ -94,8 +95,8 @@ def export(
     Says what the target cannot express. By default in a folder export-TARGET of the run.
     """
     from ..export import Identified, export_run, target_named, verify_export
-    from ..output.record import as_json as json_text
     from ..terminal import comparison_table, export_notes
+    from ..tree import as_json as json_text
 
     target, folder = target_named(to), out or run_folder / f"export-{to}"
     require_possible(folder)

@@ -204,10 +204,10 @@ class _Study:
 
 def _study(study: _Study, limits: Limits, dry_run: bool, as_json: bool, quiet: bool) -> None:
     """Do the runs that are left, write the tables and plots, and print them."""
-    from ..output.record import as_json as json_text
     from ..study import RunStore, run_all
     from ..study.display import StudyProgress, study_tables
     from ..study.report import load_report, report_json, write_report
+    from ..tree import as_json as json_text
 
     folder = study.folder
     store = RunStore(folder / "runs")

@@ -16,7 +16,7 @@ from ..methods.options import Options
 from ..nlp.parameters import ThetaMap
 from ..nlp.simulation import Trajectory, simulate, with_markers
 from ..problem import Problem
-from ..run import solve
+from ..solving import solve
 from ..statistics.linearised import linearised_fit
 from .criterion import Criterion, Errors, both_sides, draws_about
 from .information import Recording, Told, shared_information

@@ -21,11 +21,11 @@ from ..experiment import (
 )
 from ..output.animation import film
 from ..output.pictures.album import save_pictures
-from ..output.record import as_json
 from ..output.replay import Replay
 from ..output.writers import run_folder
 from ..problem import Problem
 from ..problem.schema import ProblemFile, completed
+from ..tree import as_json
 from .designing import Bars, Design
 from .pictures import pictures
 

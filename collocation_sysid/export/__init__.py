@@ -9,11 +9,11 @@ from pathlib import Path
 
 from ..errors import InputError, hint_at
 from ..experiment import write_poses_csv
-from ..output.record import as_json
 from ..output.writers import run_folder
+from ..tree import as_json
 from . import calculix, febio, mujoco, newton, sofa
 from .identified import Identified
-from .target import Comparison, Exported, Target, plain
+from .target import Comparison, Exported, Target
 
 NUMBERS = "identified.json"
 
@@ -52,7 +52,7 @@ def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
     with run_folder(folder, mark=NUMBERS, what="export") as place:
         for name, text in exported.files.items():
             (place / name).write_text(text, encoding="utf-8")
-        content = plain({**body.as_dict(), "not_expressed": exported.limits})
+        content = {**body.as_dict(), "not_expressed": exported.limits}
         (place / NUMBERS).write_text(as_json(content) + "\n", encoding="utf-8")
         for k, grasp in enumerate(body.experiment.grasps, start=1):
             write_poses_csv(place / f"poses_{k}.csv", grasp.poses)

@@ -21,9 +21,9 @@ from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
 from ..fem.moduli import engineering
-from ..files import RESULT_FILE, read_json
 from ..output.replay import Replay, read_arrays, reading_run
 from ..problem import Problem
+from ..result import FoundValue, Result
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Identified:
     verdict : str
     warnings : tuple of str
         What to know before these numbers are used anywhere else.
-    parameters : mapping of name to {"value", "ci95", "at_bound", …}
+    parameters : mapping of name to FoundValue
     body : Body
     theta : (k,) its constants
     experiment : Experiment
@@ -95,7 +95,7 @@ class Identified:
     title: str
     verdict: str
     warnings: tuple[str, ...]
-    parameters: Mapping[str, Mapping[str, Any]]
+    parameters: Mapping[str, FoundValue]
     body: Body
     theta: Array
     experiment: Experiment
@@ -121,14 +121,10 @@ class Identified:
             If it is no run of a problem file, is damaged, or has no such recording.
         """
         folder = Path(run)
-        result = read_json(folder / RESULT_FILE, "a run folder")
-        answer = Earlier.read(folder)
+        result = Result.read(folder)
+        answer = Earlier.of_result(result, folder)
+        home = result.home(folder, "which export needs")
         with reading_run(folder):
-            file = result["provenance"]["problem_file"]
-            if file is None:
-                raise InputError("the run is of no problem file: export needs one", folder)
-            home = Path(file).parent
-            parameters, trust = result["parameters"], result["trust"]
             warnings = _warnings(result)
         problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
         if problem.parameters.free:
@@ -151,9 +147,9 @@ class Identified:
         found = segment.corrected(phi)
         return cls(
             problem.title,
-            trust["verdict"],
+            result.trust.verdict,
             warnings,
-            parameters,
+            result.parameters,
             body,
             body.theta(values),
             found,
@@ -235,7 +231,7 @@ class Identified:
             "verdict": self.verdict,
             "warnings": self.warnings,
             "parameters": {
-                name: {key: found.get(key) for key in names}
+                name: {key: getattr(found, key) for key in names}
                 for name, found in self.parameters.items()
             },
             "element": body.element.name,
@@ -272,18 +268,16 @@ class Identified:
         }
 
 
-def _warnings(result: Mapping[str, Any]) -> tuple[str, ...]:
+def _warnings(result: Result) -> tuple[str, ...]:
     """Why not to trust the numbers as they are."""
     found = []
-    if not result["converged"]:
+    if not result.converged:
         found.append("the run did not converge")
-    if (verdict := result["trust"]["verdict"]) != "good":
-        found.append(
-            f"the verdict on the run is {verdict!r}: {'; '.join(result['trust']['reasons'])}"
-        )
-    for name, each in result["parameters"].items():
-        if each["at_bound"] and not each["fixed"]:
+    if (verdict := result.trust.verdict) != "good":
+        found.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
+    for name, each in result.parameters.items():
+        if each.at_bound and not each.fixed:
             found.append(
-                f"{name} = {each['value']:.4g} ended at a bound: the data would have it elsewhere"
+                f"{name} = {each.value:.4g} ended at a bound: the data would have it elsewhere"
             )
     return tuple(found)

@@ -6,8 +6,9 @@ import json
 
 import numpy as np
 
+from ..tree import content
 from .identified import Identified
-from .target import LINEAR_ONLY, Exported, heading, left_out, linear_cells, plain
+from .target import LINEAR_ONLY, Exported, heading, left_out, linear_cells
 
 MODULE = "body.py"
 NUMBERS = "body.json"
@@ -97,6 +98,6 @@ def export(body: Identified) -> Exported:
     }
     files = {
         MODULE: heading(body, limits, "# ") + _BUILD,
-        NUMBERS: json.dumps(plain(numbers)) + "\n",
+        NUMBERS: json.dumps(content(numbers)) + "\n",
     }
     return Exported(files, tuple(limits))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -134,12 +133,3 @@ def heading(body: Identified, limits: Iterable[str], start: str, end: str = "") 
         )
     # No line may end the comment itself.
     return "".join(f"{start}{' '.join(line.split()).replace('--', '- -')}{end}\n" for line in lines)
-
-
-def plain(content: Any) -> Any:
-    """The same without arrays, for JSON."""
-    if isinstance(content, Mapping):
-        return {key: plain(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [plain(value) for value in content]
-    return content.tolist() if isinstance(content, (np.ndarray, np.generic)) else content

@@ -29,9 +29,10 @@ from ..nlp.lapack import one_blas_thread
 from ..nlp.least_squares import LeastSquares
 from ..problem import Problem
 from ..run import Run
+from ..statistics.concern import concerned
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
-from ..statistics.trust import GROSS_MISFIT, Concern, Trust
+from ..statistics.trust import GROSS_MISFIT, Trust
 from .budget import Budget
 from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .intake import LONGEST, Intake
@@ -465,15 +466,16 @@ class Estimator:
         return self._best(track, known)
 
     def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
-        grave: list[Concern] = []
+        said = None
         if self.track is None:
-            grave.append(("there is no start yet: the first frame needs a pose", "doubtful"))
+            said = "there is no start yet: the first frame needs a pose"
         elif self.track.failed:
-            grave.append(("the body cannot be simulated with these parameters", "doubtful"))
+            said = "the body cannot be simulated with these parameters"
         elif self.intake.is_lost(t_s):
-            grave.append(("the grasp is lost", "doubtful"))
+            said = "the grasp is lost"
         elif self.search is not None:
-            grave.append(("a start is still sought", "doubtful"))
+            said = "a start is still sought"
+        grave = concerned(said is not None, True, "solve/no-start", said=said)
         if self.track is None or self.track.failed:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
             return {name: Estimate(value) for name, value in values.items()}, Trust.of(grave)

@@ -13,11 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
 from ..experiment.experiment import Experiment
-from ..files import RESULT_FILE, read_json
-from ..output.replay import reading_run
 from ..problem import Problem
+from ..result import Result
 from .estimator import Update
 from .frames import Frame
 from .model import Model
@@ -64,13 +62,8 @@ def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> P
     """
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code)
-    result = read_json(recording / RESULT_FILE, "a run folder")
-    with reading_run(recording):
-        origin = result["provenance"]["problem_file"]
-    if origin is None:
-        raise InputError("the run is of no problem file, which a replay needs", recording)
-    file, home = recording / "problem.toml", Path(origin).parent
-    return Problem.read(file, overrides, allow_code, folder=home)
+    home = Result.read(recording).home(recording, "which a replay needs")
+    return Problem.read(recording / "problem.toml", overrides, allow_code, folder=home)
 
 
 def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:

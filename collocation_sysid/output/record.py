@@ -3,27 +3,42 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import casadi
 import numpy as np
 
+from ..answer import Answer
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..files import SCHEMA
-from ..methods.scan import Scan
 from ..methods.solution import Solution, pooled_wrench_rms
 from ..nlp.schemes import as_scheme
 from ..problem import Problem
+from ..result import (
+    FittedExperiment,
+    FoundDynamics,
+    FoundFit,
+    FoundNuisance,
+    FoundProfile,
+    FoundRollout,
+    FoundScan,
+    FoundUncertainty,
+    FoundValue,
+    HistoryLine,
+    ProgramSize,
+    Provenance,
+    RecordingsAgreement,
+    Result,
+    SimulatedExperiment,
+)
 from ..rollout import Rollout
-from ..run import Run
 from ..statistics.identifiability import verdicts
+from ..tree import alike, as_json
 from .fields import ElementFields
 from .replay import Replay
 from .writers import run_folder, write_frames
@@ -31,7 +46,7 @@ from .writers import run_folder, write_frames
 REFINEMENT_FILE = "refinement.json"
 
 
-def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
+def write_run(finished: Answer, folder: str | Path, frames: bool = True) -> Path:
     """Write the run folder, whole or not at all, and return it.
 
     ``result.json``, ``problem.toml`` as run where the problem has a file, ``trajectory.npz``,
@@ -39,33 +54,30 @@ def write_run(finished: Run, folder: str | Path, frames: bool = True) -> Path:
     arrays' names and the frames' folders have the experiment's name in front.
     """
     solution = finished.solution
+    found = result(finished)
     with run_folder(folder) as place:
         origin = finished.problem.origin
         if origin is not None:
             (place / "problem.toml").write_text(origin.text, encoding="utf-8")
-        (place / "result.json").write_text(as_json(result(finished)) + "\n", encoding="utf-8")
+        (place / "result.json").write_text(as_json(found) + "\n", encoding="utf-8")
         if finished.refinement is not None and finished.refinement.levels:
-            text = as_json(finished.refinement.as_dict())
+            text = as_json(finished.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
         seen = replays(finished)
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
-        _write_pictures(finished, seen, place)
+        _write_pictures(finished, found, seen, place)
         if frames:
             _write_all_frames(solution, place)
     return Path(folder)
 
 
-def _write_pictures(finished: Run, seen: Sequence[Replay], place: Path) -> None:
+def _write_pictures(finished: Answer, found: Result, seen: Sequence[Replay], place: Path) -> None:
     # matplotlib takes a while to import, and nothing else needs it.
-    from .pictures import Confidence, album, jacobian_sparsity, save_pictures
+    from .pictures import album, jacobian_sparsity, save_pictures
 
     solution = finished.solution
-    free = [item.name for item in solution.collocation.parameters.free]
-    found = finished.uncertainty
-    confidence = Confidence.of(found) if found is not None else None
-    pictures = album(seen, solution.history, free, confidence, scan=_scan(solution.scan))
-    pictures["jacobian"] = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(place, pictures)
+    jacobian = jacobian_sparsity(solution.collocation, solution.z)
+    save_pictures(place, album(seen, found) | {"jacobian": jacobian})
 
 
 def _write_all_frames(solution: Solution, place: Path) -> None:
@@ -91,7 +103,7 @@ def _write_all_frames(solution: Solution, place: Path) -> None:
         )
 
 
-def replays(finished: Run) -> list[Replay]:
+def replays(finished: Answer) -> list[Replay]:
     """The experiments as they are looked at: those fitted, then those for validation."""
     solution = finished.solution
     fitted = {
@@ -116,7 +128,7 @@ def replays(finished: Run) -> list[Replay]:
     return found
 
 
-def _sensed(finished: Run, experiment: Experiment) -> list[Array]:
+def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
     """(S, 19) of each sensor: time, and the wrench as measured, fitted and rolled out."""
     sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
     rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
@@ -129,7 +141,7 @@ def _sensed(finished: Run, experiment: Experiment) -> list[Array]:
     return found
 
 
-def _places_m(finished: Run, experiment: str) -> Array | None:
+def _places_m(finished: Answer, experiment: str) -> Array | None:
     """(M, 3) of the markers as estimated; None where that failed."""
     if experiment in finished.places:
         found = [place.position_m for place in finished.places[experiment].values()]
@@ -150,259 +162,174 @@ def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
     return arrays
 
 
-def result(finished: Run) -> dict[str, Any]:
+def result(finished: Answer) -> Result:
     """The content of result.json."""
     solution, problem = finished.solution, finished.problem
     collocation = solution.collocation
-    fitted = {segment.experiment.name for segment in collocation.segments}
-    rolled = {n: r for n, r in finished.rollouts.items() if isinstance(r, Rollout) and n in fitted}
-    return {
-        "schema": SCHEMA,
-        "status": solution.status.value,
-        "converged": solution.status.converged,
-        "message": solution.message,
-        "missing": finished.missing,
-        "trust": {"verdict": finished.trust.verdict, "reasons": list(finished.trust.reasons)},
-        "method": solution.method,
-        "title": problem.title,
-        "parameters": _parameters(finished),
-        "derived": {name: _with_errors(finished, name) for name in finished.derived},
-        "places": _places(finished),
-        "nuisance": _nuisance(finished),
-        "uncertainty": _uncertainty(finished),
-        "scan": _scan(solution.scan),
-        "fit": _fit(solution) | {"noise_rms_m": finished.noise_rms_m},
-        "residuals": [
-            {**asdict(diagnosis), "offset_m": diagnosis.offset_m.tolist()}
-            for diagnosis in finished.diagnoses
-        ],
-        "dynamics": {
-            "max_violation_n": solution.max_violation_n,
-            "max_violation_relative": solution.max_violation_relative,
-            "largest": [str(violation) for violation in solution.largest_violations],
-        },
-        "rollout": {
-            "rms_m": _pooled_rms(finished, rolled),
-            "max_m": max((r.max_m for r in rolled.values()), default=None),
-            "experiments": {
-                name: {
-                    "rms_m": r.rms_m,
-                    "max_m": r.max_m,
-                    "fitted": name in fitted,
-                    "nuisance": r.nuisance,
-                    "places_m": r.places_m,
-                    **_wrench_rms(r.wrench_rms),
-                }
-                if isinstance(r, Rollout)
-                else {"failed": r, "fitted": name in fitted}
-                for name, r in finished.rollouts.items()
-            },
-        },
-        "iterations": solution.iterations,
-        "evaluations": solution.evaluations,
-        "timing_s": {
-            field.name: getattr(solution.timing, field.name) for field in fields(solution.timing)
-        },
-        "problem": {
-            "nodes": sum(len(body.nodes_m) for body in problem.bodies),
-            "elements": sum(len(body.cells) for body in problem.bodies),
-            "substeps": collocation.substeps,
-            "timesteps": sum(segment.grid_rows for segment in collocation.segments),
-            "variables": collocation.variables,
-            "constraints": collocation.constraints,
-            "scheme": as_scheme(collocation.scheme).name,
-        },
-        "notes": list(dict.fromkeys([*problem.notes, *solution.notes, *finished.all_notes])),
-        "history": [
-            {
-                "iteration": line.number,
-                "loss": line.loss,
-                "rms_m": line.rms_m,
-                "violation_n": line.violation_n,
-                "parameters": line.parameters,
-                "time_s": line.time_s,
-                "share": line.share,
-            }
-            for line in solution.history
-        ],
-        "provenance": _provenance(problem),
-    }
+    values = {name: _value(finished, name) for name in finished.estimates}
+    return Result(
+        schema=SCHEMA,
+        status=solution.status.value,
+        converged=solution.status.converged,
+        message=solution.message,
+        missing=finished.missing,
+        trust=finished.trust,
+        method=solution.method,
+        title=problem.title,
+        parameters={item.name: values[item.name] for item in finished.started_from.items},
+        derived={name: values[name] for name in finished.derived},
+        places=finished.places,
+        nuisance=_nuisance(finished),
+        uncertainty=_uncertainty(finished),
+        scan=None if solution.scan is None else alike(FoundScan, solution.scan),
+        fit=_fit(finished),
+        residuals=finished.diagnoses,
+        dynamics=FoundDynamics(
+            solution.max_violation_n,
+            solution.max_violation_relative,
+            tuple(map(str, solution.largest_violations)),
+        ),
+        rollout=_rollout(finished),
+        iterations=solution.iterations,
+        evaluations=solution.evaluations,
+        timing_s=solution.timing,
+        problem=ProgramSize(
+            sum(len(body.nodes_m) for body in problem.bodies),
+            sum(len(body.cells) for body in problem.bodies),
+            collocation.substeps,
+            sum(segment.grid_rows for segment in collocation.segments),
+            collocation.variables,
+            collocation.constraints,
+            as_scheme(collocation.scheme).name,
+        ),
+        notes=tuple(dict.fromkeys([*problem.notes, *solution.notes, *finished.all_notes])),
+        history=tuple(HistoryLine(*vars(line).values()) for line in solution.history),
+        provenance=_provenance(problem),
+    )
 
 
-def _provenance(problem: Problem) -> dict[str, Any]:
+def _provenance(problem: Problem) -> Provenance:
     origin = problem.origin
     text = None if origin is None else origin.text.encode()
-    return {
-        "version": version("collocation-sysid"),
-        "casadi": casadi.CasadiMeta.version(),
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "problem_file": None if origin is None else str(origin.path),
-        "problem_sha256": None if text is None else hashlib.sha256(text).hexdigest(),
-        "mesh_sha256": [body.mesh.sha256 for body in problem.bodies],
-    }
+    return Provenance(
+        version=version("collocation-sysid"),
+        casadi=casadi.CasadiMeta.version(),
+        numpy=np.__version__,
+        python=platform.python_version(),
+        platform=platform.platform(),
+        problem_file=None if origin is None else str(origin.path),
+        problem_sha256=None if text is None else hashlib.sha256(text).hexdigest(),
+        mesh_sha256=tuple(body.mesh.sha256 for body in problem.bodies),
+    )
 
 
-def as_json(content: Any) -> str:
-    """Text of a result; JSON has no NaN and no infinity, null takes their place."""
-    return json.dumps(_finite(content), indent=1, allow_nan=False)
+def _value(finished: Answer, name: str) -> FoundValue:
+    estimate = finished.estimates[name]
+    item = next((each for each in finished.started_from.items if each.name == name), None)
+    errors = {} if finished.refinement is None else finished.refinement.errors
+    found = alike(
+        FoundValue,
+        estimate,
+        ci95_holds=() if estimate.ci95 is None else finished.interval_holds,
+        ci95_noise=finished.noise_estimates[name].ci95,
+        numerical_error=errors.get(name),
+        guess=None,
+        fixed=None,
+    )
+    if item is None:
+        return found
+    guess = np.nan if item.guess is None else item.guess
+    return replace(found, guess=guess, fixed=item.fixed or item.tied is not None)
 
 
-def _finite(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not np.isfinite(content) else content
-
-
-def _parameters(finished: Run) -> dict[str, Any]:
-    return {
-        item.name: {
-            "guess": item.guess,
-            "fixed": item.fixed or item.tied is not None,
-            **_with_errors(finished, item.name),
-        }
-        for item in finished.started_from.items
-    }
-
-
-def _with_errors(finished: Run, name: str) -> dict[str, Any]:
-    estimate, noise = finished.estimates[name], finished.noise_estimates[name].ci95
-    error = None if finished.refinement is None else finished.refinement.errors.get(name)
-    return {
-        "value": estimate.value,
-        "std_error": estimate.std_error,
-        "ci95": None if estimate.ci95 is None else list(estimate.ci95),
-        "ci95_holds": [] if estimate.ci95 is None else list(finished.interval_holds),
-        "ci95_noise": None if noise is None else list(noise),
-        "at_bound": estimate.at_bound,
-        "reason": estimate.reason,
-        "numerical_error": None if error is None else asdict(error),
-    }
-
-
-def _places(finished: Run) -> dict[str, dict[str, dict[str, Any]]]:
-    return {
-        experiment: {
-            name: {
-                "position_m": place.position_m.tolist(),
-                "std_error_m": None if place.std_error_m is None else place.std_error_m.tolist(),
-                "prior_m": place.prior_m,
-                "given": place.given,
-            }
-            for name, place in places.items()
-        }
-        for experiment, places in finished.places.items()
-    }
-
-
-def _nuisance(finished: Run) -> dict[str, dict[str, Any]]:
-    """Nuisance parameters but the places in their units, with the deviation of their prior."""
+def _nuisance(finished: Answer) -> dict[str, dict[str, FoundNuisance]]:
+    """Nuisance parameters but the places."""
     deviations = finished.uncertainty.nuisance if finished.uncertainty is not None else {}
     collocation = finished.solution.collocation
-    found = {}
+    found: dict[str, dict[str, FoundNuisance]] = {}
     for part in collocation.parts(finished.solution.z):
         for entry, name, value in part.segment.nuisance.valued(part.phi):
-            found.setdefault(part.segment.experiment.name, {})[entry.label] = {
-                "value": value,
-                "prior": entry.sigma,
-                "std_error": deviations[name] * entry.sigma if name in deviations else None,
-            }
+            error = deviations[name] * entry.sigma if name in deviations else None
+            here = found.setdefault(part.segment.experiment.name, {})
+            here[entry.label] = FoundNuisance(value, entry.sigma, error)
     return found
 
 
-def _scan(scan: Scan | None) -> dict[str, Any] | None:
-    if scan is None:
-        return None
-    return {
-        "reason": scan.reason,
-        "young_pa": scan.young_pa.tolist(),
-        "misfit": scan.misfit.tolist(),
-        "best": scan.best,
-        "samples": scan.samples,
-        "time_s": scan.time_s,
-        "sentence": scan.sentence,
-    }
-
-
-def _uncertainty(finished: Run) -> dict[str, Any] | None:
+def _uncertainty(finished: Answer) -> FoundUncertainty | None:
     found = finished.uncertainty
     if found is None:
         return None
-    return {
-        "noise": found.noise,
-        "errors": found.errors,
-        "reduced_chi_squared": found.reduced_chi_squared,
-        "noise_factors": found.level.factors,
-        "autocorrelation": found.dependence.lag1,
-        "names": list(found.names),
-        "correlation": found.correlation.tolist(),
-        "covariance": found.covariance.tolist(),
-        "quantiles": found.quantiles.tolist(),
-        "verdicts": list(verdicts(found)),
-        "recordings": _recordings(finished),
-        "profiles": {
-            profile.parameter: {
-                "interval": list(profile.interval),
-                "values": profile.values.tolist(),
-                "rises": (profile.losses - profile.losses.min()).tolist(),
-                "threshold": profile.threshold,
-                "sentence": profile.sentence,
-            }
+    return alike(
+        FoundUncertainty,
+        found,
+        noise_factors=found.level.factors,
+        autocorrelation=found.dependence.lag1,
+        verdicts=tuple(verdicts(found)),
+        recordings=_recordings(finished),
+        profiles={
+            profile.parameter: alike(
+                FoundProfile, profile, rises=profile.losses - profile.losses.min()
+            )
             for profile in finished.profiles
         },
-    }
+    )
 
 
-def _recordings(finished: Run) -> dict[str, Any] | None:
-    """What each recording says by itself of the parameters, to first order, and how they agree."""
+def _recordings(finished: Answer) -> dict[str, RecordingsAgreement] | None:
     found = finished.uncertainty
     if found is None or found.scatter is None:
         return None
-    scatter, free = found.scatter, finished.solution.collocation.parameters.free
-    q = finished.solution.q
-    return {
-        item.name: {
-            "values": {
-                name: item.value(float(q[k] + away)) if np.isfinite(away) else None
-                for name, away in zip(scatter.recordings, scatter.away[:, k], strict=True)
-            },
-            "deviations": dict(
-                zip(scatter.recordings, scatter.deviations[:, k].tolist(), strict=True)
-            ),
-            "chi_squared": float(scatter.chi_squared[k]),
-            "degrees_of_freedom": int(scatter.freedom[k]),
-            "disagree": bool(scatter.disagreeing[k]),
-        }
-        for k, item in enumerate(free)
-    }
+    scatter, q = found.scatter, finished.solution.q
+    agreements = {}
+    for k, item in enumerate(finished.solution.collocation.parameters.free):
+        away = q[k] + scatter.away[:, k]
+        values = [item.value(float(x)) if np.isfinite(x) else np.nan for x in away]
+        deviations = scatter.deviations[:, k].tolist()
+        agreements[item.name] = RecordingsAgreement(
+            dict(zip(scatter.recordings, values, strict=True)),
+            dict(zip(scatter.recordings, deviations, strict=True)),
+            float(scatter.chi_squared[k]),
+            int(scatter.freedom[k]),
+            bool(scatter.disagreeing[k]),
+        )
+    return agreements
 
 
-def _fit(solution: Solution) -> dict[str, Any]:
-    experiments = {}
+def _fit(finished: Answer) -> FoundFit:
+    solution, experiments = finished.solution, {}
     for segment in solution.collocation.segments:
         name, markers = segment.experiment.name, segment.experiment.markers
-        experiments[name] = {
-            "rms_m": solution.rms_by_experiment_m[name],
-            "samples": markers.samples,
-            "missing": int(markers.missing.sum()),
-        } | _wrench_rms(solution.wrench_rms.get(name))
-    return {"rms_m": solution.rms_m, **_wrench_rms(pooled_wrench_rms(solution))} | {
-        "experiments": experiments
-    }
+        experiments[name] = FittedExperiment(
+            solution.rms_by_experiment_m[name],
+            markers.samples,
+            int(markers.missing.sum()),
+            *solution.wrench_rms.get(name, ()),
+        )
+    pooled = pooled_wrench_rms(solution)
+    return FoundFit(solution.rms_m, finished.noise_rms_m, experiments, *pooled)
 
 
-def _wrench_rms(found: tuple[float | None, float | None] | None) -> dict[str, float]:
-    """Those that there are."""
-    named = zip(("wrench_rms_n", "wrench_rms_nm"), found or (None, None), strict=True)
-    return {name: value for name, value in named if value is not None}
-
-
-def _pooled_rms(finished: Run, rolled: Mapping[str, Rollout]) -> float | None:
-    if not rolled:
-        return None
-    counts = {e.name: e.markers.samples for e in finished.problem.experiments}
-    squares = sum(counts[name] * r.rms_m**2 for name, r in rolled.items())
-    return float(np.sqrt(squares / max(1, sum(counts[name] for name in rolled))))
+def _rollout(finished: Answer) -> FoundRollout:
+    fitted = {segment.experiment.name for segment in finished.solution.collocation.segments}
+    experiments, squares, counts, largest = {}, 0.0, 0, []
+    for experiment in finished.problem.experiments:
+        name, count = experiment.name, experiment.markers.samples
+        found = finished.rollouts[name]
+        if not isinstance(found, Rollout):
+            experiments[name] = SimulatedExperiment(name in fitted, failed=found)
+            continue
+        force, torque = found.wrench_rms
+        experiments[name] = alike(
+            SimulatedExperiment,
+            found,
+            fitted=name in fitted,
+            failed=None,
+            wrench_rms_n=force,
+            wrench_rms_nm=torque,
+        )
+        if name in fitted:
+            squares, counts = squares + count * found.rms_m**2, counts + count
+            largest.append(found.max_m)
+    if not largest:
+        return FoundRollout(None, None, experiments)
+    return FoundRollout(float(np.sqrt(squares / max(1, counts))), max(largest), experiments)

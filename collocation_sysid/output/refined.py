@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
 
 from ..earlier import Earlier
 from ..errors import InputError
-from ..files import RESULT_FILE, read_json, require_own, whole_file
+from ..files import RESULT_FILE, require_own, whole_file
 from ..problem import Problem
 from ..refine import refinement_of
-from ..statistics.estimates import Estimate
-from ..statistics.numerical import Refinement
-from ..statistics.trust import STEP_MOVES, Verdict, numerical_concerns
-from .record import REFINEMENT_FILE, as_json
+from ..result import FoundValue, Result
+from ..statistics.numerical import Level, Refinement
+from ..statistics.trust import NUMERICAL, Trust, numerical_concerns
+from ..tree import as_json, read
+from .record import REFINEMENT_FILE
 from .replay import reading_run
 
 
@@ -25,7 +25,7 @@ def refine_run(
     levels: int = 2,
     allow_code: bool = False,
     say: Callable[[str], None] | None = None,
-) -> tuple[Refinement, dict[str, Any]]:
+) -> tuple[Refinement, Result]:
     """Solve the problem of a run folder again at finer discretisations, and write what that tells.
 
     ``refinement.json`` holds the levels, and those that it holds already are not solved again; in
@@ -43,76 +43,56 @@ def refine_run(
     KeyboardInterrupt
         Where it was interrupted: the levels that were finished are in the folder.
     """
-    file = Path(folder) / RESULT_FILE
-    answer = Earlier.read(folder)
-    result = read_json(file, "a run folder")
-    with reading_run(file.parent):
-        problem_file = result["provenance"]["problem_file"]
-        if problem_file is None:
-            raise InputError("the run is of no problem file; use collocation_sysid.refine", file)
-        if not result["converged"]:
-            raise InputError("the run did not converge: there is no answer to refine", file)
-        home = Path(problem_file).parent
-        groups = [result[key] for key in ("parameters", "derived")]
-        estimates = {name: _estimate(each) for group in groups for name, each in group.items()}
-        before, substeps = _trust(result["trust"]), int(result["problem"]["substeps"])
-        known = _known_levels(file.parent, list(estimates))
-    problem = Problem.read(file.parent / "problem.toml", allow_code=allow_code, folder=home)
-    problem = replace(problem, substeps=substeps)
+    run, before = Path(folder), Result.read(folder)
+    file, beside = run / RESULT_FILE, run / REFINEMENT_FILE
+    home = before.home(file, "use collocation_sysid.refine")
+    if not before.converged:
+        raise InputError("the run did not converge: there is no answer to refine", file)
+    estimates = {name: each.by_noise for name, each in before.values.items()}
+    with reading_run(run):
+        known = _known_levels(beside, estimates)
+        answer = Earlier.of_result(before, run)
+    problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
+    problem = replace(problem, substeps=before.problem.substeps)
 
-    def keep(found: Refinement) -> None:
-        for group in groups:
-            for name in set(group) & set(found.errors):
-                error = found.errors[name]
-                group[name] |= {"numerical_error": asdict(error), "ci95": error.ci95}
-                group[name]["ci95_holds"] = [] if error.ci95 is None else list(found.holds)
-        result["trust"] = _judged(before, estimates, found)
-        with whole_file(file.parent / REFINEMENT_FILE) as beside, whole_file(file) as draft:
-            beside.write_text(as_json(found.as_dict()) + "\n", encoding="utf-8")
-            draft.write_text(as_json(result) + "\n", encoding="utf-8")
+    def keep(found: Refinement) -> Result:
+        after = refined(before, found)
+        with whole_file(beside) as levels, whole_file(file) as draft:
+            levels.write_text(as_json(found) + "\n", encoding="utf-8")
+            draft.write_text(as_json(after) + "\n", encoding="utf-8")
+        return after
 
     found = refinement_of(problem, answer, estimates, levels, say, known, keep)
-    keep(found)
-    return found, result
+    return found, keep(found)
 
 
-def _known_levels(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """The levels that an earlier call has finished."""
-    file = folder / REFINEMENT_FILE
-    if not file.is_file():
-        return []
-    require_own(file)
-    levels = json.loads(file.read_text(encoding="utf-8"))["levels"]
-    return [
-        {**each, "values": {name: float(each["values"][name]) for name in names}} for each in levels
-    ]
+def refined(before: Result, found: Refinement) -> Result:
+    """A result with what was measured of the numerical error in place of what was estimated."""
 
+    def allowing(values: Mapping[str, FoundValue]) -> dict[str, FoundValue]:
+        after = dict(values)
+        for name in values.keys() & found.errors.keys():
+            error = found.errors[name]
+            holds = () if error.ci95 is None else found.holds
+            after[name] = replace(
+                values[name], numerical_error=error, ci95=error.ci95, ci95_holds=holds
+            )
+        return after
 
-def _estimate(found: dict[str, Any]) -> Estimate:
-    interval = found["ci95_noise"]
-    return Estimate(
-        found["value"],
-        found["std_error"],
-        None if interval is None else (interval[0], interval[1]),
-        found["at_bound"],
-        found["reason"],
+    estimates = {name: each.by_noise for name, each in before.values.items()}
+    kept = [each for each in before.trust.concerns if each.code not in NUMERICAL]
+    return replace(
+        before,
+        parameters=allowing(before.parameters),
+        derived=allowing(before.derived),
+        trust=Trust.of((*kept, *numerical_concerns(estimates, found))),
     )
 
 
-def _trust(found: dict[str, Any]) -> dict[str, Any]:
-    verdict, reasons = found["verdict"], [str(reason) for reason in found["reasons"]]
-    if verdict not in get_args(Verdict):
-        raise ValueError(f"a verdict {verdict!r}")
-    return {"verdict": verdict, "reasons": reasons}
-
-
-def _judged(
-    trust: dict[str, Any], estimates: dict[str, Estimate], found: Refinement
-) -> dict[str, Any]:
-    """The verdict with what was measured in place of what was estimated."""
-    kept = [reason for reason in trust["reasons"] if not reason.startswith(STEP_MOVES)]
-    reasons = [*kept, *(said for said, _ in numerical_concerns(estimates, found))]
-    verdict = trust["verdict"]
-    if verdict != "doubtful":
-        verdict = "check" if reasons else "good"
-    return {"verdict": verdict, "reasons": reasons}
+def _known_levels(file: Path, names: Iterable[str]) -> list[Level]:
+    """The levels that an earlier call has finished."""
+    if not file.is_file():
+        return []
+    require_own(file)
+    levels = read(Refinement, json.loads(file.read_text(encoding="utf-8"))).levels
+    return [replace(each, values={name: each.values[name] for name in names}) for each in levels]

@@ -21,7 +21,8 @@ from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..fem.constants import bare, symbol_of
 from ..fem.quadratic import EDGES
-from ..files import RESULT_FILE, damage_refused, read_json, require_own
+from ..files import RESULT_FILE, damage_refused, require_own
+from ..result import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # Of the body, and so the same for all experiments of a run.
@@ -261,30 +262,33 @@ def _single(array: Array | None) -> NDArray[np.float32] | None:
     return None if array is None else array.astype(np.float32)
 
 
-def read_run(folder: str | Path) -> tuple[dict[str, Any], list[Replay]]:
+def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
     """Read the content of result.json, and all experiments, from a run folder.
+
+    The fitted experiments are first, then those for validation that could be simulated.
 
     Raises
     ------
     InputError
         If it is not a run folder, or one that is damaged.
     """
-    run = Path(folder)
-    result = read_json(run / RESULT_FILE, "a run folder")
+    run, result = Path(folder), Result.read(folder)
+    rolled = result.rollout.experiments
+    predicted = [n for n, r in rolled.items() if not r.fitted and r.failed is None]
     with reading_run(run):
         arrays = read_arrays(run)
-        return result, [Replay.from_arrays(name, arrays) for name in _experiments(result)]
+        names = [*result.fit.experiments, *predicted]
+        return result, [Replay.from_arrays(name, arrays) for name in names]
 
 
-def headline(result: Mapping[str, Any]) -> str:
+def headline(result: Result) -> str:
     """Young's moduli with their standard errors, and the verdict, in one line."""
-    found = {**result["derived"], **result["parameters"]}
-    moduli = {symbol_of(name): each for name, each in found.items() if bare(name) == "young_pa"}
+    moduli = {symbol_of(n): each for n, each in result.values.items() if bare(n) == "young_pa"}
     said = []
     for name, each in moduli.items():
-        bar = f" ± {float(format(each['std_error'], '.2g')):g}" if each["std_error"] else ""
-        said.append(f"{name} = {each['value']:.5g}{bar} Pa")
-    return "; ".join([*said, f"verdict: {result['trust']['verdict']}"])
+        bar = f" ± {float(format(each.std_error, '.2g')):g}" if each.std_error else ""
+        said.append(f"{name} = {each.value:.5g}{bar} Pa")
+    return "; ".join([*said, f"verdict: {result.trust.verdict}"])
 
 
 def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
@@ -309,10 +313,3 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
 def reading_run(run: Path) -> AbstractContextManager[None]:
     """Within this, whatever the files of a run make go wrong is a refusal of the run."""
     return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", "solve the problem again")
-
-
-def _experiments(result: Mapping[str, Any]) -> list[str]:
-    """Names of the fitted experiments, then of those for validation that could be simulated."""
-    rolled = result["rollout"]["experiments"]
-    only_predicted = [n for n, r in rolled.items() if not r["fitted"] and "failed" not in r]
-    return [*result["fit"]["experiments"], *only_predicted]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +26,6 @@ from .description import Comparison, doubts
 from .mistakes import gravity_mistakes
 from .work import against_the_load
 from .wrench_causes import wrench_causes
-
-if TYPE_CHECKING:
-    from ..run import Run
 
 # Residuals up to so many standard deviations are noise: they need no cause.
 NOISE = 1.15
@@ -56,12 +52,12 @@ class _Trial:
     experiment: Experiment
 
 
-def likely_causes(found: Run | Solution, budget: int | None = None) -> tuple[Cause, ...]:
+def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Cause, ...]:
     """What is likely described wrongly, likeliest first; empty where the residuals are noise.
 
     Parameters
     ----------
-    found : Run or Solution
+    solution : Solution
     budget : int, optional
         Sweeps over the recording's first samples that all refits together may take; by default
         three times the work of the fit, 150 at most.
@@ -71,7 +67,6 @@ def likely_causes(found: Run | Solution, budget: int | None = None) -> tuple[Cau
     tuple of Cause
         Their `strength` is the factor by which the misfit falls without the mistake.
     """
-    solution = found if isinstance(found, Solution) else found.solution
     fitted = [segment.experiment for segment in solution.collocation.segments]
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
     causes, worst = [], fitted[int(np.argmax(misfits))]

@@ -28,9 +28,8 @@ with the p-th power of their number.
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import ceil
-from typing import Any
 
 import numpy as np
 
@@ -73,6 +72,31 @@ class NumericalError:
     ci95: tuple[float, float] | None
 
 
+@dataclass(frozen=True)
+class Level:
+    """A finer answer.
+
+    Attributes
+    ----------
+    halved : {"step", "mesh"}
+    times : int
+        How often.
+    timesteps, nodes : int
+        Rows of the grid, and nodes of the bodies.
+    iterations : int
+    time_s : float
+    values : mapping of parameter or derived modulus to value
+    """
+
+    halved: str
+    times: int
+    timesteps: int
+    nodes: int
+    iterations: int
+    time_s: float
+    values: Mapping[str, float]
+
+
 @dataclass(frozen=True, eq=False)
 class Refinement:
     """What finer discretisations do to the estimates.
@@ -80,14 +104,13 @@ class Refinement:
     Attributes
     ----------
     errors : mapping of parameter or derived modulus to NumericalError
-    levels : tuple of dict
-        Of each finer answer what was halved ("step" or "mesh") and how often, grid rows and nodes,
-        iterations, seconds, and the values by name. Empty where the step's error was estimated
-        from a finer simulation, and nothing solved again.
+    levels : tuple of Level
+        Empty where the step's error was estimated from a finer simulation, and nothing solved
+        again.
     """
 
     errors: Mapping[str, NumericalError]
-    levels: tuple[dict[str, Any], ...] = ()
+    levels: tuple[Level, ...] = ()
 
     @property
     def holds(self) -> tuple[str, ...]:
@@ -110,13 +133,6 @@ class Refinement:
         """How many steps keep every move small, if these are of one; not more than the most."""
         many = self.worst(estimates)[1]
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
-
-    def as_dict(self) -> dict[str, Any]:
-        """For ``refinement.json``."""
-        return {
-            "errors": {name: asdict(error) for name, error in self.errors.items()},
-            "levels": list(self.levels),
-        }
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ class Place:
     std_error_m: Array | None
     prior_m: float
     given_m: Array | None
+    TOLD: ClassVar = ("given",)
 
     @property
     def given(self) -> bool:

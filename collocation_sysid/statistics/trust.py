@@ -1,22 +1,22 @@
 """One word on how far an answer can be trusted, with its reasons.
 
-Every function here looks at one thing and returns what gives concern, each a sentence and how
-strong it is. The levels are strict: of answers to faultless data at least 95 % are to be called
-good, however many markers and nuisance parameters there are.
+Every function here looks at one thing and returns what gives concern. The levels are strict: of
+answers to faultless data at least 95 % are to be called good, however many markers and nuisance
+parameters there are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from ..arrays import Array
-from ..errors import listed
 from ..nlp.stability import Instability
 from .cause import Cause
+from .concern import Concern, as_said, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import normal_isf
 from .estimates import Estimate
@@ -25,7 +25,6 @@ from .numerical import Refinement
 from .uncertainty import Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
-Concern = tuple[str, Literal["check", "doubtful"]]
 
 # A cause without which the misfit falls by more than this is as good as certain.
 CERTAIN = 2.0
@@ -54,50 +53,57 @@ PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
 E_FOLDINGS, GROSS_E_FOLDINGS = 1.0, 7.0
 # Standard errors that step and mesh may move a parameter: the half width of its interval.
 MOVED = 2.0
-# How what is said of the numerical error begins: estimated, and measured.
-STEP_MOVES = "the step moves", "step and mesh move"
+# What is said of the numerical error: estimated, and measured.
+NUMERICAL = "scheme/step", "mesh/refined"
 
 
 @dataclass(frozen=True)
 class Trust:
-    """A verdict and the sentences it rests on, the gravest first.
+    """What gives concern, the gravest first, and the verdict that this brings.
 
     Attributes
     ----------
-    verdict : {"good", "check", "doubtful"}
-        "good": nothing speaks against the answer and its error bars. "check": usable, after a
-        look at the reasons. "doubtful": something is wrong with data, model or solve.
-    reasons : tuple of str
+    concerns : tuple of Concern
         Empty if the verdict is good.
     """
 
-    verdict: Verdict
-    reasons: tuple[str, ...] = ()
+    concerns: tuple[Concern, ...] = ()
+    TOLD: ClassVar = ("verdict", "reasons")
 
     @classmethod
     def of(cls, concerns: Iterable[Concern]) -> Trust:
-        """The verdict that the gravest concern brings."""
-        found = tuple(concerns)
-        grave, light = (
-            [said for said, strength in found if strength == wanted]
-            for wanted in ("doubtful", "check")
-        )
-        verdict = "doubtful" if grave else "check" if light else "good"
-        return cls(verdict, tuple(dict.fromkeys((*grave, *light))))
+        """Each concern once, the gravest first."""
+        found = {concern.sentence: concern for concern in reversed([*concerns])}
+        gravest = sorted(reversed(found.values()), key=lambda each: each.grade == "check")
+        return cls(tuple(gravest))
+
+    @property
+    def verdict(self) -> Verdict:
+        """In one word how far the answer can be trusted.
+
+        "good": nothing speaks against the answer and its error bars. "check": usable, after a
+        look at the reasons. "doubtful": something is wrong with data, model or solve.
+        """
+        return self.concerns[0].grade if self.concerns else "good"
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The sentences that it rests on."""
+        return tuple(concern.sentence for concern in self.concerns)
 
     def joined(self, other: Trust) -> Trust:
         """The graver of two verdicts, with the reasons of both."""
-        gravity = get_args(Verdict).index
-        light, grave = sorted((other, self), key=lambda each: gravity(each.verdict))
-        return Trust(grave.verdict, tuple(dict.fromkeys((*grave.reasons, *light.reasons))))
+        light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
+        return Trust.of((*grave.concerns, *light.concerns))
 
 
 def cause_concerns(causes: Iterable[Cause]) -> list[Concern]:
     """What is likely described wrongly."""
-    return [
-        (f"likely: {each.sentence}", "doubtful" if each.strength > CERTAIN else "check")
-        for each in causes
-    ]
+    found: list[Concern] = []
+    for cause in causes:
+        data = {"cause": cause.cause, "strength": cause.strength, "said": cause.sentence}
+        found += concerned(True, cause.strength > CERTAIN, "description/cause", **data)
+    return found
 
 
 def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
@@ -108,40 +114,35 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     persistent = abs(found.lag1) > max(PERSISTENT, limit)
     shared = found.shared_p < RARE
     matters = uncertainty.errors == "autocorrelated" and (persistent or shared)
-    concerns: list[Concern] = [
-        (f"{each.series}: {each.said}", "check") for each in uncertainty.outliers
+    larger = factor > MISFIT and level.larger_p < RARE
+    # Of single samples nothing tells that it is noise.
+    no_noise = persistent or shared or not np.isfinite(found.lag1_deviation)
+    smaller = not larger and factor < 1 / MISFIT and level.smaller_p < RARE and not matters
+    stated = level.stated
+    return [
+        *as_said("residuals/outlier", (f"{o.series}: {o.said}" for o in uncertainty.outliers)),
+        *concerned(
+            matters and persistent,
+            found.lag1 > NO_NOISE and factor > MISFIT,
+            "residuals/persist",
+            autocorrelation=found.lag1,
+        ),
+        *concerned(matters and not persistent, False, "residuals/shared"),
+        *concerned(
+            larger, factor > GROSS_MISFIT and no_noise, "noise/larger", factor=factor, stated=stated
+        ),
+        *concerned(smaller, False, "noise/smaller", factor=1 / factor, stated=stated),
+        *_uneven_concerns(level),
+        *_scatter_concerns(uncertainty),
     ]
-    if matters and persistent:
-        concerns.append(
-            (
-                f"the residuals are not noise: they persist from sample to sample "
-                f"(autocorrelation {found.lag1:.2f})",
-                "doubtful" if found.lag1 > NO_NOISE and factor > MISFIT else "check",
-            )
-        )
-    elif matters:
-        concerns.append(("the residuals are not noise: markers or axes share them", "check"))
-    if factor > MISFIT and level.larger_p < RARE:
-        # Of single samples nothing tells that it is noise.
-        untested = not np.isfinite(found.lag1_deviation)
-        gross = factor > GROSS_MISFIT and (persistent or shared or untested)
-        said = f"the residuals are {factor:.2g} times as large as {level.stated} says"
-        concerns.append((said, "doubtful" if gross else "check"))
-    elif factor < 1 / MISFIT and level.smaller_p < RARE and not matters:
-        concerns.append(
-            (f"{level.stated} seems {1 / factor:.2g} times too large for these residuals", "check")
-        )
-    return concerns + _uneven_concerns(uncertainty.level) + _scatter_concerns(uncertainty)
 
 
 def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Recordings that disagree on what they share."""
     scatter = uncertainty.scatter
-    if scatter is None or not scatter.disagreeing.any():
-        return []
-    which = [uncertainty.names[k] for k in np.flatnonzero(scatter.disagreeing)]
-    said = f"the recordings disagree on {listed(which)}: model error decides, not noise"
-    return [(said, "check")]
+    disagreeing = [] if scatter is None else np.flatnonzero(scatter.disagreeing).tolist()
+    names = [uncertainty.names[k] for k in disagreeing]
+    return concerned(bool(names), False, "residuals/recordings", names=names)
 
 
 def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
@@ -153,9 +154,9 @@ def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
     if not noisy:
         return []
     worst = max(noisy, key=level.factors.__getitem__)
-    which = worst if len(noisy) == 1 else f"{len(noisy)} markers, most of all {worst},"
-    verb = "is" if len(noisy) == 1 else "are"
-    return [(f"{which} {verb} off by {level.factors[worst]:.2g} times sigma_m", "check")]
+    code = "noise/marker" if len(noisy) == 1 else "noise/markers"
+    data = {"marker": worst, "factor": level.factors[worst], "count": len(noisy)}
+    return [Concern(code, data=data)]
 
 
 def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
@@ -163,15 +164,12 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     estimates = {name: uncertainty.estimates[name] for name in uncertainty.names}
     bounded = [name for name, found in estimates.items() if found.at_bound]
     vague = [n for n, found in estimates.items() if not found.at_bound and found.std_error is None]
-    concerns: list[Concern] = []
-    if bounded:
-        ended = f"{listed(bounded)} ended at {'its bound' if len(bounded) == 1 else 'their bounds'}"
-        concerns.append((ended, "doubtful" if len(bounded) > 1 else "check"))
-    if vague:
-        none = len(vague) == len(estimates)
-        said = f"these data do not tell {listed(vague)}"
-        concerns.append((said, "doubtful" if none else "check"))
-    return concerns
+    several = len(bounded) > 1
+    code = "information/bounds" if several else "information/bound"
+    return [
+        *concerned(bool(bounded), several, code, names=bounded),
+        *concerned(bool(vague), len(vague) == len(estimates), "information/none", names=vague),
+    ]
 
 
 def numerical_concerns(
@@ -181,24 +179,17 @@ def numerical_concerns(
     worst, many = ("", 0.0) if refinement is None else refinement.worst(estimates)
     if refinement is None or many <= MOVED:
         return []
-    if refinement.levels:
-        what, remedy = STEP_MOVES[1], ""
-    else:
-        what, remedy = STEP_MOVES[0], "; raise transcription.substeps, or see what refine says"
     value = estimates[worst].value
-    share = (value - refinement.errors[worst].extrapolated) / abs(value)
-    said = f"{what} {worst} by {100 * share:+.2g} %, {many:.2g} standard errors"
-    return [(f"{said}: its interval allows for that{remedy}", "check")]
+    percent = 100 * (value - refinement.errors[worst].extrapolated) / abs(value)
+    code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
+    return [Concern(code, data={"name": worst, "percent": percent, "errors": many})]
 
 
 def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
     """Samples that Huber's loss takes for wild."""
     found = tuple(diagnoses)
-    wild, samples = sum(d.wild for d in found), max(1, sum(d.samples for d in found))
-    if wild <= WILD * samples:
-        return []
-    said = f"{100 * wild / samples:.0f} % of the samples are beyond Huber's threshold"
-    return [(said, "doubtful" if wild > HARDLY_TAME * samples else "check")]
+    share = sum(d.wild for d in found) / max(1, sum(d.samples for d in found))
+    return concerned(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
 
 
 def nuisance_concerns(
@@ -209,26 +200,24 @@ def nuisance_concerns(
     far = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
-        if not lowest + 1e-3 < phi < highest - 1e-3:
-            concerns.append((f"{name} ended at the largest value allowed", "doubtful"))
-        elif abs(phi) > far:
-            said = f"{name} is {abs(phi):.1f} deviations of its prior away from zero"
-            concerns.append((said, "doubtful" if abs(phi) > ABSURD else "check"))
+        away, limited = abs(float(phi)), not lowest + 1e-3 < phi < highest - 1e-3
+        concerns += concerned(limited, True, "nuisance/limit", name=name)
+        concerns += concerned(
+            away > far and not limited, away > ABSURD, "nuisance/far", name=name, deviations=away
+        )
     return concerns
 
 
 def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     """A time shift that is unusual for its prior, though it is estimated and allowed for."""
-    if abs(shift_s) <= LATE * prior_s:
-        return []
-    when = "later" if shift_s > 0 else "earlier"
-    return [
-        (
-            f"the markers of '{name}' were seen {1e3 * abs(shift_s):.2g} ms {when} than their "
-            "times say: the estimates allow for it; better find out why",
-            "check",
-        )
-    ]
+    return concerned(
+        abs(shift_s) > LATE * prior_s,
+        False,
+        "nuisance/clock",
+        experiment=name,
+        shift_ms=1e3 * abs(shift_s),
+        when="later" if shift_s > 0 else "earlier",
+    )
 
 
 def rollout_concerns(
@@ -240,46 +229,53 @@ def rollout_concerns(
         return []
     if not fitted:
         times = rms_m / yardstick_m
-        if times <= PREDICTION:
-            return []
-        said = f"'{name}' is predicted {times:.2g} times worse than the others are fitted"
-        return [(said, "doubtful" if times > GROSS_PREDICTION else "check")]
-    missed_m = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2)))
-    if missed_m <= ROLLOUT * yardstick_m:
-        return []
-    said = (
-        f"the roll-out of '{name}' misses by {1e3 * rms_m:.2g} mm, the fit by "
-        f"{1e3 * fit_rms_m:.2g} mm"
+        gross = times > GROSS_PREDICTION
+        return concerned(
+            times > PREDICTION, gross, "roll-out/predicted", experiment=name, times=times
+        )
+    missed = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2))) / yardstick_m
+    return concerned(
+        missed > ROLLOUT,
+        missed > GROSS_ROLLOUT,
+        "roll-out/misses",
+        experiment=name,
+        rms_mm=1e3 * rms_m,
+        fit_mm=1e3 * fit_rms_m,
     )
-    return [(said, "doubtful" if missed_m > GROSS_ROLLOUT * yardstick_m else "check")]
 
 
 def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
     """States of the answer in which disturbances grow."""
-    return [
-        (each.sentence, "doubtful" if each.e_foldings > GROSS_E_FOLDINGS else "check")
-        for each in found
-        if each.e_foldings > E_FOLDINGS
-    ]
+    concerns: list[Concern] = []
+    for each in found:
+        powers = each.e_foldings
+        concerns += concerned(
+            powers > E_FOLDINGS, powers > GROSS_E_FOLDINGS, "stability/grows", said=each.sentence
+        )
+    return concerns
 
 
 def scheme_concerns(
     name: str, damping_ratio: float, added_ratio: float, period_error: float
 ) -> list[Concern]:
     """What the scheme does to the first mode of an experiment, with the answer's parameters."""
-    concerns: list[Concern] = []
-    if added_ratio > max(DAMPING_SHARE * damping_ratio, LITTLE_DAMPING):
-        gross = added_ratio > GROSS_DAMPING_SHARE * damping_ratio
-        said = (
-            f"the scheme adds a damping ratio of {added_ratio:.2g} to the {damping_ratio:.2g} of "
-            f"the first mode of '{name}'"
-        )
-        concerns.append((said, "doubtful" if gross else "check"))
-    if abs(period_error) > PERIOD_ERROR:
-        said = f"the scheme changes the first period of '{name}' by {period_error:+.1%}"
-        gross = abs(period_error) > GROSS_PERIOD_ERROR
-        concerns.append((said, "doubtful" if gross else "check"))
-    return concerns
+    return [
+        *concerned(
+            added_ratio > max(DAMPING_SHARE * damping_ratio, LITTLE_DAMPING),
+            added_ratio > GROSS_DAMPING_SHARE * damping_ratio,
+            "scheme/damping",
+            experiment=name,
+            added=added_ratio,
+            damping=damping_ratio,
+        ),
+        *concerned(
+            abs(period_error) > PERIOD_ERROR,
+            abs(period_error) > GROSS_PERIOD_ERROR,
+            "scheme/period",
+            experiment=name,
+            change=period_error,
+        ),
+    ]
 
 
 def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:

@@ -20,7 +20,7 @@ from ..methods.solution import Solution, pooled_wrench_rms
 from ..nlp.simulation import with_markers
 from ..problem import Problem, RolloutOptions
 from ..rollout import Rollout, roll_out
-from ..run import solve
+from ..solving import solve
 from ..statistics.evidence import evidence_of
 from ..statistics.linearised import Derived, linearised_fit
 

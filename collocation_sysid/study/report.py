@@ -12,7 +12,7 @@ from typing import Any
 
 from ..fem.constants import symbol_of, unit_of
 from ..files import SCHEMA, whole_file, write_whole
-from ..output.record import as_json
+from ..tree import as_json
 from .choice import advice, model_notes, model_rows, shown_in
 from .plan import PlannedRun, short_keys
 from .plots import comparison_plots, sweep_plots

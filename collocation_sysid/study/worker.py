@@ -19,11 +19,12 @@ import numpy as np
 from ..errors import InputError, SimulationError
 from ..experiment.grasp import held_nodes
 from ..files import write_whole
-from ..output.record import as_json, result
+from ..output.record import result
 from ..problem import Problem
 from ..rollout import Rollout
 from ..run import Run, run
 from ..starting import heed_interrupts, leave
+from ..tree import as_json
 from .prediction import model_record
 from .store import ERROR, FINISHED
 

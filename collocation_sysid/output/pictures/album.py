@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from ...arrays import Array
 from ...files import safe_name, whole_file
 from ...methods.solution import Iteration
+from ...result import Result
 from ..replay import Replay
 from ..style import RESOLUTION_DPI
 from .confidence import Confidence, confidence_ellipses, correlation_matrix
@@ -27,12 +27,7 @@ from .wrench import wrench_picture
 
 
 def album(
-    replays: Sequence[Replay],
-    history: Sequence[Iteration],
-    names: Sequence[str],
-    confidence: Confidence | None = None,
-    truth: Mapping[str, float] | None = None,
-    scan: Mapping[str, Any] | None = None,
+    replays: Sequence[Replay], found: Result, truth: Mapping[str, float] | None = None
 ) -> dict[str, Figure]:
     """All pictures of a run but that of its Jacobian, by file name.
 
@@ -40,19 +35,16 @@ def album(
     ----------
     replays : sequence of Replay
         The experiments; the mesh is drawn with grasps and markers of the first.
-    history : sequence of Iteration
-    names : sequence of str
-        Estimated parameters.
-    confidence : Confidence, optional
+    found : Result
     truth : mapping, optional
         See `convergence`.
-    scan : mapping, optional
-        What result.json says of the scan of the stiffness.
     """
+    history = [Iteration(*vars(line).values()) for line in found.history]
+    names = [name for name, item in found.parameters.items() if not item.fixed]
     pictures = {"convergence": convergence(history, names, truth)} if history else {}
-    if scan is not None:
-        curve = np.array(scan["young_pa"]), np.array(scan["misfit"], dtype=float)
-        pictures["scan"] = scan_picture(*curve, scan["best"])
+    if (scan := found.scan) is not None:
+        pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
+    confidence = Confidence.of(found)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,8 +12,8 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
 from ...arrays import Array
+from ...result import Result
 from ...statistics.estimates import correlation_of
-from ...statistics.uncertainty import Uncertainty
 from ..style import (
     BLACK,
     BLUE,
@@ -54,36 +53,18 @@ class Confidence:
     quantiles: Array
 
     @classmethod
-    def of(cls, uncertainty: Uncertainty) -> Confidence:
-        """Gather what is determined; parameters at a bound have no uncertainty."""
-        values = [uncertainty.estimates[name].value for name in uncertainty.names]
-        return _determined(uncertainty.names, values, uncertainty.covariance, uncertainty.quantiles)
+    def of(cls, result: Result) -> Confidence | None:
+        """Gather what is determined: what is at a bound has no uncertainty.
 
-    @classmethod
-    def from_result(cls, result: Mapping[str, Any]) -> Confidence | None:
-        """The same from the content of result.json; None where it has no error bars."""
-        found = result["uncertainty"]
-        if found is None:
+        None where there are no error bars.
+        """
+        if (found := result.uncertainty) is None:
             return None
-        values = [result["parameters"][name]["value"] for name in found["names"]]
-        return _determined(
-            found["names"],
-            values,
-            np.array(found["covariance"], dtype=float),
-            np.array(found["quantiles"], dtype=float),
-        )
-
-
-def _determined(
-    names: Sequence[str], values: Sequence[float], covariance: Array, quantiles: Array
-) -> Confidence:
-    kept = np.flatnonzero(np.isfinite(np.diag(covariance)) & np.isfinite(quantiles)).tolist()
-    return Confidence(
-        [names[k] for k in kept],
-        np.array(values, dtype=float)[kept],
-        covariance[np.ix_(kept, kept)],
-        np.asarray(quantiles, dtype=float)[kept],
-    )
+        known = np.isfinite(np.diag(found.covariance)) & np.isfinite(found.quantiles)
+        kept = np.flatnonzero(known).tolist()
+        names = [found.names[k] for k in kept]
+        values = np.array([result.parameters[name].value for name in names])
+        return cls(names, values, found.covariance[np.ix_(kept, kept)], found.quantiles[kept])
 
 
 def ellipse(found: Confidence, i: int, j: int, points: int = 181) -> Array:

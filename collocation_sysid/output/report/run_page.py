@@ -9,8 +9,11 @@ import numpy as np
 
 from ...experiment.nuisance import in_unit_for_people
 from ...fem.constants import symbol_of, unit_of
-from ...files import RESULT_FILE, is_own, read_json
-from ..remedies import remedies_for, remedy_for
+from ...files import is_own
+from ...result import Result
+from ...statistics.places import Place
+from ...tree import content
+from ..remedies import remedies_for
 from ..replay import LARGEST, read_arrays, reading_run
 from .page import millimetres, number, own_pictures, picture, rendered
 
@@ -49,16 +52,15 @@ def run_page(run: str | Path) -> str:
         If it is not a run folder, or damaged.
     """
     run = Path(run)
-    result = read_json(run / RESULT_FILE, "a run folder")
+    result = Result.read(run)
     with reading_run(run):
         parameters = _parameters(result)
         return rendered(
             "run.html",
             result=result,
-            trust=result["trust"],
-            meaning=MEANINGS[result["trust"]["verdict"]],
-            reasons=[(reason, remedy_for(reason)) for reason in result["trust"]["reasons"]],
-            remedies=remedies_for(result["trust"]["reasons"]),
+            trust=result.trust,
+            meaning=MEANINGS[result.trust.verdict],
+            remedies=remedies_for(result.trust.concerns),
             numbers=_numbers(result),
             verdict=verdict(result),
             notes=_notes(result),
@@ -69,71 +71,70 @@ def run_page(run: str | Path) -> str:
             worst=_worst_errors(run),
             pictures=_pictures(run),
             problem=_problem(run),
+            size=content(result.problem),
+            provenance=content(result.provenance),
         )
 
 
-def verdict(result: dict[str, Any]) -> list[str]:
+def verdict(result: Result) -> list[str]:
     """The run in a few sentences."""
-    said = [result["message"]]
-    if result["converged"]:
+    said = [result.message]
+    if result.converged:
         said += _weakest(result)
-    fit, rolled = result["fit"], result["rollout"]
-    sentence = f"The fitted markers are {millimetres(fit['rms_m'])} off (RMS)"
-    if rolled["rms_m"] is not None:
+    fit, rolled = result.fit, result.rollout
+    sentence = f"The fitted markers are {millimetres(fit.rms_m)} off (RMS)"
+    if rolled.rms_m is not None:
         sentence += (
-            f"; the roll-out misses by {millimetres(rolled['rms_m'])}, at most "
-            f"{millimetres(rolled['max_m'])}"
+            f"; the roll-out misses by {millimetres(rolled.rms_m)}, at most "
+            f"{millimetres(rolled.max_m)}"
         )
     said.append(f"{sentence}.")
-    for name, experiment in rolled["experiments"].items():
-        if "failed" in experiment:
-            said.append(f"The roll-out of '{name}' failed: {experiment['failed']}.")
-        elif not experiment["fitted"]:
-            said.append(
-                f"'{name}' was predicted, not fitted: {millimetres(experiment['rms_m'])} RMS."
-            )
+    for name, found in rolled.experiments.items():
+        if found.failed is not None:
+            said.append(f"The roll-out of '{name}' failed: {found.failed}.")
+        elif not found.fitted:
+            said.append(f"'{name}' was predicted, not fitted: {millimetres(found.rms_m)} RMS.")
     return said
 
 
-def _numbers(result: dict[str, Any]) -> list[dict[str, str]]:
+def _numbers(result: Result) -> list[dict[str, str]]:
     """The three numbers that matter: stiffness, misfit, and how well the answer repeats it."""
-    found = {**result["parameters"], **result["derived"]}
+    found = result.values
     name = next((key for key in FOREMOST if key in found), next(iter(found)))
-    low, high = found[name].get("ci95") or (None, None)
+    low, high = found[name].ci95 or (None, None)
     interval = "no error bar" if low is None else f"{number(low, 4)} to {number(high, 4)} (95 %)"
-    fit, rolled = result["fit"], result["rollout"]
+    fit, rolled = result.fit, result.rollout
     return [
         {
             "what": symbol_of(name),
-            "value": f"{number(found[name]['value'], 4)} {unit_of(name)}".strip(),
+            "value": f"{number(found[name].value, 4)} {unit_of(name)}".strip(),
             "beside": interval,
         },
         {
             "what": "markers, fitted",
-            "value": millimetres(fit["rms_m"]),
-            "beside": f"RMS; noise alone leaves {millimetres(fit['noise_rms_m'])}",
+            "value": millimetres(fit.rms_m),
+            "beside": f"RMS; noise alone leaves {millimetres(fit.noise_rms_m)}",
         },
         {
             "what": "markers, re-simulated",
-            "value": millimetres(rolled["rms_m"]),
-            "beside": f"RMS; {millimetres(rolled['max_m'])} at most",
+            "value": millimetres(rolled.rms_m),
+            "beside": f"RMS; {millimetres(rolled.max_m)} at most",
         },
     ]
 
 
-def _notes(result: dict[str, Any]) -> list[str]:
+def _notes(result: Result) -> list[str]:
     """Notes that the page does not hold elsewhere."""
-    found = result["uncertainty"]
-    profiles = found["profiles"].values() if found else ()
-    said = {*(found["verdicts"] if found else ()), *(p["sentence"] for p in profiles)}
-    return [note for note in result["notes"] if note not in said]
+    found = result.uncertainty
+    said = {*found.verdicts, *(p.sentence for p in found.profiles.values())} if found else ()
+    return [note for note in result.notes if note not in said]
 
 
-def _weakest(result: dict[str, Any]) -> list[str]:
-    free = {name: p for name, p in result["parameters"].items() if not p["fixed"]}
-    unknown = [symbol_of(name) for name, p in free.items() if p["std_error"] is None]
+def _weakest(result: Result) -> list[str]:
+    free = {name: p for name, p in result.parameters.items() if not p.fixed}
+    unknown = [symbol_of(name) for name, p in free.items() if p.std_error is None]
     said = [f"No error bar for {', '.join(unknown)}: see the notes."] if unknown else []
-    known = {name: p["std_error"] / p["value"] for name, p in free.items() if p["std_error"]}
+    known = {name: p.std_error / p.value for name, p in free.items() if p.std_error}
     if known:
         name = max(known, key=lambda key: known[key])
         how = "weakly" if known[name] > 0.1 else "least well, but well"
@@ -141,69 +142,63 @@ def _weakest(result: dict[str, Any]) -> list[str]:
     return said
 
 
-def _parameters(result: dict[str, Any]) -> list[dict[str, Any]]:
+def _parameters(result: Result) -> list[dict[str, Any]]:
     rows = []
-    for group in ("parameters", "derived"):
-        for name, found in result[group].items():
-            symbol, unit = symbol_of(name), unit_of(name)
-            low, high = found.get("ci95") or (None, None)
-            rows.append(
-                {
-                    "symbol": symbol,
-                    "unit": unit,
-                    "value": found["value"],
-                    "std_error": found.get("std_error"),
-                    "low": low,
-                    "high": high,
-                    "reason": "fixed" if found.get("fixed") else found.get("reason"),
-                    "guess": found.get("guess"),
-                    "derived": group == "derived",
-                    "numerical": _numerical(found.get("numerical_error")),
-                    "holds": found.get("ci95_holds") or [],
-                }
-            )
+    for name, found in result.values.items():
+        low, high = found.ci95 or (None, None)
+        rows.append(
+            {
+                "symbol": symbol_of(name),
+                "unit": unit_of(name),
+                "value": found.value,
+                "std_error": found.std_error,
+                "low": low,
+                "high": high,
+                "reason": "fixed" if found.fixed else found.reason,
+                "guess": found.guess,
+                "derived": found.fixed is None,
+                "numerical": found.numerical_error,
+                "holds": found.ci95_holds,
+            }
+        )
     return rows
 
 
-def _numerical(found: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The numerical error, with gaps for what was not measured."""
-    keys = ("step", "step_order", "mesh", "mesh_order", "extrapolated")
-    return None if found is None else {key: found.get(key) for key in keys}
-
-
-def _places(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+def _places(result: Result) -> dict[str, list[dict[str, Any]]]:
     """By experiment the places of the markers in millimetres."""
     return {
         experiment: [
             {
                 "marker": marker,
                 "coordinates": _coordinates(place),
-                "prior": "exact" if place["prior_m"] == 0 else _size(place["prior_m"], "m"),
-                "given": place["given"],
+                "prior": "exact" if place.prior_m == 0 else _size(place.prior_m, "m"),
+                "given": place.given,
             }
             for marker, place in places.items()
         ]
-        for experiment, places in result["places"].items()
+        for experiment, places in result.places.items()
     }
 
 
-def _coordinates(place: dict[str, Any]) -> list[tuple[str, str]]:
+def _coordinates(place: Place) -> list[tuple[str, str]]:
     """Each coordinate with its error, in millimetres."""
-    errors_m = place["std_error_m"] or [None] * 3
+    errors_m = [None] * 3 if place.std_error_m is None else place.std_error_m
     return [
         (f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2))
-        for x, error in zip(place["position_m"], errors_m, strict=True)
+        for x, error in zip(place.position_m, errors_m, strict=True)
     ]
 
 
-def _nuisance(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+def _nuisance(result: Result) -> dict[str, list[dict[str, Any]]]:
     """By experiment its other nuisance parameters in units for people."""
     tables = {}
-    for experiment, named in result["nuisance"].items():
+    for experiment, named in result.nuisance.items():
         tables[experiment] = []
         for label, found in named.items():
             words, _, unit = label.rstrip("]").rpartition(" [")
-            cells = {key: _size(found[key], unit) for key in ("value", "std_error", "prior")}
+            cells = {
+                key: _size(getattr(found, key), unit) for key in ("value", "std_error", "prior")
+            }
             tables[experiment].append({"label": words, **cells})
     return tables
 

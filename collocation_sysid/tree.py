@@ -1,0 +1,106 @@
+"""Results as files hold them: dataclasses to JSON, and back.
+
+A dataclass is an object of its fields, and of the properties that its class names as ``TOLD``;
+arrays are lists. JSON has no NaN and no infinity: null takes their place, and is NaN again where a
+number is read.
+"""
+
+from __future__ import annotations
+
+import json
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, field, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from math import isfinite, nan
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+T = TypeVar("T")
+
+
+def optional() -> Any:
+    """A field that is left out where it is None; all others are always there."""
+    return field(default=None, metadata={"optional": True})
+
+
+def content(value: Any) -> Any:
+    """What JSON has of a value."""
+    if is_dataclass(value) and not isinstance(value, type):
+        own = {f.name: getattr(value, f.name) for f in fields(value)}
+        own |= {name: getattr(value, name) for name in getattr(value, "TOLD", ())}
+        left_out = {f.name for f in fields(value) if _is_optional(f) and own[f.name] is None}
+        return {name: content(each) for name, each in own.items() if name not in left_out}
+    if isinstance(value, Mapping):
+        return {key: content(each) for key, each in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return content(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [content(each) for each in value]
+    if isinstance(value, Enum):
+        return content(value.value)
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+def as_json(value: Any) -> str:
+    """Text of a result."""
+    return json.dumps(content(value), indent=1, allow_nan=False)
+
+
+def alike(kind: type[T], of: Any, **others: Any) -> T:
+    """A dataclass with the attributes of something that has those of its names, and `others`."""
+    names = (f.name for f in fields(kind) if f.name not in others)  # type: ignore[arg-type]
+    return kind(**{name: getattr(of, name) for name in names}, **others)
+
+
+def read(kind: Any, found: Any) -> Any:
+    """A value of a type from what JSON has of it.
+
+    Parameters
+    ----------
+    kind : type
+        A dataclass, or what annotates a field: numbers, texts, tuples, mappings, arrays.
+    found : object
+        What `json` made of a file.
+
+    Raises
+    ------
+    TypeError, KeyError, ValueError
+        Where it is of another kind.
+    """
+    if is_dataclass(kind):
+        hints = _hints(kind)
+        there = (f for f in fields(kind) if not _is_optional(f) or f.name in found)
+        return kind(**{f.name: read(hints[f.name], found[f.name]) for f in there})  # type: ignore
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        (some,) = (each for each in inner if each is not type(None))
+        return None if found is None else read(some, found)
+    if origin is np.ndarray:
+        return np.array(found, dtype=float)
+    if origin is tuple:
+        kinds = [inner[0]] * len(found) if inner[-1] is ... else inner
+        return tuple(read(one, each) for one, each in zip(kinds, found, strict=True))
+    if origin in (dict, Mapping):
+        return {key: read(inner[1], each) for key, each in found.items()}
+    if origin is Sequence:
+        return [read(inner[0], each) for each in found]
+    wrong = origin is Literal and found not in inner
+    wrong |= kind in (str, bool, int) and type(found) is not kind
+    if kind is float:
+        found = nan if found is None else found
+        wrong = type(found) not in (int, float) or abs(found) == float("inf")
+    if wrong:
+        raise TypeError(f"found {str(found)[:40]!r}; expected {kind}")
+    return float(found) if kind is float else found
+
+
+def _is_optional(field: Field[Any]) -> bool:
+    return "optional" in field.metadata
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)

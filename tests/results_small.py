@@ -1,0 +1,88 @@
+"""A whole `Result` without a solve, for what is made of results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from collocation_sysid.files import SCHEMA
+from collocation_sysid.methods.solution import Iteration, Timing
+from collocation_sysid.result import (
+    FoundDynamics,
+    FoundFit,
+    FoundRollout,
+    FoundUncertainty,
+    FoundValue,
+    HistoryLine,
+    ProgramSize,
+    Provenance,
+    Result,
+)
+from collocation_sysid.statistics.trust import Trust
+
+FIT = FoundFit(1e-3, 1e-3, {})
+ROLLOUT = FoundRollout(0.8e-3, 2e-3, {})
+
+
+def value(number: float = 100.0, std_error: float | None = 1.0) -> FoundValue:
+    interval = None if std_error is None else (number - 2 * std_error, number + 2 * std_error)
+    return FoundValue(number, std_error, interval, guess=number, fixed=False)
+
+
+def lines(history: Sequence[Iteration]) -> tuple[HistoryLine, ...]:
+    return tuple(HistoryLine(*vars(line).values()) for line in history)
+
+
+def uncertainty(names: Sequence[str], covariance: np.ndarray) -> FoundUncertainty:
+    scale = np.sqrt(np.diag(covariance))
+    quantiles = np.full(len(names), 1.96)
+    correlation = covariance / np.outer(scale, scale)
+    return FoundUncertainty(
+        noise="given",
+        errors="independent",
+        reduced_chi_squared=1.0,
+        noise_factors={},
+        autocorrelation=0.0,
+        names=tuple(names),
+        correlation=correlation,
+        covariance=covariance,
+        quantiles=quantiles,
+        verdicts=(),
+        recordings=None,
+        profiles={},
+    )
+
+
+def a_result(parameters: Mapping[str, FoundValue] | None = None, **changes: Any) -> Result:
+    """A converged run of these parameters, with other entries as they are given."""
+    whole = Result(
+        schema=SCHEMA,
+        status="converged",
+        converged=True,
+        message="Converged.",
+        missing="",
+        trust=Trust(()),
+        method="reduced-space",
+        title="small",
+        parameters={"lambda_pa": value()} if parameters is None else parameters,
+        derived={},
+        places={},
+        nuisance={},
+        uncertainty=None,
+        scan=None,
+        fit=FIT,
+        residuals=(),
+        dynamics=FoundDynamics(1e-9, 1e-8, ()),
+        rollout=ROLLOUT,
+        iterations=5,
+        evaluations=5,
+        timing_s=Timing(0.1, 0.2, 0.3, 0.6),
+        problem=ProgramSize(8, 6, 1, 10, 240, 200, "midpoint"),
+        notes=(),
+        history=(),
+        provenance=Provenance("0", "3", "2", "3", "here", None, None, ()),
+    )
+    return replace(whole, **changes)
