@@ -26,7 +26,7 @@ from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.rest import start_state
 from ..nlp.row import Row
-from ..nlp.tangent import Forward, GivenMotion, Memory, Step
+from ..nlp.tangent import Columns, Forward, GivenMotion, Memory, Step
 from .model import TOGETHER, Model, Poses
 
 # A row's correction over the body's size: the next one would be its square. Where rows are solved
@@ -85,7 +85,7 @@ class State:
         Rows done, and the place of the next one in the template.
     x, force : (rows, 3n) of the template
     given : (rows, g, 1 + m) of grasped dofs
-    memory : Memory
+    memory : Memory, None at first
     read : tuple of rows with their markers, latest last
     """
 
@@ -94,19 +94,8 @@ class State:
     x: Array
     force: Array
     given: Array
-    memory: Memory
+    memory: Memory | None
     read: tuple[Read, ...]
-
-
-class Linear(NamedTuple):
-    """Rows from one on at their guesses: the sides of their equations (k, …, 1 + m)."""
-
-    first: int
-    at: Linearisation
-    nu: Array
-    right: Array
-    force: Array
-    given: GivenMotion | None
 
 
 class Sweep:
@@ -149,7 +138,7 @@ class Sweep:
         self.clock = self._weights_in_time()
         self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
-        self.shape = len(self.solver.free), 1 + len(self.moving)
+        self.count = 1 + len(self.moving)
         self.mass_kg = self.dynamics.mass.row(0, self.setting.theta)
         # Loads are always there: what acts on one row acts on every one.
         still = self.dynamics.forces is segment.dynamics.forces
@@ -162,17 +151,16 @@ class Sweep:
     # State ------------------------------------------------------------------------------------
 
     def _begin(self) -> State:
-        rows, dofs, shape = self.model.rows, self.segment.dofs, self.shape
-        empty, given = np.zeros((rows, dofs)), np.zeros((rows, len(self.grasped), shape[1]))
-        memory = Forward(self.solver, self.setting, shape).memory
-        return State(0, 0, empty, empty, given, memory, ())
+        rows, dofs = self.model.rows, self.segment.dofs
+        empty, given = np.zeros((rows, dofs)), np.zeros((rows, len(self.grasped), self.count))
+        return State(0, 0, empty, empty, given, None, ())
 
     def _moved(self, state: State, at: Array) -> State:
-        if (at == self.p).all():
+        if state.memory is None or (at == self.p).all():
             return state
         moving, flat = self.moving, self.model.flat(at)
         was, way = self.model.rates(flat), (self.flat - flat)[moving]
-        step, grown = way / was[moving], np.ones(self.shape[1])
+        step, grown = way / was[moving], np.ones(self.count)
         grown[1:] = (self.rates / was)[moving]
         force, memory, last = state.force.copy(), state.memory, state.end - 1
         for k, columns in enumerate(memory.increments[: last + 1]):
@@ -183,7 +171,7 @@ class Sweep:
         )
         memory = replace(memory, solutions=solutions, increments=increments)
         kept = [each for each, _ in state.read]
-        whole = np.empty((len(kept), self.segment.dofs, self.shape[1]))
+        whole = np.empty((len(kept), self.segment.dofs, self.count))
         whole[..., 1:] = [each.columns for each in kept]
         whole[..., 0] = whole[..., 1:] @ way + [each.x for each in kept]
         x, known = state.x.copy(), min(len(kept), state.end)
@@ -197,7 +185,11 @@ class Sweep:
     def _resume(self, state: State) -> None:
         self.row, self.end = state.row, state.end
         self.x, self.force, self.given = state.x.copy(), state.force.copy(), state.given.copy()
-        self.forward = Forward(self.solver, self.setting, self.shape, state.memory)
+        grasped = None
+        if self.segment.nuisance.moves_grasps:
+            grasped = GivenMotion.along(self.solver, self.grasped, self.given)
+        self.columns = Columns(self.setting, self.count, step=True, grasped=grasped)
+        self.forward = Forward(self.solver, self.columns, state.memory)
         most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
         self.read: deque[Read] = deque(state.read, maxlen=most)
 
@@ -230,29 +222,23 @@ class Sweep:
         self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
         if first < self.dynamics.first_row:
             self.x[first] = self._start(poses[0])
-            nothing = np.zeros((1, *self.shape))
-            self._correct(range(first, first + 1), nothing, nothing)
-            return self._kept(nothing)
+            self._done(1)
+            return self._kept([np.zeros(self.forward.shape)])
         for k, t in enumerate(range(first, first + count)):
             self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
             self.x[t, self.grasped] = goals[k]
         here, found, last, careful = range(first, first + count), [], np.inf, False
         while here:
             limit = LAST_STEP * self.model.size_m * (1 if len(here) == 1 else ROUGH)
-            before = self.forward.memory
-            columns, increments = self._columns(here, self._linearised(here))
-            lengths = np.abs(columns[..., 0]).max(axis=1, initial=0.0)
-            short = lengths <= limit
-            good = len(here) if short.all() else int(short.argmin())
-            self.longest_m = float(lengths[:good].max(initial=self.longest_m))
-            self._correct(here[:good], columns[:good], increments[:good])
-            found += list(columns[:good])
-            if good == len(here):
+            rows, length = self._advanced(here, limit)
+            good = len(here) if length is None else len(rows) - 1
+            found += rows[:good]
+            self._done(good)
+            if length is None:
                 break
-            t, length = here[good], lengths[good]
-            self.forward = self._continued(before, columns[:good], increments[:good])
+            t = here[good]
             if length < last / 2:
-                self.x[t, self.solver.free] += columns[good, :, 0]
+                self.x[t] += rows[good][:, 0]
                 last = length
             elif not careful:
                 self.x[t], careful, last = self._carefully(t, poses[t - first]), True, np.inf
@@ -261,14 +247,9 @@ class Sweep:
             here = range(t, t + 1)
         return self._kept(found)
 
-    def _continued(self, before: Memory, columns: Array, increments: Array) -> Forward:
-        """What goes on after rows that are done, and those before."""
-        solutions, forces = (
-            (*list(new)[::-1], *old)[: len(old)]
-            for new, old in ((columns, before.solutions), (increments, before.increments))
-        )
-        memory = replace(before, solutions=solutions, increments=forces)
-        return Forward(self.solver, self.setting, self.shape, memory)
+    def _done(self, count: int) -> None:
+        """Be done with so many rows."""
+        self.row, self.end = self.row + count, self.end + count
 
     def _make_room(self, count: int) -> int:
         surplus = self.end + count - self.model.rows
@@ -290,71 +271,57 @@ class Sweep:
         experiment = self.model.at_start(poses, self.phi)
         return start_state(experiment, self.setting.theta, self.model.newton)[0]
 
-    def _linearised(self, here: range) -> Linear:
-        """Of rows where they are guessed to be, on from the rows before as they are."""
+    def _linearised(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
+        """Rows where they are guessed to be, on from the rows before as they are."""
         for past in (*self.forward.past, *self.forward.past_increments):
             past[:, 0] = 0.0
         theta, rows, known = self.setting.theta, slice(here.start, here.stop), slice(here.stop)
         p, q, w, s = (table[rows, known] for table in self.model.stencils)
-        x, force = self.x[known], self.force[known]
+        x, force, free = self.x[known], self.force[known], self.solver.free
         nu, acceleration = q @ x, s @ x
         at = self.forces.linearise(p @ x, nu, theta, self.model.out[: len(here)])
         force[rows] = at.force
-        given = None
-        if self.segment.nuisance.moves_grasps:
-            given = GivenMotion.along(self.solver, self.grasped, self.given)
-        free, (size, count) = self.solver.free, self.shape
-        right, slopes = (np.zeros((len(here), k, count)) for k in (size, self.segment.dofs))
-        right[..., 0] = (w @ force - self.mass_kg * acceleration)[:, free]
-        right[..., 1:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
-        slopes[..., 1:] = self.setting.force_slopes(rows, at.by_theta)
-        return Linear(here.start, at, nu, right, slopes, given)
+        residual = (w @ force - self.mass_kg * acceleration)[:, free]
+        return at, self.columns.sides(rows, at, acceleration, residual, free)
 
     def _row(self, t: int) -> Row:
         if t not in self._rows:
             self._rows[t] = Row.of(self.dynamics, t, self.setting.theta)
         return self._rows[t]
 
-    def _columns(self, here: range, linear: Linear) -> tuple[Array, Array]:
-        """Corrections of rows and their columns, (k, free, 1 + m), and increments of the force.
+    def _advanced(self, here: range, limit: float) -> tuple[list[Array], float | None]:
+        """Columns (3n, 1 + m) of rows that are corrected.
 
-        NaN from a row on that is singular.
+        They end with the first that is further than the limit, or singular, which is not: then
+        that one's length, or NaN.
         """
-        at, forward, solver = linear.at, self.forward, self.solver
-        found = np.full((2, len(here), *self.shape), np.nan)
-        if not forward.weighs_past:
-            found[1] = 0.0
-        for k, t in enumerate(here):
-            row = self._row(t)
-            matrix = row.block(at.by_position[k], at.by_velocity[k], solver.pattern)
-            skew = row.skew_block(at.by_position_skew[k])
+        solver, forward, (at, sides) = self.solver, self.forward, self._linearised(here)
+        found: list[Array] = []
+        for k, (t, right, force) in enumerate(zip(here, *sides, strict=True)):
+            row, before, whole = self._row(t), forward.memory, np.zeros(forward.shape)
+            parts, skew = (at.by_position[k], at.by_velocity[k]), at.by_position_skew[k]
+            matrix = row.block(*parts, solver.pattern), row.skew_block(skew)
+            found.append(whole)
             try:
-                factor = solver.factoriser.factorise(matrix, skew, self.model.room)
+                factor = solver.factoriser.factorise(*matrix, self.model.room)
+                step = Step(t, row, at.force[k], *parts, factor, skew)
+                forward.advance(step, right, force, whole)
             except np.linalg.LinAlgError:
-                break
-            parts = at.force[k], at.by_position[k], at.by_velocity[k], at.by_theta[k]
-            step = Step(t, row, *parts, factor, at.by_position_skew[k], linear.nu[k])
-            right, force = linear.right[k], linear.force[k]
-            found[0, k] = forward.advance(step, right, force, linear.given)
+                return found, np.nan
+            length = float(np.abs(whole[:, 0]).max(initial=0.0))
+            if not length <= limit:
+                self.forward = Forward(solver, self.columns, before)
+                return found, length
+            self.longest_m = max(self.longest_m, length)
+            self.x[t] += whole[:, 0]
             if forward.weighs_past:
-                found[1, k] = forward.past_increments[0]
-        return found[0], found[1]
+                # What the row says F_t is then.
+                self.force[t, solver.free] += forward.past_increments[0][:, 0]
+        return found, None
 
-    def _correct(self, here: range, columns: Array, increments: Array) -> None:
-        """Correct rows, and be done with them."""
-        done, free = slice(here.start, here.stop), self.solver.free
-        self.x[done, free] += columns[..., 0]
-        if self.forward.weighs_past:
-            # What the rows say F_t is then.
-            self.force[done, free] += increments[..., 0]
-        self.row, self.end = self.row + len(here), here.stop
-
-    def _kept(self, columns: Sequence[Array] | Array) -> list[Kept]:
-        """The last rows, whose columns (free, 1 + m) these are."""
-        here = slice(self.end - len(columns), self.end)
-        whole = np.zeros((len(columns), self.segment.dofs, self.shape[1]))
-        whole[:, self.grasped] = self.given[here]
-        whole[:, self.solver.free] = columns
+    def _kept(self, columns: Sequence[Array]) -> list[Kept]:
+        """The last rows, whose columns (3n, 1 + m) these are."""
+        here, whole = slice(self.end - len(columns), self.end), np.array(columns)
         whole[:, :, 0] = self.x[here]
         by_flat = (whole[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
         pairs = zip(self.x[here].copy(), by_flat, strict=True)

@@ -19,13 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..fem.pattern import SymmetricPattern
 from .dynamics import Dynamics
-from .unsymmetric import signs_by_column
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
@@ -42,35 +39,6 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
     last = int(np.flatnonzero(rows)[-1]) if rows.any() else 0
     late = sum(t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1]))
     return rows, round(float(late))
-
-
-class HeldRows:
-    """Rows of the slopes of the forces on some dofs.
-
-    Parameters
-    ----------
-    pattern : SymmetricPattern
-    dofs : (g,) ascending
-    """
-
-    def __init__(self, pattern: SymmetricPattern, dofs: Index) -> None:
-        rows, columns, source = pattern.full
-        place = np.full(pattern.size, -1)
-        place[dofs] = np.arange(len(dofs))
-        kept = np.flatnonzero(place[rows] >= 0)
-        numbers = np.arange(1.0, len(kept) + 1)
-        shape = (len(dofs), pattern.size)
-        self._matrix = sp.csr_array((numbers, (place[rows[kept]], columns[kept])), shape=shape)
-        # Its data are their own numbers, in the order that compressing them gave.
-        kept = kept[self._matrix.data.astype(np.int64) - 1]
-        self._source, self._signs = source[kept], signs_by_column(pattern)[kept]
-
-    def of(self, lower: Array, skew: Array) -> sp.csr_array:
-        """(g, 3n) from the lower triangles of a matrix's two parts; valid until the next call."""
-        self._matrix.data = lower[self._source]
-        if skew.size:
-            self._matrix.data += self._signs * skew[self._source]
-        return self._matrix
 
 
 @dataclass(frozen=True, eq=False)

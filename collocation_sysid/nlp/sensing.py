@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..arrays import Array, Index
-from .reaction import HeldForces, HeldRows, forces_on, reaction_slopes, reactions
+from .reaction import HeldForces, forces_on, reaction_slopes, reactions
 from .sensor import Forced, Sensor
+from .unsymmetric import Submatrix
 
 if TYPE_CHECKING:
     from .segment import Segment
@@ -158,7 +159,7 @@ class Sensing:
             acceleration = dynamics.acceleration(x)[:, dofs]
             own = setting.inertia_slopes(slice(None), acceleration, dofs)
             by_p += np.einsum("tg,tgp->p", weights, own)
-        rows = HeldRows(dynamics.pattern, dofs)
+        rows = Submatrix(dynamics.pattern, dofs)
         state, rate = np.zeros_like(x), np.zeros_like(x)
         for k, weight in enumerate(whole[first:, dofs]):
             if weight.any():

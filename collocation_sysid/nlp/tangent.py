@@ -18,10 +18,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
@@ -31,12 +30,12 @@ from .dynamics import Dynamics
 from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .memory import History, Slopes, Weights
-from .reaction import HeldForces, HeldRows
+from .reaction import HeldForces
 from .row import Row, weighted
 from .segment import Segment
 from .setting import Setting
 from .stopwatch import Stopwatch
-from .unsymmetric import both_triangles, in_both_triangles, signs_by_column, signs_by_row
+from .unsymmetric import Submatrix
 
 if TYPE_CHECKING:
     from ..fem.batched.skyline import Room
@@ -76,35 +75,161 @@ class Tangent:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What the next row depends on, most recent row first; (free, 1 + m) each.
+    """What the next row depends on, most recent row first.
 
     Attributes
     ----------
-    solutions : Y_{t−i}
-    increments : dF_{t−j}
-    forces : (3n,) total forces F_{t−j} at the evaluations
+    solutions : (3n, c) Y_{t−i}
+    increments : (free, c) dF_{t−j}
+    forces : (free,) total forces F_{t−j} at the evaluations
     overstress : dm of each branch
     """
 
     solutions: tuple[Array, ...]
     increments: tuple[Array, ...]
-    forces: tuple[Array, ...]
+    forces: tuple[Array, ...] = ()
     overstress: tuple[Array, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One timestep's F, G, C (lower triangles), ∂F/∂θ, −∂c_t/∂x_t factorised, G's skew part, ν."""
+class Step(NamedTuple):
+    """One timestep's F, G, C (lower triangles), −∂c_t/∂x_t factorised, and G's skew part."""
 
     t: int
     row: Row
     force: Array
     by_position: Array
     by_velocity: Array
-    by_theta: Array
     factor: Factor
     skew: Array
-    velocity: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Rows that are linearised together: their steps, and what they have at once."""
+
+    here: slice
+    at: Linearisation
+    steps: list[Step]
+
+
+@dataclass(frozen=True, eq=False)
+class GivenMotion:
+    """Columns Y of grasped dofs, which are given: the way to their goals, and ∂goal/∂φ.
+
+    Attributes
+    ----------
+    dofs : (g,)
+    columns : (N, g, c)
+    holds : (N, g) bool, those that are held at a time
+    """
+
+    dofs: Index
+    columns: Array
+    holds: NDArray[np.bool_]
+
+    @classmethod
+    def along(cls, solver: BlockSolver, dofs: Index, columns: Array) -> GivenMotion:
+        """Those of dofs (g,) that move by `columns` (N, g, c)."""
+        return cls(dofs, columns, solver.dynamics.taken[:, dofs] | ~np.isin(dofs, solver.free))
+
+    @property
+    def count(self) -> int:
+        """C."""
+        return self.columns.shape[-1]
+
+    def place(self, t: int, solution: Array) -> None:
+        """Put them into Y_t (3n, columns), in place."""
+        here = self.holds[t]
+        solution[self.dofs[here]] = self.columns[t, here]
+
+    def force(self, solver: BlockSolver, step: Step) -> Array | float:
+        """What their motion at t adds to F' (free, columns)."""
+        now = np.where(self.holds[step.t, :, None], self.columns[step.t], 0.0)
+        # What is only parameters of other kinds does not move them.
+        moved = np.flatnonzero(now.any(axis=0))
+        if not len(moved):
+            return 0.0
+        p, q, force = step.row.p[0], step.row.q[0], np.zeros((len(solver.free), self.count))
+        matrix = solver.beside.of(p * step.by_position + q * step.by_velocity, p * step.skew)
+        force[:, moved] = matrix @ now[:, moved]
+        return force
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What is carried through the rows.
+
+    Attributes
+    ----------
+    setting : Setting
+    count : int
+    by_p : bool
+        Whether the last are by the parameters that move the body.
+    step : bool
+        Whether the first is the way to the equations.
+    grasped : GivenMotion, optional
+        Where grasped dofs move.
+    """
+
+    setting: Setting
+    count: int
+    by_p: bool = True
+    step: bool = False
+    grasped: GivenMotion | None = None
+
+    @classmethod
+    def by_parameters(
+        cls, solver: BlockSolver, setting: Setting, x: Array | None = None
+    ) -> Columns:
+        """By all that moves the body, and in front, where x (N, 3n) is given, the step from it."""
+        first, count, grasped = int(x is not None), len(solver.segment.moving), None
+        if setting.held.moves:
+            held = setting.held
+            goals = held.positions_m[: solver.dynamics.rows]
+            columns = np.zeros((*goals.shape, first + count))
+            columns[..., first + solver.segment.nq :] = held.by_phi[: len(goals)]
+            if x is not None:
+                columns[..., 0] = np.nan_to_num(goals - x[:, held.dofs])
+            grasped = GivenMotion.along(solver, held.dofs, columns)
+        return cls(setting, first + count, step=x is not None, grasped=grasped)
+
+    @classmethod
+    def along(cls, solver: BlockSolver, setting: Setting, moved: Array) -> Columns:
+        """By grasped dofs that move by `moved` (N, g, c)."""
+        grasped = GivenMotion.along(solver, setting.held.dofs, moved)
+        return cls(setting, grasped.count, by_p=False, grasped=grasped)
+
+    def sides(
+        self,
+        rows: slice,
+        at: Linearisation,
+        acceleration: Array,
+        residual: Array | None,
+        free: Index,
+    ) -> tuple[Array, Array]:
+        """R (k, free, c) and F_R (k, 3n, c) of some rows.
+
+        Parameters
+        ----------
+        acceleration : (k, 3n)
+        residual : (k, free), where the first column is the way to the equations
+        """
+        count, size = acceleration.shape
+        right, force = (np.zeros((count, k, self.count)) for k in (len(free), size))
+        if residual is not None:
+            right[..., 0] = residual
+        if self.by_p:
+            first = int(self.step)
+            force[..., first:] = self.setting.force_slopes(rows, at.by_theta)
+            right[..., first:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
+        return right, force
+
+    @property
+    def theta(self) -> Array:
+        """(k, c) derivatives of θ."""
+        if self.by_p:
+            return self.setting.columns(int(self.step))
+        return np.zeros((len(self.setting.theta), self.count))
 
 
 class BlockSolver:
@@ -130,37 +255,14 @@ class BlockSolver:
         self.stopwatch = stopwatch or Stopwatch()
         self.factorisation: Choice = factorisation
         self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
-        self._takes = bool(self.dynamics.taken.any())
         self.segment = segment
         self.body, self.pattern = segment.body, segment.pattern
-        self.free = segment.free_dofs
+        self.free, self.sensed = segment.free_dofs, segment.sensed_dofs
         self.factoriser = Factoriser.of(self.pattern, self.free, factorisation)
-        full_rows, full_columns, source = self.pattern.full
-        place = np.full(self.pattern.size, -1)
-        place[self.free] = np.arange(len(self.free))
-        kept = (place[full_rows] >= 0) & (place[full_columns] >= 0)
-        signs = signs_by_row(self.pattern)[kept]
-        self._source = source[kept], in_both_triangles(self.pattern, source[kept], signs)
-        # Sorted by column; the matrices are symmetric, so that serves for rows as well.
-        held = np.full(self.pattern.size, -1)
-        held[segment.grasping.dofs] = np.arange(len(segment.grasping.dofs))
-        beside = (place[full_rows] >= 0) & (held[full_columns] >= 0)
-        shape = (len(self.free), len(segment.grasping.dofs))
-        numbers, places = np.arange(1, beside.sum() + 1), (place[full_rows], held[full_columns])
-        self._held = sp.csr_array((numbers, (places[0][beside], places[1][beside])), shape=shape)
-        # Its data are their own numbers, in the order that compressing them gave.
-        order = np.asarray(self._held.data, dtype=np.int64) - 1
-        origin, signs = source[beside][order], signs_by_column(self.pattern)[beside][order]
-        self._held_source = origin, in_both_triangles(self.pattern, origin, signs)
-        self._held = self._held.astype(float)
-        self.sensed = segment.sensed_dofs
-        self.sensed_rows = HeldRows(self.pattern, self.sensed)
-        counts = np.bincount(place[full_columns[kept]], minlength=len(self.free))
-        indptr = np.concatenate([[0], np.cumsum(counts)])
-        self._matrix = sp.csr_array(
-            (np.zeros(kept.sum()), place[full_rows[kept]], indptr),
-            shape=(len(self.free), len(self.free)),
-        )
+        self.matrix = Submatrix(self.pattern, self.free)
+        self.beside = Submatrix(self.pattern, self.free, segment.grasping.dofs)
+        self.of_sensed = Submatrix(self.pattern, self.sensed)
+        self._takes = bool(self.dynamics.taken.any())
 
     def __reduce__(self) -> tuple[type[BlockSolver], tuple[Segment, int, None, Choice]]:
         return BlockSolver, (self.segment, self.dynamics.rows, None, self.factorisation)
@@ -179,36 +281,19 @@ class BlockSolver:
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        count = 1 + len(self.segment.moving)
-        columns = np.zeros((*x.shape, count))
-        history, theta_q = self.dynamics.history(x, setting.theta), setting.columns()
-        violation, indefinite, done = 0.0, 0, 0
+        carried = Columns.by_parameters(self, setting, x)
+        columns = np.zeros((*x.shape, carried.count))
+        held = HeldForces.nothing(len(x), len(self.sensed), carried.count)
+        march = Forward(self, carried, known.memory if known else None, held)
         if known is not None:
-            violation, indefinite, done = known.violation_n, known.indefinite, len(known.step)
+            done = len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
-        acceleration = self.dynamics.acceleration(x)
-        given = GivenMotion.of(self, setting, x)
-        memory = known.memory if known else None
-        held = HeldForces.nothing(len(x), len(self.sensed), count)
-        if known is not None:
+            march.violation_n, march.indefinite = known.violation_n, known.indefinite
             held.begin(known.held)
-        march = Forward(self, setting, (len(self.free), count), memory, held)
-        march.remember(history, theta_q, done)
-        for step in self._steps(x, setting, first=done, history=history):
-            indefinite += not step.factor.positive_definite
-            right, force = np.zeros(march.shape), np.zeros((x.shape[1], count))
-            residual = march.residual(step, acceleration[step.t])
-            violation = max(violation, float(np.abs(residual).max(initial=0.0)))
-            right[:, 0] = residual
-            if setting.mass_moves:
-                right[:, 1:] -= march.inertia_slopes(step, acceleration[step.t])
-            force[:, 1:] = march.force_slopes(step)
-            with self.stopwatch.solving():
-                columns[step.t, self.free] = march.advance(step, right, force, given)
-        if given is not None:
-            columns[done:, given.held_dofs] = given.of_held[done:]
-        step_m, by_p = columns[:, :, 0], columns[:, :, 1:]
-        return Tangent(step_m, by_p, violation, indefinite, march.memory, held)
+        for _ in march.rows(x, 0 if known is None else len(known.step), columns):
+            pass
+        found = columns[:, :, 0], columns[:, :, 1:], march.violation_n, march.indefinite
+        return Tangent(*found, march.memory, held)
 
     def sensitivities(
         self, x: Array, setting: Setting, held: HeldForces | None = None
@@ -220,20 +305,7 @@ class BlockSolver:
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        shape = (x.shape[1], len(self.segment.moving))
-        march = Forward(self, setting, (len(self.free), shape[1]), held=held)
-        given, history = GivenMotion.of(self, setting), self.dynamics.history(x, setting.theta)
-        march.remember(history, setting.columns(first=0))
-        acceleration = self.dynamics.acceleration(x)
-        yield from np.zeros((self.dynamics.first_row, *shape))
-        for step in self._steps(x, setting, history=history):
-            row, right = np.zeros(shape), np.zeros(march.shape)
-            if setting.mass_moves:
-                right -= march.inertia_slopes(step, acceleration[step.t])
-            row[self.free] = march.advance(step, right, march.force_slopes(step), given)
-            if given is not None:
-                row[given.held_dofs] = given.of_held[step.t]
-            yield row
+        return Forward(self, Columns.by_parameters(self, setting), held=held).rows(x)
 
     def response(
         self, x: Array, setting: Setting, moved: Array, held: HeldForces | None = None
@@ -247,68 +319,46 @@ class BlockSolver:
         SimulationError
             Where a timestep's equations are singular or not finite.
         """
-        count = moved.shape[2]
-        given = GivenMotion.along(self, setting.held.dofs, moved)
-        march = Forward(self, setting, (len(self.free), count), held=held)
-        history = self.dynamics.history(x, setting.theta)
-        march.remember(history, np.zeros((len(setting.theta), count)))
-        yield from np.zeros((self.dynamics.first_row, x.shape[1], count))
-        for step in self._steps(x, setting, history=history):
-            row, right = np.zeros((x.shape[1], count)), np.zeros(march.shape)
-            row[self.free] = march.advance(step, right, np.zeros_like(row), given)
-            row[given.held_dofs] = given.of_held[step.t]
-            yield row
+        return Forward(self, Columns.along(self, setting, moved), held=held).rows(x)
 
     @one_blas_thread()
     def backward(self, x: Array, setting: Setting, gradient: Array) -> Array:
         """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].
 
-        Dofs that a passing grasp holds have zeros.
+        Dofs that a grasp holds have zeros.
         """
-        dynamics, reach = self.dynamics_at(setting), self.dynamics.reach
-        rows = [Row.of(dynamics, t, setting.theta) for t in range(dynamics.rows)]
-        y = np.zeros((dynamics.rows, len(self.free)))
-        pulled = -gradient[:, self.free]  # what is left for the rows that are still to come
+        reach, free, y = self.dynamics.reach, self.free, np.zeros_like(x)
+        pulled = -gradient[:, free]  # what is left for the rows that are still to come
         history = self.dynamics.history(x, setting.theta)
-        weights = Weights(history) if history else None
-        for step in self._steps(x, setting, backward=True, history=history):
-            t = step.t
-            through_stress = weights.pulled()[self.free] if weights else 0.0
-            lags = range(min(reach, t) + 1)
-            mass = rows[t].mass_kg[self.free]
-            later = [j for j in range(1, reach + 1) if t + j < dynamics.rows]
-            known = self.without_taken(
-                t,
-                sum(
-                    (rows[t + j].w[j] * y[t + j] for j in later if rows[t + j].w[j]),
-                    np.zeros(len(self.free)),
-                ),
-            )
-            row = rows[t]
-            p, q, w = row.p, row.q, row.w[0]
-            pulled[t] -= p[0] * through_stress
-            by_position, by_velocity = None, None
-            if known.any():
-                by_position = self.apply(step.by_position, known, -step.skew)
-                by_velocity = self.apply(step.by_velocity, known)
-                pulled[t] -= p[0] * by_position + q[0] * by_velocity
-            # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left, and the factor is of its negative.
-            right = self.without_taken(t, pulled[t])
-            y[t] = -step.factor.solve(right, transposed=True)
-            force_weight = known + w * y[t]
-            by_position = self.apply(step.by_position, force_weight, -step.skew) + through_stress
-            by_velocity = self.apply(step.by_velocity, force_weight)
-            if weights:
-                whole = np.zeros(x.shape[1])
-                whole[self.free] = force_weight
-                weights.retreat(whole)
-            for i in lags:
-                if i > 0:
+        weights, later = Weights(history) if history else None, deque[Row](maxlen=reach)
+        for chunk in self.chunks(x, setting, backward=True, history=history):
+            for step in reversed(chunk.steps):
+                t, row = step.t, step.row
+                p, q, mass = row.p, row.q, row.mass_kg[free]
+                through_stress = weights.pulled()[free] if weights else 0.0
+                known = np.zeros(x.shape[1])
+                for j, other in enumerate(later, 1):
+                    known += other.w[j] * y[t + j]
+                known[self.dynamics.taken[t]] = 0
+                pulled[t] -= p[0] * through_stress
+                if known.any():
+                    by_position = self.matrix.of(step.by_position, -step.skew) @ known
+                    pulled[t] -= p[0] * by_position
+                    pulled[t] -= q[0] * (self.matrix.of(step.by_velocity, NONE) @ known)
+                # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
+                right = self.without_taken(t, pulled[t])
+                y[t, free] = -step.factor.solve(right, transposed=True)
+                force_weight = known + row.w[0] * y[t]
+                by_position = self.matrix.of(step.by_position, -step.skew) @ force_weight
+                by_position += through_stress
+                by_velocity = self.matrix.of(step.by_velocity, NONE) @ force_weight
+                if weights:
+                    weights.retreat(force_weight)
+                for i in range(1, min(reach, t) + 1):
                     pulled[t - i] -= p[i] * by_position + q[i] * by_velocity
-                    pulled[t - i] += row.s[i] * mass * y[t]
-        full = np.zeros_like(x)
-        full[:, self.free] = y
-        return full
+                    pulled[t - i] += row.s[i] * mass * y[t, free]
+                later.appendleft(row)
+        return y
 
     def without_taken(self, t: int, rows: Array) -> Array:
         """Rows (free, …) with zeros at what a passing grasp holds at t, in place."""
@@ -335,56 +385,37 @@ class BlockSolver:
         numbers = solver.unsymmetric_numbers if self.body.unsymmetric else solver.numbers
         return 8 * (self.body.linearisation_width + numbers)
 
-    def apply(self, lower: Array, columns: Array, skew: Array = NONE) -> Array:
-        """Product of a matrix, given by lower triangles of its two parts, on the free dofs."""
-        self._matrix.data = _entries(lower, skew, self._source)
-        return self._matrix @ columns
-
-    def apply_held(self, lower: Array, columns: Array, skew: Array = NONE) -> Array:
-        """Product (free, …) of its columns of grasped dofs, with `columns` (g, …)."""
-        self._held.data = _entries(lower, skew, self._held_source)
-        return self._held @ columns
-
     def dynamics_at(self, setting: Setting) -> Dynamics:
         """The equations of motion of the rows at a setting."""
         return setting.dynamics.first_rows(self.dynamics.rows)
 
-    def _steps(
+    def chunks(
         self,
         x: Array,
         setting: Setting,
         backward: bool = False,
         first: int = 0,
         history: History | None = None,
-    ) -> Iterator[Step]:
-        """Blocks and factors of every row from `first` on, computed in chunks side by side."""
+    ) -> Iterator[Chunk]:
+        """Blocks and factors of every row from `first` on, computed side by side."""
         dynamics, theta = self.dynamics_at(setting), setting.theta
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
         for start in reversed(starts) if backward else starts:
-            stop = min(start + self.chunk, dynamics.rows)
-            here = slice(start - dynamics.first_row, stop - dynamics.first_row)
+            here = slice(start, min(start + self.chunk, dynamics.rows))
+            seen = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
             with self.stopwatch.evaluating():
-                forces = setting.dynamics.forces.rows(slice(start, stop))
-                carried = dynamics.carried(history, slice(start, stop))
-                at = forces.linearise(xi[here], nu[here], theta, carried=carried)
+                forces = setting.dynamics.forces.rows(here)
+                carried = dynamics.carried(history, here)
+                at = forces.linearise(xi[seen], nu[seen], theta, carried=carried)
             with self.stopwatch.solving():
-                rows = [Row.of(dynamics, t, theta) for t in range(start, stop)]
-                factors = self._factorise(dynamics, at, slice(start, stop), rows, rooms)
-            order = range(stop - start)
-            for k in reversed(order) if backward else order:
-                yield Step(
-                    start + k,
-                    rows[k],
-                    at.force[k],
-                    at.by_position[k],
-                    at.by_velocity[k],
-                    at.by_theta[k],
-                    factors[k],
-                    at.by_position_skew[k],
-                    nu[start - dynamics.first_row + k],
-                )
+                rows = [Row.of(dynamics, t, theta) for t in range(start, here.stop)]
+                factors = self._factorise(dynamics, at, here, rows, rooms)
+            numbers = range(start, here.stop)
+            parts = numbers, rows, at.force, at.by_position, at.by_velocity, factors
+            steps = map(Step, *parts, at.by_position_skew)
+            yield Chunk(here, at, list(steps))
 
     def _factorise(
         self,
@@ -419,108 +450,28 @@ class BlockSolver:
             ) from error
 
 
-def _entries(lower: Array, skew: Array, sources: tuple[Index, Index]) -> Array:
-    """Entries of a matrix from the lower triangle, or from both of one with a skew part."""
-    if not skew.size:
-        return np.take(lower, sources[0])
-    return np.take(both_triangles(lower, skew), sources[1])
-
-
-@dataclass(frozen=True, eq=False)
-class GivenMotion:
-    """Columns Y of grasped dofs, which are given: the way to their goals, and ∂goal/∂φ.
+class Forward:
+    """Columns carried forward, row by row; it remembers the last few rows.
 
     Attributes
     ----------
-    held_dofs : (h,) dofs held throughout
-    of_held : (N, h, columns)
-    of_evaluations : (N, g, columns) and over time, Σ_i p_i Y_{t−i} and Σ_i q_i Y_{t−i} of grasped
-        dofs; of those held for a while the past is in the rows before
-    taken : (N, g) bool, those held for a while
-    places : (g,) where they are among the free dofs; −1 for those held throughout
-    columns : (N, g, columns)
+    violation_n, indefinite : see `Tangent`
     """
-
-    held_dofs: Index
-    of_held: Array
-    of_evaluations: tuple[Array, Array]
-    taken: NDArray[np.bool_]
-    places: Index
-    columns: Array
-
-    @classmethod
-    def of(
-        cls, solver: BlockSolver, setting: Setting, x: Array | None = None
-    ) -> GivenMotion | None:
-        """Those of a setting, with the way from x (N, 3n) in front; None where all is zero."""
-        held, dynamics = setting.held, solver.dynamics
-        if not held.moves:
-            return None
-        rows, shared = dynamics.rows, setting.nq
-        goals = held.positions_m[:rows]
-        columns = np.zeros((*goals.shape, shared + held.by_phi.shape[2]))
-        columns[..., shared:] = held.by_phi[:rows]
-        if x is not None:
-            way = np.nan_to_num(goals - x[:, held.dofs])
-            columns = np.concatenate([way[..., None], columns], axis=2)
-        return cls.along(solver, held.dofs, columns)
-
-    @classmethod
-    def along(cls, solver: BlockSolver, dofs: Index, columns: Array) -> GivenMotion:
-        """Those of dofs (g,) that move by `columns` (N, g, c)."""
-        dynamics = solver.dynamics
-        taken = dynamics.taken[:, dofs]
-        passing = np.isin(dofs, solver.free)
-        throughout = np.where(passing[:, None], 0.0, columns)
-        now = np.where((taken & passing)[..., None], columns, 0.0)
-        p, q = dynamics.tables.p, dynamics.tables.q / dynamics.step_s
-        evaluated = [
-            dynamics.combine(table, throughout) + table[:, :1, None] * now for table in (p, q)
-        ]
-        return cls(
-            held_dofs=dofs[~passing],
-            of_held=columns[:, ~passing],
-            of_evaluations=(evaluated[0], evaluated[1]),
-            taken=taken & passing,
-            places=np.where(passing, np.searchsorted(solver.free, dofs), -1),
-            columns=columns,
-        )
-
-    def force(self, solver: BlockSolver, step: Step) -> Array:
-        """What their motion adds to F' (free, columns)."""
-        position, velocity = (each[step.t] for each in self.of_evaluations)
-        # What is only parameters of other kinds does not move them.
-        moved = np.flatnonzero(position.any(axis=0) | velocity.any(axis=0))
-        force = np.zeros((len(solver.free), position.shape[1]))
-        if len(moved):
-            force[:, moved] = solver.apply_held(step.by_position, position[:, moved], step.skew)
-            force[:, moved] += solver.apply_held(step.by_velocity, velocity[:, moved])
-        return force
-
-    def place_taken(self, t: int, solution: Array) -> None:
-        """Put those held for a while into Y_t (free, columns), in place."""
-        here = self.taken[t]
-        solution[self.places[here]] = self.columns[t, here]
-
-
-class Forward:
-    """Substitution row by row; remembers the last few rows."""
 
     def __init__(
         self,
         solver: BlockSolver,
-        setting: Setting,
-        shape: tuple[int, int],
+        columns: Columns,
         memory: Memory | None = None,
         held: HeldForces | None = None,
     ) -> None:
-        self.solver = solver
+        self.solver, self.columns = solver, columns
         self.held = held if len(solver.sensed) else None
-        self.setting = setting
-        self.shape = shape
-        reach = solver.dynamics.reach
-        nothing = (np.zeros(shape),) * reach
-        memory = memory or Memory(nothing, nothing, (np.zeros(len(solver.free)),) * reach)
+        self.violation_n, self.indefinite = 0.0, 0
+        size, reach = solver.pattern.size, solver.dynamics.reach
+        self.shape, self._of_free = (size, columns.count), (len(solver.free), columns.count)
+        nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
+        memory = memory or Memory(*((each,) * reach for each in nothing))
         self.past = deque(memory.solutions, maxlen=reach)
         self.past_increments = deque(memory.increments, maxlen=reach)
         self.past_forces = deque(memory.forces, maxlen=reach)
@@ -533,52 +484,59 @@ class Forward:
     def memory(self) -> Memory:
         """What later rows depend on."""
         overstress = tuple(self.slopes.columns) if self.slopes else ()
-        return Memory(
-            tuple(self.past), tuple(self.past_increments), tuple(self.past_forces), overstress
-        )
+        past = tuple(self.past), tuple(self.past_increments), tuple(self.past_forces)
+        return Memory(*past, overstress)
 
-    def remember(self, history: History | None, theta_q: Array, done: int = 0) -> None:
-        """Follow the memory of a body that has one, after rows that are done."""
-        if history is None:
-            return
-        self.slopes = Slopes(history, theta_q, done, self._overstress)
-        if not done and self.solver.dynamics.first_row:
-            # The start is given.
-            self.slopes.advance(np.zeros((self.solver.pattern.size, theta_q.shape[1])))
+    def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
+        """Y_t (3n, c) at x (N, 3n) after rows that are done, also into `out` (N, 3n, c)."""
+        solver, columns, setting = self.solver, self.columns, self.columns.setting
+        dynamics, first = solver.dynamics, solver.dynamics.first_row
+        history, acceleration = dynamics.history(x, setting.theta), dynamics.acceleration(x)
+        if history is not None:
+            self.slopes = Slopes(history, columns.theta, done, self._overstress)
+        for t in range(done, first):  # the start is given
+            if self.slopes is not None:
+                self.slopes.advance(np.zeros(self.shape))
+            start = np.zeros(self.shape)
+            if columns.grasped is not None:
+                columns.grasped.place(t, start)
+            self.past.appendleft(start)
+            yield np.zeros(self.shape)
+        for chunk in solver.chunks(x, setting, first=done, history=history):
+            residual = None
+            if columns.step:
+                residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
+                self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
+            of_rows = acceleration[chunk.here], residual, solver.free
+            sides = columns.sides(chunk.here, chunk.at, *of_rows)
+            for step, right, force in zip(chunk.steps, *sides, strict=True):
+                self.indefinite += not step.factor.positive_definite
+                found = np.zeros(self.shape) if out is None else out[step.t]
+                with solver.stopwatch.solving():
+                    self.advance(step, right, force, found)
+                yield found
 
-    def residual(self, step: Step, acceleration: Array) -> Array:
+    def _residual(self, step: Step, acceleration: Array) -> Array:
         """c_t on the free dofs; to be called for every row in turn."""
         solver, row = self.solver, step.row
-        force = step.force[solver.free]
-        solver.without_taken(step.t, force)
+        force = solver.without_taken(step.t, step.force[solver.free])
         total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
             total += weighted(row.w, self.past_forces, force.shape)
             self.past_forces.appendleft(force)
         return solver.without_taken(step.t, total)
 
-    def force_slopes(self, step: Step) -> Array:
-        """∂F/∂p (3n, m)."""
-        return self.setting.force_slopes(step.t, step.by_theta)
-
-    def inertia_slopes(self, step: Step, acceleration: Array) -> Array | float:
-        """∂(M a)/∂p on the free dofs."""
-        free = self.solver.free
-        return self.setting.inertia_slopes(step.t, acceleration[free], free)
-
-    def advance(
-        self, step: Step, right: Array, force: Array, given: GivenMotion | None = None
-    ) -> Array:
-        """Y_t from R_t (free, columns) and F_R (3n, columns), and from how grasped dofs move."""
-        t, solver = step.t, self.solver
-        row = step.row
-        w, s, mass = row.w, row.s, row.mass_kg.take(solver.free)[:, None]
+    def advance(self, step: Step, right: Array, force: Array, found: Array) -> None:
+        """Put Y_t into `found` (3n, c), from R_t (free, c) and F_R (3n, c)."""
+        t, solver, given = step.t, self.solver, self.columns.grasped
+        row, free = step.row, solver.free
+        w, s, mass = row.w, row.s, row.mass_kg.take(free)[:, None]
         if self.weighs_past:
-            right += weighted(w, self.past_increments, self.shape)
-        right -= mass * weighted(s, self.past, self.shape)
+            right += weighted(w, self.past_increments, self._of_free)
+        right -= mass * weighted(s, self.past, self.shape).take(free, axis=0)
         if self.slopes is not None:
             force = force + self.slopes.force()
-        forced = force.take(solver.free, axis=0)
+        forced = force.take(free, axis=0)
         forced += self._of_past(step, row)
         if given is not None:
             forced += given.force(solver, step)
@@ -587,52 +545,40 @@ class Forward:
         solution = step.factor.solve(right + w[0] * forced)
         if self.weighs_past:
             self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
+        found[free] = solution
         if given is not None:
-            given.place_taken(t, solution)
+            given.place(t, found)
         if self.slopes is not None:
-            self.slopes.advance(self._evaluated(row.p, solution, t, given, 0))
+            self.slopes.advance(self._evaluated(row.p, found))
         if self.held is not None:
-            state, rate = (
-                self._evaluated(weights, solution, t, given, order)
-                for order, weights in enumerate((row.p, row.q))
-            )
-            self._sense(self.held, step, force, state, rate)
-        self.past.appendleft(solution)
-        return solution
+            self._sense(self.held, step, force, found)
+        self.past.appendleft(found)
 
-    def _sense(self, held: HeldForces, step: Step, force: Array, state: Array, rate: Array) -> None:
+    def _sense(self, held: HeldForces, step: Step, force: Array, found: Array) -> None:
         """Note F_t and dF_t of the dofs whose grasp has a sensor."""
-        t, rows, dofs = step.t, self.solver.sensed_rows, self.solver.sensed
-        held.force[t] = step.force[dofs]
-        held.slopes[t] = force[dofs] + rows.of(step.by_position, step.skew) @ state
-        held.slopes[t] += rows.of(step.by_velocity, NONE) @ rate
+        row, dofs, matrix = step.row, self.solver.sensed, self.solver.of_sensed
+        held.force[step.t] = step.force[dofs]
+        state, rate = (self._evaluated(weights, found) for weights in (row.p, row.q))
+        slopes = force[dofs] + matrix.of(step.by_position, step.skew) @ state
+        held.slopes[step.t] = slopes + matrix.of(step.by_velocity, NONE) @ rate
 
-    def _evaluated(
-        self,
-        weights: Sequence[float],
-        solution: Array,
-        t: int,
-        given: GivenMotion | None,
-        order: int,
-    ) -> Array:
-        """Σ_i weights[i] Y_{t−i} (3n, columns) of all dofs: how ξ, or ν, of row t changes."""
-        found = np.zeros((self.solver.pattern.size, self.shape[1]))
-        found[self.solver.free] = weights[0] * solution + weighted(weights, self.past, self.shape)
-        if given is not None:
-            found[given.held_dofs] = given.of_evaluations[order][t, given.places < 0]
-        return found
+    def _evaluated(self, weights: Sequence[float], found: Array) -> Array:
+        """Σ_i weights[i] Y_{t−i} (3n, c): how ξ, or ν, of row t changes."""
+        return weights[0] * found + weighted(weights, self.past, self.shape)
 
-    def _of_past(self, step: Step, row: Row) -> Array:
+    def _of_past(self, step: Step, row: Row) -> Array | float:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
+        matrix = self.solver.matrix
         if not row.lags:
-            return np.zeros(self.shape)
+            return 0.0
         if len(row.lags) == 1:
             (i,) = row.lags
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
-            return self.solver.apply(block, self.past[i - 1], row.p[i] * step.skew)
-        total = self.solver.apply(step.by_velocity, weighted(row.q, self.past, self.shape))
+            return matrix.of(block, row.p[i] * step.skew) @ self.past[i - 1]
+        past = weighted(row.q, self.past, self.shape)
+        total = matrix.of(step.by_velocity, NONE) @ past
         if any(row.p[1:]):
             past = weighted(row.p, self.past, self.shape)
-            total += self.solver.apply(step.by_position, past, step.skew)
+            total += matrix.of(step.by_position, step.skew) @ past
         return total

@@ -22,11 +22,6 @@ def signs_by_column(pattern: SymmetricPattern) -> Array:
     return np.sign(rows - columns).astype(float)
 
 
-def signs_by_row(pattern: SymmetricPattern) -> Array:
-    """The same where the entries are read as the transpose's, which are sorted by row."""
-    return -signs_by_column(pattern)
-
-
 def skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
     """Entries (…, nnz) of the whole skew matrix in the order of `pattern.full`; none of none."""
     if not skew.size:
@@ -35,14 +30,40 @@ def skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
     return np.take(skew, pattern.full[2], axis=-1) * signs_by_column(pattern)
 
 
-def both_triangles(lower: Array, skew: Array) -> Array:
-    """(2m,) entries of the lower triangle of symmetric and skew parts, then of the upper one."""
-    return np.concatenate([lower + skew, lower - skew])
+class Submatrix:
+    """Some rows and columns of matrices that are given so.
 
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+    rows : (k,) ascending dofs
+    columns : (c,) ascending dofs, by default all
+    """
 
-def in_both_triangles(pattern: SymmetricPattern, source: Index, signs: Array) -> Index:
-    """Where in `both_triangles` entries are that are at `source` in a lower triangle."""
-    return source + np.where(signs < 0, pattern.entries, 0)
+    def __init__(
+        self, pattern: SymmetricPattern, rows: Index, columns: Index | None = None
+    ) -> None:
+        # Entries are sorted by column, so that those of the transpose are sorted by row.
+        across, along, source = pattern.full
+        count = pattern.size if columns is None else len(columns)
+        place, number = np.full((2, pattern.size), -1)
+        place[rows] = np.arange(len(rows))
+        number[slice(None) if columns is None else columns] = np.arange(count)
+        kept = (place[along] >= 0) & (number[across] >= 0)
+        self._source = source[kept]
+        self._in_both = source[kept] + np.where((along > across)[kept], 0, pattern.entries)
+        ends = np.cumsum(np.bincount(place[along[kept]], minlength=len(rows)))
+        parts = np.zeros(kept.sum()), number[across[kept]], np.concatenate([[0], ends])
+        self._matrix = sp.csr_array(parts, shape=(len(rows), count))
+
+    def of(self, lower: Array, skew: Array) -> sp.csr_array:
+        """The matrix (k, c); valid until the next call."""
+        if skew.size:
+            both = np.concatenate([lower + skew, lower - skew])
+            self._matrix.data = np.take(both, self._in_both)
+        else:
+            self._matrix.data = np.take(lower, self._source)
+        return self._matrix
 
 
 def whole(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
