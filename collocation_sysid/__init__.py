@@ -27,9 +27,11 @@ from .experiment import (
     place_markers,
 )
 from .fem.body import Body
+from .fem.constants import Constant
 from .fem.materials import Material
 from .fem.memory import Prony
 from .fem.mesh import TetMesh
+from .fem.node_force import NodeForce
 from .fem.regions import Region
 from .fem.selection import Ball, Box, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh
@@ -58,6 +60,7 @@ __all__ = [
     "Body",
     "Box",
     "Collocation",
+    "Constant",
     "Continuation",
     "Experiment",
     "Force",
@@ -69,6 +72,7 @@ __all__ = [
     "Markers",
     "Material",
     "Named",
+    "NodeForce",
     "Nuisance",
     "Parameter",
     "Parameters",

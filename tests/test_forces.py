@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from checks import assert_derivative
@@ -11,9 +12,12 @@ from problems_small import GUESS, driven_bar, hung_cube, nodes_where
 from test_density import parameters, with_core
 
 from collocation_sysid.experiment import Experiment, Force, Nuisance, PointMass
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.node_force import NodeForce
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.force_term import States
 from collocation_sysid.nlp.forces import Forces
+from collocation_sysid.nlp.parameters import Parameters, Unknown
 from collocation_sysid.nlp.segment import Segment
 from collocation_sysid.nlp.unsymmetric import whole
 
@@ -39,7 +43,31 @@ def joined_cube() -> Experiment:
     )
 
 
+def drag(x, v, at, drag_coefficient):
+    """Of air, by the share of the surface."""
+    return -0.6 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-4) * v
+
+
+def foundation(x, v, at, bed_n_m3, whirl_n_m3):
+    """A bed of springs with dashpots under a body, and something that turns, growing in time."""
+    moved = x - at.rest_m
+    beside = ca.vertcat(-moved[1], moved[0], 0)
+    spring = bed_n_m3 * at.area_m2 * (1 + ca.sumsqr(moved) / 1e-4)
+    return -spring * (moved + 0.1 * v) + whirl_n_m3 * at.t_s * at.volume_m3 * beside
+
+
+def cube_in_air() -> Collocation:
+    """A hung cube with forces of a user, on all of its nodes and on some."""
+    old = hung_cube(8)
+    forces = [NodeForce.of(drag), NodeForce.of(foundation, nodes=nodes_where(old.body, 2, 0.0))]
+    body = Body(old.body.mesh, density_kg_m3=30.0, forces=forces)
+    given = {"drag_coefficient": 1.1, "bed_n_m3": 900.0, "whirl_n_m3": 4e4}
+    known = Parameters.of({name: Unknown(value) for name, value in given.items()})
+    return Collocation([replace(old, body=body)], Parameters((*GUESS.items, *known.items)))
+
+
 CASES = {
+    "of a user": cube_in_air,
     "tendon and pressure": lambda: Collocation([BAR], GUESS),
     "weight and loads": lambda: Collocation([joined_cube()], parameters()),
 }
@@ -164,6 +192,18 @@ def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
         return matrix_times(forces, at.position_position, none, way)
 
     assert_derivative(lambda x: slopes(x, nu, steady)[0], twice, xi, rng, 1e-6, scale=1e-3)
+    if at.velocity_velocity.size:
+        assert_derivative(
+            lambda v: slopes(xi, v, steady)[1],
+            lambda way: matrix_times(forces, at.velocity_velocity, none, way),
+            nu, rng, 1e-6, scale=0.1,
+        )  # fmt: skip
+    mixed = at.position_velocity, at.position_velocity_skew
+    assert_derivative(
+        lambda v: slopes(xi, v, steady)[0],
+        lambda way: matrix_times(forces, *mixed, way),
+        nu, rng, 1e-6, scale=0.1,
+    )  # fmt: skip
     found = np.einsum("tiu,tu->tiu", at.position_theta, u)
     rates = np.einsum("tiu,tu->tiu", at.velocity_theta, u)
     both = np.einsum("tiu,tu->tiu", at.theta_theta, u)

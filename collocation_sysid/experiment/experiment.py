@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..fem.pattern import Joined
 from .actuator import Actuator
 from .arrays import read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
@@ -27,7 +26,7 @@ from .wrench_files import within
 
 if TYPE_CHECKING:
     from ..fem.body import Body
-    from ..fem.pattern import SymmetricPattern
+    from ..fem.pattern import Joined, SymmetricPattern
 
 Kind = Literal["dynamic", "static"]
 Start = Literal["equilibrium", "undeformed", "given"]
@@ -293,9 +292,8 @@ class Experiment:
 
     @property
     def joined(self) -> Joined:
-        """The mesh graph of its body, and the couplings of each of the actuators."""
-        couplings = (actuator.measure.couplings for actuator in self.actuators)
-        return Joined.of((self.body.pattern, *couplings))
+        """The mesh graph of its body, and the couplings of each of the actuators and forces."""
+        return self.body.joined_with([each.measure.couplings for each in self.actuators])
 
     @property
     def pattern(self) -> SymmetricPattern:

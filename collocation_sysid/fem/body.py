@@ -36,8 +36,9 @@ from .materials import Energy, Material
 from .memory import Carried, Prony, point_places, width
 from .mesh import TetMesh
 from .model import Model, Theta
+from .node_force import NodeForce, PlacedForce
 from .nodes import Nodes
-from .pattern import SymmetricPattern, element_destinations, in_ascending_order
+from .pattern import Joined, SymmetricPattern, element_destinations, in_ascending_order
 from .regions import Part, Region, parts_of
 from .selection import Selection
 from .stress import Stresses
@@ -66,7 +67,7 @@ class Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """Second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states; ∂²φ/∂v² is zero.
+    """Second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states.
 
     Attributes
     ----------
@@ -75,6 +76,7 @@ class Curvature:
     theta_theta : (T, k, k)
     theta : (T, k) first derivative ∂φ/∂θ
     position_velocity_skew : (T, m) lower triangles of the skew part of ∂²φ/∂x∂v, or (T, 0)
+    velocity_velocity : (T, m) lower triangles, or (T, 0): only forces of users have some
     """
 
     position_position: Array
@@ -84,6 +86,7 @@ class Curvature:
     theta_theta: Array
     theta: Array
     position_velocity_skew: Array
+    velocity_velocity: Array
 
 
 class Body(Model):
@@ -107,6 +110,8 @@ class Body(Model):
         Parts that differ.
     prony : sequence of str or Prony
         Names of the branches of the material's memory.
+    forces : sequence of NodeForce
+        Of the user's own, on its nodes, such as the drag of the air.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
         for a material that vector code cannot evaluate.
@@ -143,10 +148,12 @@ class Body(Model):
         damping: str | Damping = "kelvin-voigt",
         regions: Sequence[Region] = (),
         prony: Sequence[str | Prony] = (),
+        forces: Sequence[NodeForce] = (),
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
-        super().__init__(parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony))
+        parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony)
+        super().__init__(parts, tuple(forces))
         self.mesh = mesh
         self.element: Element = element_named(element)
         if self.remembers and self.element.mean_dilatation:
@@ -194,9 +201,10 @@ class Body(Model):
         if all(a.free_density == b.free_density for a, b in zip(free, self.parts, strict=True)):
             return self
         other = copy(self)
-        for name in ("starts", "stresses", "elastic_places", "mass_slopes", "_gamma_places"):
+        gone = "starts", "stresses", "elastic_places", "mass_slopes", "_gamma_places"
+        for name in (*gone, "placed_forces"):
             vars(other).pop(name, None)
-        Model.__init__(other, free)
+        Model.__init__(other, free, self.forces)
         other._evaluators = {}
         return other
 
@@ -290,7 +298,20 @@ class Body(Model):
     @cached_property
     def unsymmetric(self) -> bool:
         """Whether the slopes of the force have a skew part."""
-        return any(part.damping.stress is not None for part in self.parts)
+        laws = any(part.damping.stress is not None for part in self.parts)
+        return laws or any(force.turns for force in self.forces)
+
+    @cached_property
+    def placed_forces(self) -> tuple[PlacedForce, ...]:
+        """Those of users, where they are."""
+        volume, first, found = np.sum(self._lumped_m3, axis=0)[::3], self.starts[-1], []
+        for force in self.forces:
+            columns = first + np.arange(len(force.constants))
+            first += len(columns)
+            chosen = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
+            chosen = self.select(chosen) if isinstance(chosen, Selection) else np.unique(chosen)
+            found.append(PlacedForce.on(force, self.nodes, chosen, volume, columns))
+        return tuple(found)
 
     @cached_property
     def dof_mass(self) -> Array:
@@ -301,6 +322,11 @@ class Body(Model):
     def pattern(self) -> SymmetricPattern:
         """Sparsity of the stiffness matrix."""
         return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
+
+    def joined_with(self, couplings: Sequence[SymmetricPattern]) -> Joined:
+        """The mesh graph, other couplings, and those of the forces of users."""
+        own = (placed.couplings for placed in self.placed_forces)
+        return Joined.of((self.pattern, *couplings, *own))
 
     # One state ------------------------------------------------------------------------------
 
@@ -448,7 +474,8 @@ class Body(Model):
         for density, slope in self.mass_slopes.items():
             mixed = -np.einsum("ti,ti,i->t", w, v, slope)
             theta_theta[:, density, density - 1] = theta_theta[:, density - 1, density] = mixed
-        return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew)
+        none = np.zeros((len(x), 0))
+        return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, none)
 
     @cached_property
     def curvature_width(self) -> int:

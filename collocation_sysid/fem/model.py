@@ -13,6 +13,7 @@ from ..arrays import Array
 from ..errors import InputError, hint_at
 from .constants import DENSITY, MASS, Constant
 from .moduli import Source, elastic_names, source_of
+from .node_force import NodeForce
 from .regions import Part
 
 Theta = Sequence[float] | Array
@@ -24,18 +25,33 @@ class Model:
     Parameters
     ----------
     parts : tuple of Part
+    forces : tuple of NodeForce
+        Of users.
 
     Attributes
     ----------
     constants : dict of name to Constant
-        What θ holds, in its order.
+        What θ holds, in its order: those of the parts, then those of the forces.
+
+    Raises
+    ------
+    InputError
+        If two constants have one name.
     """
 
-    def __init__(self, parts: tuple[Part, ...]) -> None:
-        self.parts = parts
+    def __init__(self, parts: tuple[Part, ...], forces: tuple[NodeForce, ...] = ()) -> None:
+        self.parts, self.forces = parts, forces
         self.constants: dict[str, Constant] = {
             part.full_name(c.name): c for part in parts for c in part.constants
         }
+        for force in forces:
+            for constant in force.constants:
+                if constant.name in self.parameter_names:
+                    raise InputError(
+                        f"force {force.name!r} has the constant {constant.name!r}, which another "
+                        "part of the body has; expected a name of its own"
+                    )
+                self.constants[constant.name] = constant
 
     def sources(self, known: Sequence[str]) -> list[Source]:
         """For each part, which of the names that are known give its constants.
@@ -54,7 +70,8 @@ class Model:
 
     def used_names(self, known: Sequence[str]) -> set[str]:
         """Those of the names that are known which give its constants."""
-        return {name for source in self.sources(known) for name in source.names.values()}
+        own = {name for source in self.sources(known) for name in source.names.values()}
+        return own | self._of_forces
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -64,7 +81,11 @@ class Model:
             owns = [c.name for c in part.constants] + list(elastic_names(part.material))
             owns.append(DENSITY.name)
             names += [part.full_name(own) for own in owns] + owns
-        return tuple(dict.fromkeys([*names, MASS.name]))
+        return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
+
+    @property
+    def _of_forces(self) -> set[str]:
+        return {c.name for force in self.forces for c in force.constants}
 
     def assembled(self, values: Mapping[str, Any]) -> list[Any]:
         """θ from values by the user's names: numbers, or CasADi expressions.
@@ -80,6 +101,10 @@ class Model:
             if source.names.get(DENSITY.name) == MASS.name:
                 found[DENSITY.name] *= part.per_mass_1_m3
             theta += [found[c.name] for c in part.constants]
+        for name in list(self.constants)[len(theta) :]:
+            if name not in values:
+                raise InputError("no value is given of this constant of a force", None, name)
+            theta.append(values[name])
         return theta
 
     def theta(self, values: Mapping[str, float]) -> Array:

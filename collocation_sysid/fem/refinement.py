@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..arrays import Index
 from .mesh import TetMesh
 from .mesh_checks import orient
+from .node_force import NodeForce, PlacedForce
 from .quadratic import EDGES
 from .regions import Region
 from .selection import Ball, Box, Selection
@@ -78,18 +79,30 @@ def refined(body: Body) -> Body:
     ]
     # A region without a density of its own has the body's, whether any cell is left for it or not.
     rest = next((part for part in body.parts if not part.own_density), body.parts[0])
+    mesh = split_in_eight(body.mesh)
     finer = type(body)(
-        split_in_eight(body.mesh),
+        mesh,
         rest.material,
         rest.density_kg_m3,
         body.element.name,
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,
+        forces=[_finer(placed, mesh, body) for placed in body.placed_forces],
         evaluator=body.evaluator,
         threads=body.threads,
     )
     return finer.with_free_densities([part.name for part in body.parts if part.free_density])
+
+
+def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
+    """A force on the finer mesh: the middle of an edge belongs where both ends do."""
+    chosen = np.isin(np.arange(len(body.nodes_m)), placed.nodes)
+    nodes = chosen[: len(body.mesh.points_m)]
+    chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])
+    if body.element.edges:
+        chosen = np.concatenate([chosen, chosen[mesh.edges].all(axis=1)])
+    return placed.force.on_finer(np.flatnonzero(chosen))
 
 
 def refined_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:

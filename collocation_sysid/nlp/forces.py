@@ -23,6 +23,7 @@ from ..fem.memory import Carried
 from ..fem.model import Theta
 from ..fem.pattern import Joined, SymmetricPattern
 from .force_term import ForceTerm, Places, States
+from .point_forces import point_forces
 from .potential import Potential
 from .weight import Mass, Weight
 
@@ -53,12 +54,14 @@ class Forces:
             Potential(actuator.measure, actuator.amplitude(times)[:, None])
             for actuator in experiment.actuators
         )
-        return cls(Weight.of(experiment, times), potentials, experiment.joined)
+        further = (*potentials, *point_forces(experiment.body, times))
+        return cls(Weight.of(experiment, times), further, experiment.joined)
 
     @classmethod
     def on(cls, body: Body) -> Forces:
-        """Those on a body that nothing acts on, at one time."""
-        return cls(Weight.none(body), (), Joined.of((body.pattern,)))
+        """Those on a body that nothing acts on but what is its own, at one time."""
+        own = point_forces(body, np.zeros(1))
+        return cls(Weight.none(body), own, body.joined_with(()))
 
     @property
     def body(self) -> Body:
@@ -79,6 +82,10 @@ class Forces:
     def terms(self) -> tuple[ForceTerm, ...]:
         """Beside what is internal."""
         return (self.weight, *self.further)
+
+    def _rates(self, times: int) -> Array:
+        """Room for the curvature by velocities, where forces may have some."""
+        return np.zeros((times, self.pattern.entries if self.body.forces else 0))
 
     @cached_property
     def _ends(self) -> list[int]:
@@ -187,6 +194,7 @@ class Forces:
                 widened(widened(at.theta_theta).swapaxes(1, 2)),
                 widened(at.theta),
                 spread(at.position_velocity_skew),
+                self._rates(len(at.theta)),
             )
         states = self._states(xi, nu, theta)
         for term, places in self._placed:

@@ -6,7 +6,7 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -505,22 +505,27 @@ class Segment:
     @cached_property
     def _skew_hessian(self) -> BlockBand:
         """The same, to add what the skew part of ∂²φ/∂x∂v gives."""
-        blocks = self._hessian_blocks(skew=True)
+        blocks = self._hessian_blocks(self._skew_terms)
         return adding_skew(self.dofs, self._hessian_starts, blocks, top=self.nq)
+
+    @cached_property
+    def _rate_hessian(self) -> BlockBand:
+        """The same, to add what ∂²φ/∂v² gives."""
+        blocks = self._hessian_blocks(self._rate_terms)
+        return BlockBand(self.dofs, self._hessian_starts, blocks, self.nq, adds=True)
 
     @property
     def _hessian_starts(self) -> Index:
         return self.nq + np.arange(self.grid_rows) * self.dofs
 
-    def _hessian_blocks(self, skew: bool = False) -> list[Block]:
+    def _hessian_blocks(self, of: Callable[[int], Iterator[Term]] | None = None) -> list[Block]:
         rows, columns, source = self.pattern.full
         blocks = []
         for distance in range(self.dynamics.reach + 1):
             terms = list(self._curvature_terms(distance))
             if distance > 0 and not terms:
                 continue
-            if skew:
-                terms = list(self._skew_terms(distance))
+            terms = terms if of is None else list(of(distance))
             kept = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
             entries = rows[kept], columns[kept], source[kept]
             blocks.append(Block(-distance, *entries, terms, np.flatnonzero(kept)))
@@ -547,6 +552,14 @@ class Segment:
             skew = scale * (t.p[:, other] * t.q[:, i] - t.q[:, other] * t.p[:, i])
             if skew.any():
                 yield Term(i, ahead(skew, i), np.zeros(len(skew)))
+
+    def _rate_terms(self, distance: int) -> Iterator[Term]:
+        """The same of ∂²φ/∂v²."""
+        q, scale = self.dynamics.tables.q, (self.length_m / self.dynamics.step_s) ** 2
+        for i in range(self.dynamics.reach + 1 - distance):
+            vv = scale * q[:, i] * q[:, i + distance]
+            if vv.any():
+                yield Term(i, ahead(vv, i), np.zeros(len(vv)))
 
     def hessian_values(
         self,
@@ -579,6 +592,9 @@ class Segment:
         band.fill(
             of_band, curvature.position_position, curvature.position_velocity, self.body.threads
         )
+        if curvature.velocity_velocity.size:
+            rates = curvature.velocity_velocity
+            self._rate_hessian.fill(of_band, rates, rates, self.body.threads)
         skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
             self._skew_hessian.fill(of_band, skew, skew, self.body.threads)

@@ -1,16 +1,19 @@
-"""Materials that a problem file takes from Python files: foreign code, run only when allowed."""
+"""Materials and forces from Python files: foreign code, run only when allowed."""
 
 from __future__ import annotations
 
 import runpy
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from ..errors import InputError, hint_at
 from ..fem.materials import Energy, Material
+from ..fem.node_force import NodeForce
 from ..files import reason
-from .recording import existing_file
-from .schema import CodeSection
+from .recording import existing_file, selection
+from .schema import CodeSection, NodeForceSection
 
 
 def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -> Material:
@@ -19,8 +22,44 @@ def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -
     Raises
     ------
     InputError
-        If running code is not allowed, the file or the function is not there, the file fails, or
-        the function is no energy density, see `Material.of`.
+        See `load_function`; or if the function is no energy density, see `Material.of`.
+    """
+    file, found = load_function(section, folder, key, allowed)
+    if isinstance(found, Material):
+        return found
+    try:
+        return Material.of(cast(Energy, found), section.function)
+    except InputError as error:
+        raise error.located(file) from error
+
+
+def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool) -> NodeForce:
+    """Run the file and make a force on nodes of its function.
+
+    Raises
+    ------
+    InputError
+        See `load_function`; or if the function is no force, see `NodeForce.of`.
+    """
+    file, found = load_function(section, folder, key, allowed)
+    nodes = None if section.nodes is None else selection(section.nodes)
+    if isinstance(found, NodeForce):
+        return found if nodes is None else replace(found, nodes=nodes)
+    try:
+        return NodeForce.of(found, nodes=nodes, name=section.function)
+    except InputError as error:
+        raise error.located(file) from error
+
+
+def load_function(
+    section: CodeSection, folder: Path, key: str, allowed: bool
+) -> tuple[Path, Callable[..., Any]]:
+    """Run a file and take a function of it; the file's path too.
+
+    Raises
+    ------
+    InputError
+        If running code is not allowed, the file or the function is not there, or the file fails.
     """
     if not allowed:
         raise InputError(
@@ -35,16 +74,11 @@ def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -
     except (Exception, SystemExit) as error:
         raise InputError(f"running it failed: {reason(error)}", file) from error
     found = names.get(section.function)
-    if not callable(found):
+    if not callable(found) and not isinstance(found, NodeForce):
         functions = [n for n, v in names.items() if callable(v) and not n.startswith("_")]
         raise InputError(
             f"there is no function {section.function!r}; expected one of "
             f"{', '.join(functions) or 'none'}{hint_at(section.function, functions)}",
             file,
         )
-    if isinstance(found, Material):
-        return found
-    try:
-        return Material.of(cast(Energy, found), section.function)
-    except InputError as error:
-        raise error.located(file) from error
+    return file, cast(Callable[..., Any], found)

@@ -16,7 +16,7 @@ from ..fem.plausible import oddities
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..nlp.parameters import Parameters, Tied, Unknown
-from .code import load_material
+from .code import load_force, load_material
 from .densities import completed, guessed
 from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
@@ -156,6 +156,10 @@ def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: 
         damping=section.damping,
         regions=regions,
         prony=_branches(section, None),
+        forces=[
+            load_force(force, folder, f"force.{k}", allow_code)
+            for k, force in enumerate(section.force)
+        ],
         evaluator=section.evaluator,
     )
 

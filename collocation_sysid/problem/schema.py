@@ -31,6 +31,13 @@ class CodeSection(Section):
     function: Text = Field(description="Name of the energy function in it.")
 
 
+class NodeForceSection(CodeSection):
+    """A force of the user's own: a Python function of x, v, at and named constants."""
+
+    function: Text = Field(description="Name of the function of the force in it.")
+    nodes: Nodes | None = Field(None, description="Selection of nodes; all by default.")
+
+
 def _material_form(value: Any) -> str:
     return "<name>" if isinstance(value, str) else "<code>"
 
@@ -113,6 +120,10 @@ class ObjectSection(Section):
     prony: list[PronySection] = Field(
         default_factory=list,
         description="[[object.prony]] tables: a material with memory, branch by branch.",
+    )
+    force: list[NodeForceSection] = Field(
+        default_factory=list,
+        description="[[object.force]] tables: forces of the user's own on the nodes.",
     )
     evaluator: Literal["auto", "simd", "casadi"] = Field(
         "auto", description="How element kernels are evaluated."

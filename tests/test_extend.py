@@ -1,0 +1,224 @@
+"""What a user adds without touching the package: forces on nodes, in every method and in a file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from checks import assert_derivative
+from problem_files import AT_TRUTH, both, replace_text, run_command, settings, write
+from problems_small import GUESS, TRUTH, hung_cube
+from test_collocation import assert_derivatives
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.fem.refinement import refined
+from collocation_sysid.methods import METHODS
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.explicit import made_explicit
+from collocation_sysid.nlp.forces import Forces
+from collocation_sysid.nlp.simulation import simulate, with_markers
+
+DRAG = 40.0
+
+
+def drag(x, v, at, drag_coefficient):
+    """Of a thick fluid, so that it is felt: half its density, the share of the surface, speed."""
+    return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
+
+
+def smooth_drag(x, v, at, drag_coefficient):
+    """The same with a corner that differences do not see."""
+    return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1.0) * v
+
+
+def whirled(x, v, at, whirl_n_m3):
+    """It has no potential."""
+    return whirl_n_m3 * at.volume_m3 * ca.vertcat(at.rest_m[1] - x[1], x[0] - at.rest_m[0], 0)
+
+
+def in_fluid(steps: int = 10, law=drag, **changes) -> Experiment:
+    """A hung cube in a fluid, without what is unknown by default."""
+    old = hung_cube(steps, nuisance=Nuisance.none())
+    forces = [cs.NodeForce.of(law, cs.Constant("drag_coefficient", "c", usual=1.0))]
+    body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=forces, **changes)
+    return replace(old, body=body)
+
+
+def parameters(guess: float) -> cs.Parameters:
+    own = cs.Parameters.of({"drag_coefficient": cs.Unknown(guess)})
+    return cs.Parameters((*GUESS.items, *own.items))
+
+
+def seen(experiment: Experiment, integrator: str = "midpoint", sigma: float = 0.0) -> Experiment:
+    tracks = simulate(experiment, {**TRUTH, "drag_coefficient": DRAG}, integrator).markers_m
+    noise = sigma * np.random.default_rng(4).normal(size=tracks.shape)
+    return with_markers(experiment, tracks + noise)
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
+@pytest.mark.parametrize("law", [smooth_drag, whirled])
+def test_programs_with_a_users_force_have_exact_derivatives(law, scheme, rng):
+    cube = hung_cube(5, (1, 1, 2))
+    (name,) = (constant.name for constant in cs.NodeForce.of(law).constants)
+    body = cs.Body(cube.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.of(law)])
+    own = cs.Parameters.of({name: cs.Unknown(DRAG)})
+    known = cs.Parameters((*GUESS.items, *own.items))
+    assert_derivatives(Collocation([replace(cube, body=body)], known, scheme), rng)
+
+
+def test_so_have_those_of_a_body_with_memory(rng):
+    experiment = in_fluid(4, law=smooth_drag, prony=["prony_1"])
+    memory = cs.Parameters.of({"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)})
+    known = cs.Parameters((*parameters(DRAG).items, *memory.items))
+    program = made_explicit(Collocation([experiment], known))
+    z = program.plain.pack(program.guess_p, [seen_rows(s) for s in program.segments])
+    z = program.pack(*program.plain.unpack(z))
+    y = rng.normal(size=program.constraints)
+    jacobian, second = program.jacobian(z), program.hessian(z, 1.0, y)
+    assert_derivative(program.constraint_values, lambda d: jacobian @ d, z, rng, scale=0.05)
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return program.gradient(at) + program.jacobian(at).T @ y
+
+    assert_derivative(slope, lambda d: second @ d, z, rng, scale=0.05)
+
+
+def seen_rows(segment) -> np.ndarray:
+    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+    return rigid + 1e-3 * np.random.default_rng(3).normal(size=rigid.shape)
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if not m.startswith("casadi:")])
+def test_every_method_finds_the_constant_of_a_users_force(method):
+    problem = cs.Problem([seen(in_fluid())], parameters=parameters(25.0), method=METHODS[method]())
+    found = cs.solve(problem)
+    assert found.parameters["drag_coefficient"] == pytest.approx(DRAG, rel=5e-3)
+
+
+def test_newmarks_rule_moves_it_alike():
+    at = {**TRUTH, "drag_coefficient": DRAG}
+    experiment = in_fluid()
+    fine = simulate(experiment, at, "newmark", timestep_s=2.5e-4).markers_m
+    ours = simulate(experiment, at, "midpoint", substeps=40).markers_m
+    without = simulate(experiment, {**at, "drag_coefficient": 1e-6}, "midpoint", substeps=40)
+    moved = np.abs(ours - without.markers_m).max()
+    assert np.abs(ours - fine).max() < 0.02 * moved
+    assert moved > 2e-4
+
+
+def test_its_interval_holds_the_truth_and_the_report_names_it():
+    problem = cs.Problem([seen(in_fluid(20), sigma=1e-4)], parameters=parameters(25.0))
+    run = cs.run(problem)
+    low, high = run.interval("drag_coefficient")
+    assert low < DRAG < high
+    assert "drag_coefficient" in str(run)
+
+
+def test_left_out_the_verdict_doubts_the_answer():
+    experiment = seen(in_fluid(20), sigma=1e-5)
+    still = replace(experiment, body=hung_cube().body)
+    run = cs.run(cs.Problem([still], parameters=GUESS))
+    assert run.trust.verdict != "good"
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_on_a_finer_mesh_it_is_the_same_force(element):
+    mesh = hung_cube().body.mesh
+    body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[cs.NodeForce.of(drag)])
+    wind = np.array([0.3, -0.2, 0.5])
+    theta = np.array([1e-9, 1e-9, 0.0, 0.0, DRAG])
+    of_both = []
+    for each in (body, refined(body)):
+        moving = np.tile(wind, len(each.nodes_m))[None]
+        total = Forces.on(each).total(each.nodes_m.reshape(1, -1), moving.reshape(1, -1), theta)
+        of_both.append(total.reshape(-1, 3).sum(axis=0))
+    expected = -5.0 * DRAG * 6 * 0.1**2 * np.linalg.norm(wind) * wind
+    np.testing.assert_allclose(of_both, [expected, expected], rtol=1e-6)
+
+
+# In a file ---------------------------------------------------------------------------------------
+
+MINE = """
+import casadi as ca
+
+def drag(x, v, at, drag_coefficient):
+    return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
+
+def lift(x, v, at, drag_coefficient):
+    return drag_coefficient * ca.vertcat(v[1], -v[0], 0)
+
+def wild(x, v, at, drag_coefficient):
+    return -drag_coefficient * ca.sqrt(ca.sumsqr(v)) * v[:2]
+"""
+FORCE = """density_kg_m3 = 30.0
+[[object.force]]
+file = "mine.py"
+function = "{}"
+"""
+PARAMETER = "gamma_m_1_s = {"
+
+
+def with_force(function: str = "drag"):
+    return both(
+        replace_text("density_kg_m3 = 30.0\n", FORCE.format(function)),
+        replace_text(PARAMETER, f"drag_coefficient = {{ guess = 25.0 }}\n{PARAMETER}"),
+    )
+
+
+def test_a_force_in_a_file_is_simulated_and_identified(tiny):
+    with_force()(tiny)
+    write("mine.py", MINE)(tiny)
+    truth = settings(*AT_TRUTH, "parameters.drag_coefficient.guess=40")
+    code = ("problem.toml", "--allow-code", "--quiet")
+    done = run_command("simulate", *code, *truth, "--integrator", "midpoint", "--out", "data")
+    assert done.code == 0, done.err
+    recorded = settings("experiment.0.markers.file=data/swing_markers.csv")
+    assert run_command("solve", *code, *recorded, "--out", "found").code == 0
+    result = json.loads((tiny / "found" / "result.json").read_text())
+    value = result["parameters"]["drag_coefficient"]["value"]
+    assert value == pytest.approx(40.0, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        ("lift", "the derivative of force 'lift' by the velocity is not symmetric"),
+        ("wild", r"force 'wild' has the shape \(2, 1\); expected \(3, 1\)"),
+        ("gone", "there is no function 'gone'; expected one of drag, lift, wild"),
+    ],
+)
+def test_what_is_no_force_is_one_message(tiny, function, said):
+    with_force(function)(tiny)
+    write("mine.py", MINE)(tiny)
+    with pytest.raises(InputError, match=said):
+        cs.Problem.read(tiny / "problem.toml", allow_code=True)
+
+
+def test_a_force_is_not_run_unless_it_is_allowed(tiny):
+    with_force()(tiny)
+    write("mine.py", "raise SystemExit")(tiny)
+    found = run_command("solve", "problem.toml")
+    assert found.code == 2
+    assert "object.force.0" in found.err
+    assert "--allow-code" in found.err
+
+
+def test_a_constant_that_the_body_has_is_refused():
+    def mine(x, v, at, mu_pa):
+        return -mu_pa * v
+
+    with pytest.raises(InputError, match="'mu_pa', which another part of the body has"):
+        cs.Body(hung_cube().body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.of(mine)])
+
+
+def test_a_law_that_is_not_finite_at_rest_is_refused():
+    def mine(x, v, at, drag_coefficient):
+        return -drag_coefficient * ca.sqrt(ca.sumsqr(v)) * v
+
+    with pytest.raises(InputError, match="not finite where the node is at rest"):
+        cs.NodeForce.of(mine)
