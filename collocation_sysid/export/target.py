@@ -72,6 +72,8 @@ def left_out(body: Identified, memory: bool = False, moving: bool = True) -> lis
     e, said = body.experiment, []
     if e.actuators:
         said.append("tendons and pressures are not exported")
+    if e.body.forces:
+        said.append(f"{', '.join(f.name for f in e.body.forces)} of your own is not exported")
     times = e.t_s
     if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
         said.append("forces and point masses stay as they are at the first sample")

@@ -284,6 +284,8 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a material with memory", "one without Prony branches")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
+    if any(force.timed for force in experiment.body.forces):
+        raise refused("a force that depends on time", "one that does not")
     if not experiment.markers.names:
         raise refused("an experiment without markers", "markers")
     if any(np.isfinite([g.from_s, g.until_s]).any() for g in experiment.grasps):
