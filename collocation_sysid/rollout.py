@@ -74,7 +74,7 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         )
     except SimulationError as error:
         return str(error)
-    readings = segment.observation.of_samples(trajectory.positions_m, phi)
+    readings = segment.markers.of_samples(trajectory.positions_m, phi)
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]
     nuisance, wrenches = segment.nuisance, _read(segment, phi, trajectory)
@@ -96,7 +96,7 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
 def _read(segment: Segment, phi: Array, trajectory: Trajectory) -> list[Array]:
     """What the experiment's sensors read, with its φ, of what was simulated."""
     grid, forced = trajectory.reactions
-    return [replace(sensor, on=grid).readings(forced, phi) for sensor in segment.sensors]
+    return [sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors]
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:

@@ -176,7 +176,7 @@ def twin(
     drawn = rng.standard_normal(collocation.nphi)
     followed, p = collocation.following(np.append(collocation.parameters.guess_q, drawn))
     (segment,), phi = followed.segments, p[collocation.nq :]
-    tracks = segment.observation.predicted(x, phi)
+    tracks = segment.markers.of_positions(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
     return collocation_of(with_markers(experiment, tracks + noise)), phi
 

@@ -162,7 +162,7 @@ def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     values = problem.parameters.guesses
     _, scheme, substeps = options
     actual = simulate(segment.corrected(phi), values, scheme, substeps=substeps)
-    tracks = segment.observation.of_samples(actual.positions_m, phi)
+    tracks = segment.markers.of_samples(actual.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     seen = with_markers(experiment, tracks + noise)
     solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(Collocation([seen], *options))

@@ -233,7 +233,7 @@ def rms_mm(solution: Solution) -> list[float]:
 
 
 def rms_of(part: Part) -> float:
-    squares = part.segment.observation.squared_distances_m2(part.x, part.phi)
+    squares = part.segment.markers.squared_distances_m2(part.x, part.phi)
     return 1e3 * float(np.sqrt(squares.mean()))
 
 

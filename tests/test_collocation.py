@@ -450,7 +450,7 @@ def test_the_loss_counts_present_samples_only():
     expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurements
     assert collocation.objective(z) == pytest.approx(expected)
     np.testing.assert_allclose(
-        segment.observation.squared_distances_m2(x, np.zeros(0)), squares[present]
+        segment.markers.squared_distances_m2(x, np.zeros(0)), squares[present]
     )
     assert collocation.rms_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
 

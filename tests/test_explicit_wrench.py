@@ -25,8 +25,8 @@ from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.explicit import carried_over
 from collocation_sysid.nlp.parameters import Parameters, Unknown
 from collocation_sysid.nlp.reaction_rows import Reactions
-from collocation_sysid.nlp.sensor_rows import SensorRows
 from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.nlp.wrench_rows import WrenchRows
 
 DENSE = TRUTH | {"density_kg_m3": 30.0}
 ALL_UNKNOWN = Nuisance.none(
@@ -111,8 +111,8 @@ def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):
     assert program.objective(z) == pytest.approx(collocation.objective(given), rel=1e-12)
     np.testing.assert_allclose(carried_over(z, program, collocation), given, rtol=1e-14)
     (sensor,) = collocation.segments[0].sensors
-    assert program.added(SensorRows) == 12 * len(sensor.grid)
-    assert program.added(Reactions) == 7 * len(sensor.places)
+    assert program.added(WrenchRows) == 12 * sensor.channel.count
+    assert program.added(Reactions) == 7 * len(sensor.channel.places)
 
 
 # What methods find ------------------------------------------------------------------------------

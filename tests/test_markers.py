@@ -10,7 +10,7 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Markers, Placement, place_markers
-from collocation_sysid.nlp.observation import operator_of
+from collocation_sysid.nlp.channel import operator_of
 
 
 def box_body(divisions=(2, 2, 3), edge_m=0.1) -> Any:

@@ -134,7 +134,7 @@ def load_n(experiment: Experiment) -> np.ndarray:
     collocation = fitted(experiment, Parameters.of(TRUTH))
     x = march(experiment, collocation.segments[0].dynamics, as_theta(TRUTH))
     (part,) = collocation.parts_at(np.zeros(0), [x])
-    return part.sensing.readings(x)[0][:, 2]
+    return part.sensing.wrenches(x)[0][:, 2]
 
 
 def test_forces_rank_the_platens_where_there_are_no_markers():

@@ -55,7 +55,7 @@ def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
     followed, p = collocation.following(np.append(GUESS.guess_q, phi))
     (segment,) = followed.segments
     motion = simulate(segment.corrected(phi), TRUTH, "midpoint")
-    return segment.observation.of_samples(motion.positions_m, p[followed.nq :])
+    return segment.markers.of_samples(motion.positions_m, p[followed.nq :])
 
 
 def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:
@@ -118,7 +118,7 @@ def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     cube = replace(hung_cube(20), nuisance=Nuisance.none(time_shift_s=0.01))
     (segment,) = alone(cube, substeps=10).segments
     grid = simulate(cube, TRUTH, "midpoint", substeps=10)
-    found = segment.observation.of_samples(grid.positions_m, np.array([share]))
+    found = segment.markers.of_samples(grid.positions_m, np.array([share]))
     dense = replace(cube, t_s=np.linspace(0, 0.2, 201), markers=_on(cube, np.linspace(0, 0.2, 201)))
     expected = simulate(dense, TRUTH, "midpoint").markers_m
     moved = np.abs(expected - expected[0]).max()

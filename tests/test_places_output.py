@@ -129,7 +129,7 @@ def test_places_travel_to_another_mesh(folder: Path):
     places_m = segment.places_m(segment.guess_phi)
     for m, name in enumerate(segment.experiment.markers.names):
         assert places_m[m] == pytest.approx(earlier.places_m["swing"][name], abs=1e-9)
-        of_nodes, reading = segment.observation.reading(segment.guess_phi)
+        of_nodes, reading = segment.markers.channel.shape(segment.guess_phi)
         there = reading.weights[m] @ segment.body.nodes_m[of_nodes[m]]
         assert there == pytest.approx(places_m[m], abs=1e-9)
 

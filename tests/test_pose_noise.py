@@ -49,7 +49,7 @@ def reading(of: Collocation, poses: PoseSequence, phi: np.ndarray) -> tuple[np.n
     (segment,) = replace(of, experiments=(moved,)).segments
     motion = simulate(segment.corrected(phi), TRUTH, of.scheme)
     positions = motion.positions_m.reshape(len(motion.positions_m), -1)
-    return segment.observation.predicted(positions, phi), positions
+    return segment.markers.of_positions(positions, phi), positions
 
 
 @pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])

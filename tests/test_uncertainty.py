@@ -23,6 +23,7 @@ from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.segment import Segment
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.statistics.uncertainty import (
     covariance,
@@ -144,6 +145,12 @@ def test_marker_sensitivities_are_those_of_the_nodes_at_the_samples():
 # Covariance
 
 
+def residuals(segment: Segment, x: np.ndarray) -> np.ndarray:
+    """Of its markers (T, M, 3), without nuisance parameters."""
+    phi = np.zeros(0)
+    return segment.markers.residuals(segment.markers.channel.of(x, phi), phi)
+
+
 def test_covariance_is_that_of_the_weighted_least_squares_problem():
     experiments = [with_sigma(cube_with_gaps(5), 2e-3), hung_cube(4)]
     collocation, z = simulated(experiments)
@@ -152,7 +159,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
         ahead, behind = (
             np.concatenate(
                 [
-                    segment.observation.residuals(x, np.zeros(0)).ravel()
+                    residuals(segment, x).ravel()
                     for segment, x in zip(
                         collocation.segments,
                         positions(collocation, AT_TRUTH.guess_q + sign * direction),
@@ -197,7 +204,7 @@ def fitted(collocation: Collocation, q, steps=2):
         (x,) = positions(collocation, q)
         (by_q,) = marker_sensitivities(collocation, collocation.pack(q, [x]))
         matrix = weight * by_q.reshape(-1, 4)
-        q = q - np.linalg.lstsq(matrix, segment.observation.residuals(x, np.zeros(0)).ravel())[0]
+        q = q - np.linalg.lstsq(matrix, residuals(segment, x).ravel())[0]
     return q
 
 

@@ -36,12 +36,18 @@ from collocation_sysid.experiment import (
 )
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.shooting import adjoint_gradient, simulated
+from collocation_sysid.nlp.channel import Forced, Motion
 from collocation_sysid.nlp.collocation import Collocation, Part
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.sensor import Forced, low_pass
 from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.nlp.wrench_channel import (
+    fading,
+    pulled_through,
+    smoothed,
+    smoothed_slope,
+)
 
 EVERYTHING = Nuisance(
     gravity_rad=0.03,
@@ -64,9 +70,8 @@ def at_truth(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1
 
 def total_on_grid(part: Part) -> tuple[np.ndarray, np.ndarray]:
     """Grid times and the wrenches (n, 6) of all grasps together."""
-    forced = part.sensing.at(part.x)
-    wrenches = [sensor.on_grid(forced)[0] for sensor in part.segment.sensors]
-    return part.segment.sensors[0].grid, np.sum(wrenches, axis=0)
+    forced, channels = part.motion.forced, [s.channel for s in part.segment.sensors]
+    return channels[0].grid, np.sum([c.without_tool(forced) for c in channels], axis=0)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -83,7 +88,7 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(experiment: Experi
     dynamics = part.segment.dynamics
     mass = dynamics.mass.row(0, theta)[::3]
     stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
-    acceleration = stencil[grid + part.segment.sensors[0].late].reshape(len(grid), -1, 3)
+    acceleration = stencil[grid + part.segment.sensors[0].channel.on.late].reshape(len(grid), -1, 3)
     pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
     weight_n = 9.81 * mass.sum()
     assert np.abs(found[:, :3] - pull.sum(axis=1)).max() < 1e-9 * weight_n
@@ -138,9 +143,9 @@ def test_the_frame_of_the_grasp_moves_along():
 def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
     part = at_truth(sensing(bar_let_go(12)))
     still, moving = part.segment.sensors
-    assert still.grid[-1] == 11
+    assert still.channel.grid[-1] == 11
     # It holds up to the third grid time; the first two rows are those of the start.
-    np.testing.assert_array_equal(moving.grid, [1])
+    np.testing.assert_array_equal(moving.channel.grid, [1])
 
 
 # Derivatives --------------------------------------------------------------------------------------
@@ -258,29 +263,37 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
         slow = replace(cube, t_s=t_s, markers=replace(cube.markers, t_s=t_s))
         fine = np.linspace(0.03, 0.13, 87)
         part = at_truth(sensing(slow, fine))
-        (read,) = part.sensing.readings(part.x)
+        (read,) = part.sensing.wrenches(part.x)
         dense = at_truth(sensing(slow, fine), substeps=8 // refinement)
-        (expected,) = dense.sensing.readings(dense.x)
+        (expected,) = dense.sensing.wrenches(dense.x)
         errors.append(relative_error(read[:, :3], expected[:, :3]))
     assert errors[1] < 0.4 * errors[0]
 
 
 def test_a_low_pass_follows_a_ramp_by_its_time_constant():
     step_s, lag_s = 0.01, 0.025
-    smoothing, _ = low_pass(lag_s, step_s, 60)
     ramp = step_s * np.arange(60)
-    lag = ramp - smoothing @ ramp
+    lag = ramp - smoothed(fading(lag_s, step_s)[:, 0], ramp)
     assert lag[-1] == pytest.approx(lag_s * (1 - np.exp(-ramp[-1] / lag_s)), rel=1e-12)
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.002, 0.05])
 def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float):
     signal = np.random.default_rng(0).standard_normal(20)
-    _, slope = low_pass(lag_s, 0.01, 20)
-    step = 1e-6
-    before = low_pass(max(0.0, lag_s - step), 0.01, 20)[0]
-    change = (low_pass(lag_s + step, 0.01, 20)[0] - before) / (step + min(step, lag_s))
-    np.testing.assert_allclose(slope @ signal, change @ signal, rtol=1e-3, atol=0.02)
+    step, coefficients = 1e-6, fading(lag_s, 0.01)
+
+    def read(lag_s: float) -> np.ndarray:
+        return smoothed(fading(lag_s, 0.01)[:, 0], signal)
+
+    slope = smoothed_slope(coefficients, signal, read(lag_s))
+    change = read(lag_s + step) - read(max(0.0, lag_s - step))
+    np.testing.assert_allclose(slope, change / (step + min(step, lag_s)), rtol=1e-3, atol=0.02)
+
+
+def test_a_low_pass_is_pulled_through_by_its_transpose(rng):
+    (signal, weights), e_a_b = rng.normal(size=(2, 20)), fading(0.02, 0.01)[:, 0]
+    forward = weights @ smoothed(e_a_b, signal)
+    assert pulled_through(e_a_b, weights) @ signal == pytest.approx(forward, rel=1e-12)
 
 
 # Static experiments and single axes ---------------------------------------------------------------
@@ -315,16 +328,19 @@ def test_slopes_of_a_static_experiment():
 def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
     (segment,) = fitted(noisy_wrenches(wristed_cube(8, frame="grasp")), GUESS).segments
     (sensor,) = segment.sensors
-    poses, rows, dofs = sensor.grasp.poses, segment.grid_rows, len(segment.sensed_dofs)
-    forced = Forced.still(rng.normal(size=(rows, dofs)), rng.normal(size=(rows, dofs)))
+    grasp, rows, dofs = sensor.channel.grasp, segment.grid_rows, len(segment.sensed_dofs)
+    poses = grasp.poses
+    forced = Forced(rng.normal(size=(rows, dofs)), rng.normal(size=(rows, dofs)))
+    motion, phi = Motion(np.zeros((rows, segment.dofs)), lambda: forced), np.zeros(0)
     shift, turn = rng.normal(size=(2, 3))
 
     def residual(size: float) -> np.ndarray:
         turned = Rotation.from_rotvec(size * turn) * Rotation.from_quat(poses.quaternions_xyzw)
         off = PoseSequence(poses.t_s, poses.positions_m + size * shift, turned.as_quat())
-        other = replace(sensor, grasp=replace(sensor.grasp, poses=off))
-        return other.linearised(forced, np.zeros(0, dtype=int), np.zeros(0), 0)[0]
+        other = replace(sensor.channel, grasp=replace(grasp, poses=off))
+        return sensor.residuals(other.values(motion, phi), phi)
 
     given = [np.tile(each, (rows, 1, 1)) for each in (shift, turn)]
-    found = sensor.frame_response(forced, np.zeros(0), *given)[..., 0]
+    carried = sensor.channel.carried(grasp, motion, phi, *given)
+    found = sensor.changes(sensor.channel.values(motion, phi), carried, phi)[..., 0]
     assert relative_error(found, (residual(1e-4) - residual(-1e-4)) / 2e-4) < 1e-5

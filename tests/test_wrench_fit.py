@@ -117,7 +117,7 @@ def test_tare_clock_lag_and_tool_are_found():
     made = simulate(swung(0, wanted, 60), TRUTH, "midpoint")
     grid, forced = made.reactions
     (sensor,) = segment.sensors
-    read = replace(sensor, on=grid).readings(forced, phi)
+    read = sensor.on(grid).of_forced(forced, phi)
     measured = with_wrenches(swung(0, wanted, 60), [read])
     collocation = Collocation([with_markers(measured, made.markers_m)], GUESS)
     solution = ReducedSpace()(collocation)

@@ -56,7 +56,7 @@ def sensed(
     (segment,) = collocation.segments
     x = march(experiment, segment.dynamics, as_theta(truth))
     (part,) = collocation.parts_at(np.zeros(collocation.nphi), [x])
-    return with_wrenches(made, part.sensing.readings(x))
+    return with_wrenches(made, part.sensing.wrenches(x))
 
 
 def wristed_cube(steps: int = 12, nuisance: Nuisance | None = None, **changes) -> Experiment:

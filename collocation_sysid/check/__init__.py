@@ -22,8 +22,8 @@ from ..nlp.factorisation import Choice
 from ..nlp.overstress import Overstress
 from ..nlp.reaction_rows import Reactions
 from ..nlp.schemes import as_scheme
-from ..nlp.sensor_rows import SensorRows
 from ..nlp.stability import instabilities
+from ..nlp.wrench_rows import WrenchRows
 from ..problem import Problem
 from ..statistics.cause import Cause
 from ..statistics.concern import Concern, as_said
@@ -259,7 +259,7 @@ def check_problem(
         variables=collocation.variables,
         constraints=collocation.constraints,
         overstresses=whole.added(Overstress) if isinstance(whole, Explicit) else 0,
-        wrenches=whole.added(Reactions, SensorRows) if isinstance(whole, Explicit) else 0,
+        wrenches=whole.added(Reactions, WrenchRows) if isinstance(whole, Explicit) else 0,
         jacobian_nonzeros=jacobian,
         hessian_nonzeros=hessian,
         method=method,
@@ -311,7 +311,7 @@ def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[R
     """What was recorded; `collocation` may be of the first samples."""
     simulated = {}
     for part in collocation.parts(z):
-        at_samples = part.x[part.segment.observation.grid_rows]
+        at_samples = part.x[part.segment.markers.grid_rows]
         simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
 

@@ -39,7 +39,7 @@ from .intake import LONGEST, Intake
 from .model import TOGETHER, Model, Poses
 from .search import SEEN, Search
 from .statistics import Scatter, widened
-from .sweep import LoggedRow, Reading
+from .sweep import LoggedRow, Tracks
 from .track import JoinedPasses, Track
 from .trust import UNSETTLED, data_concerns, estimate_concerns
 from .whole import recording_of, solved
@@ -332,7 +332,7 @@ class Estimator:
             said += self._read(row.readings, squares, done - k)
         return done, said
 
-    def _read(self, readings: Sequence[Reading], squares: list[Array], rows: int = 0) -> list[str]:
+    def _read(self, readings: Sequence[Tracks], squares: list[Array], rows: int = 0) -> list[str]:
         """Take what is read so many rows before the last one, without samples that jump."""
         track = self.track
         if track is None:
@@ -381,7 +381,7 @@ class Estimator:
         nowhere[0] = 0.0
         try:
             trial = Track(self.model, self.p, self.prior, self._block_rows)
-            row = LoggedRow(moved, [Reading(0.0, nowhere)])
+            row = LoggedRow(moved, [Tracks(0.0, nowhere)])
             for _ in range(self.model.rows + 2):
                 trial.again([row])
         except SimulationError:

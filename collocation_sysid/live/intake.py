@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..experiment.clock import TIME_TOLERANCE_S
-from .sweep import LATEST, LoggedRow, Reading, lagrange
+from .sweep import LATEST, LoggedRow, Tracks, lagrange
 
 # Frames this near in time, in samples, are of one time.
 TOLERANCE = 0.1
@@ -88,7 +88,7 @@ class Intake:
 
     def take(
         self, t_s: float, pose: tuple[Array, Array] | None, tracks_m: Array
-    ) -> tuple[list[LoggedRow], list[Reading], list[str]]:
+    ) -> tuple[list[LoggedRow], list[Tracks], list[str]]:
         """The rows a frame completes, what can be read after the last row, and what was odd.
 
         Parameters
@@ -164,7 +164,7 @@ class Intake:
 
     def _due(self) -> list[LoggedRow]:
         """The rows that there are poses for."""
-        found: list[tuple[Array, Array, list[Reading]]] = []
+        found: list[tuple[Array, Array, list[Tracks]]] = []
         if self.start_s is None:
             return []
         until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
@@ -194,7 +194,7 @@ class Intake:
         )
         return position_m, quaternion
 
-    def _ready(self) -> list[Reading]:
+    def _ready(self) -> list[Tracks]:
         """What can be read after the rows there are."""
         if self.start_s is None or not self.rows:
             return []
@@ -205,4 +205,4 @@ class Intake:
         self._waiting = [each for each in self._waiting if each[0] > latest_s]
         # Before the first row nothing is known.
         ready = [each for each in ready if each[0] >= self.start_s - TOLERANCE * self.interval_s]
-        return [Reading((now_s - t_s) / step_s, tracks) for t_s, tracks in ready]
+        return [Tracks((now_s - t_s) / step_s, tracks) for t_s, tracks in ready]

@@ -22,8 +22,8 @@ from ..methods.scan import usual_parameters
 from ..nlp.collocation import Collocation
 from ..nlp.forces import Forces
 from ..nlp.least_squares import LeastSquares
+from ..nlp.markers import NEIGHBOURS, MarkerReading
 from ..nlp.newton import NewtonOptions, Solver
-from ..nlp.observation import NEIGHBOURS, Observation
 from ..nlp.row import Row
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver
@@ -173,18 +173,15 @@ class Model:
         return NEIGHBOURS // 2 if len(self.segment.nuisance.of_clock) else 0
 
     @cached_property
-    def reads_plainly(self) -> bool:
-        """Whether a marker is read as it is, at its place on the body, if by another clock."""
-        return self.segment.nuisance.reads_plainly
-
-    @cached_property
-    def observation(self) -> Observation:
-        """Reads one sample, in the middle, of markers measured at the origin."""
+    def markers(self) -> MarkerReading:
+        """Reads one sample, in the middle of those around, of markers measured at the origin."""
         around, markers = self.samples_around, self.segment.experiment.markers
-        count = 2 * around + 1
-        t_s = markers.t_s[:count]
-        origin = replace(markers, t_s=t_s, positions_m=np.zeros((count, len(markers.names), 3)))
-        return Observation(origin, np.arange(count), self.segment.nuisance, self.segment.chart)
+        origin = replace(
+            markers, t_s=markers.t_s[:1], positions_m=np.zeros((1, len(markers.names), 3))
+        )
+        rows, segment = np.arange(2 * around + 1), self.segment
+        where = rows, segment.nuisance, segment.chart
+        return MarkerReading.of(origin, *where, earlier=around)
 
     @cached_property
     def moved_grasps(self) -> Index:

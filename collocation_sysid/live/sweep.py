@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.body import Linearisation
-from ..methods.robust import huberised
 from ..nlp.least_squares import LeastSquares
 from ..nlp.marching import RowEquations, extrapolated, solve_row
 from ..nlp.newton import NewtonFailure, simulation_error
+from ..nlp.reading import as_squares
 from ..nlp.rest import start_state
 from ..nlp.row import Row
 from ..nlp.tangent import Columns, Forward, GivenMotion, Memory, Step
@@ -38,7 +38,7 @@ NEAR = 1e-3
 LATEST = 5
 
 
-class Reading(NamedTuple):
+class Tracks(NamedTuple):
     """Markers (M, 3), NaN where missing, so many rows before the row they are read after."""
 
     back: float
@@ -49,7 +49,7 @@ class LoggedRow(NamedTuple):
     """What came with one row of the grid."""
 
     poses: Poses
-    readings: list[Reading]
+    readings: list[Tracks]
 
 
 class Kept(NamedTuple):
@@ -134,8 +134,7 @@ class Sweep:
         self.setting = segment.setting(p[: collocation.nq], self.phi)
         self.dynamics = self.setting.dynamics
         self.carried = model.carried(self.phi)
-        self.reading = segment.observation.reading(self.phi)
-        self.clock = self._weights_in_time()
+        self.shape_functions = segment.markers.channel.shape(self.phi)
         self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.count = 1 + len(self.moving)
@@ -331,7 +330,7 @@ class Sweep:
 
     def _seen(self, whole: Array) -> Array:
         """What the markers have of columns (…, 3n, k) of the body, (…, 3M, k)."""
-        (nodes, places), (*rows, dofs, count) = self.reading, whole.shape
+        (nodes, places), (*rows, dofs, count) = self.shape_functions, whole.shape
         at = whole.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
         return np.einsum("ma,...maik->...mik", places.weights, at).reshape(*rows, -1, count)
 
@@ -353,54 +352,22 @@ class Sweep:
 
     # Markers ----------------------------------------------------------------------------------
 
-    def linearised(self, reading: Reading, rows: int = 0) -> Said:
+    def linearised(self, reading: Tracks, rows: int = 0) -> Said:
         """What was read so many `rows` before the last one."""
         residual, slope = self._by_p(reading, rows)
         slope /= self.rates
         return Said(residual - slope @ self.flat, slope)
 
-    def _by_p(self, reading: Reading, rows: int) -> tuple[Array, Array]:
+    def _by_p(self, reading: Tracks, rows: int) -> tuple[Array, Array]:
         """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P) by p."""
-        model, around = self.model, self.model.samples_around
-        sigma = self.segment.experiment.markers.sigma_m[:, None]
+        model, around, markers = self.model, self.model.samples_around, self.model.markers
         back = reading.back + rows
         backs = [back - k * model.substeps for k in range(-around, around + 1)]
         x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
-        if not model.reads_plainly:
-            parts = x, self.phi, seen[..., 1:], self.moving, self.segment.nq
-            found = model.observation.linearised(*parts)
-            return found[0][around] - reading.tracks_m / sigma, found[1][around]
-        weights, rates = self.clock
-        read, moves = (
-            (each @ seen.reshape(len(seen), -1)).reshape(*reading.tracks_m.shape, -1)
-            for each in (weights, rates)
-        )
-        slope = np.zeros((*reading.tracks_m.shape, model.size))
-        slope[..., self.moving] = read[..., 1:]
-        if around:
-            (time,) = self.segment.nq + self.segment.nuisance.of_clock
-            slope[..., time] = moves[..., 0]
-        observation, (nodes, places) = model.observation, self.reading
-        for m in observation.chart.estimated:
-            own = self.segment.nq + observation.place_places[m]
-            at_m = np.tensordot(weights, x[:, 3 * nodes[m][:, None] + np.arange(3)], 1)
-            slope[m][:, own] = at_m.T @ places.slopes[m]
-        return (read[..., 0] - reading.tracks_m) / sigma, slope / sigma[..., None]
-
-    def _weights_in_time(self) -> tuple[Array, Array]:
-        """Weights of the samples around one as the clock is off, and their slopes by its φ."""
-        around, places = self.model.samples_around, self.segment.nuisance.of_clock
-        if not around:
-            return np.ones(1), np.zeros(1)
-        at = range(-around, around + 1)
-        unit = float(self.segment.nuisance.scales[places[0]]) / self.model.interval_s
-        late = unit * float(self.phi[places[0]])
-        # Of a polynomial of fourth order central differences with a step of one, and half of
-        # one, are exact to rounding when combined.
-        wide, near = (
-            (lagrange(at, late + h) - lagrange(at, late - h)) / (2 * h) for h in (1.0, 0.5)
-        )
-        return lagrange(at, late), unit * (4 * near - wide) / 3
+        values = seen[..., 0].reshape(len(seen), -1, 3)
+        slopes = markers.channel.slopes_of(x, self.phi, self.moving, seen[..., 1:])
+        residual, slope = markers.linearised(values, slopes, self.phi, model.size)
+        return residual[0] - reading.tracks_m / markers.sigmas[:, None], slope[0]
 
     def _at(self, back: float) -> tuple[Array, Array]:
         """X and what the markers have so many rows before the last; the start before the start."""
@@ -425,11 +392,11 @@ class Sweep:
             return known
         at_zero, slope = (np.concatenate(part) for part in zip(*said, strict=True))
         here = np.isfinite(at_zero[:, 0])
-        slopes = slope[here].reshape(-1, slope.shape[2])
-        rows, huber = at_zero[here].ravel() + slopes @ self.flat, self.model.collocation.huber
-        if huber is not None:
-            rows, slopes = huberised(rows, slopes, huber)
-        return known.add(rows, slopes, self.flat)
+        slopes = slope[here]
+        rows, slopes = as_squares(
+            at_zero[here] + slopes @ self.flat, slopes, self.model.collocation.huber
+        )
+        return known.add(rows.ravel(), slopes.reshape(-1, slopes.shape[2]), self.flat)
 
 
 def lagrange(points: Sequence[float], wanted: float) -> Array:

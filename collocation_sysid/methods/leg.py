@@ -16,9 +16,9 @@ from ..nlp.collocation import Part
 from ..nlp.least_squares import LeastSquares
 from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
+from ..nlp.reading import as_squares
 from ..nlp.segment import Segment
 from ..nlp.tangent import BlockSolver, Tangent
-from .robust import huberised
 from .start import continued
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
@@ -51,7 +51,7 @@ class Seen:
     @classmethod
     def of(cls, part: Part, x: Array, violation_n: float) -> Seen:
         """That of a part, with its markers read at x."""
-        squares = part.segment.observation.squared_distances_m2(x, part.phi)
+        squares = part.segment.markers.squared_distances_m2(x, part.phi)
         return cls(len(x), violation_n, float(squares.sum()), len(squares))
 
 
@@ -92,7 +92,7 @@ class Leg:
     ----------
     x : (rows, 3n)
     tangent : Tangent
-    slope : (M, k) S, of sensors and markers after the feasibility step
+    slope : (M, k) S, of all readings after the feasibility step
     report : Report
     """
 
@@ -216,30 +216,19 @@ def _read(
     before: Leg | None,
     spent: tuple[float, float, float],
 ) -> Leg:
-    """Markers and sensors after the feasibility step."""
-    segment, observation = part.segment, part.segment.observation
-    projected = part.x + tangent.step
-    by_p = observation.at_samples(tangent.by_p, part.phi)
-    rows = [observation.linearised(projected, part.phi, by_p, segment.moving, segment.nq)]
-    rows += _sensed(part, tangent) if segment.sensors else []
-    pairs = [(values.ravel(), by.reshape(values.size, by.shape[-1])) for values, by in rows]
-    if huber is not None:
-        pairs = [huberised(values, by, huber) for values, by in pairs]
-    residual, slope = map(np.concatenate, zip(*pairs, strict=True))
+    """Everything after the feasibility step."""
+    response = part.sensing.looked_along(tangent.by_p, tangent.held)
+    found = part.sensing.linearised(part.x, response, tangent.step)
+    pairs = [as_squares(*each, huber) for each in found]
+    residual = np.concatenate([values.ravel() for values, _ in pairs])
+    slope = np.concatenate([by.reshape(-1, by.shape[-1]) for _, by in pairs])
     report = Report(
         fit=LeastSquares.none(slope.shape[1]).add(residual, slope),
         crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
         feasibility_m=float(np.abs(tangent.step).max()),
         moved_m=0.0 if before is None else float(np.abs(part.x - before.x).max()),
         indefinite=tangent.indefinite,
-        seen=Seen.of(part, projected, tangent.violation_n),
+        seen=Seen.of(part, part.x + tangent.step, tangent.violation_n),
         spent=spent,
     )
     return Leg(part.x, tangent, slope, report)
-
-
-def _sensed(part: Part, tangent: Tangent) -> list[tuple[Array, Array]]:
-    """Residuals of the sensors after the feasibility step, and their slopes by (q, φ)."""
-    dofs = part.segment.sensed_dofs
-    along = np.concatenate([tangent.step[:, dofs, None], tangent.by_p[:, dofs]], axis=2)
-    return part.sensing.projected(part.x, tangent.held, along)

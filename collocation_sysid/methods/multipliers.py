@@ -26,10 +26,7 @@ def constraint_multipliers(
 
     def of(part: Part) -> Array:
         segment = part.segment
-        gradient = segment.observation.gradient(part.x, part.phi)[0]
-        if segment.sensors:
-            gradient = gradient + part.sensing.gradient(part.x)[0]
-        gradient *= collocation.loss_scale
+        gradient = collocation.loss_scale * part.gradient()[0]
         solver = BlockSolver(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(part.x, part.setting, gradient)
         return segment.of_rows(y)

@@ -27,7 +27,6 @@ from ..nlp.collocation import Collocation, Part
 from ..nlp.newton import NewtonOptions
 from ..nlp.parameters import Parameter, Parameters
 from ..nlp.segment import Segment
-from ..nlp.sensing import NOTHING
 from .ladder import SHARES, part_of
 from .start import marched
 
@@ -245,42 +244,34 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
     """
     collocation, p = collocation.placed(p, positions)
     parts = collocation.parts_at(p, positions)
-    residuals = [each for part in parts for each in (_of_markers(part), _of_sensors(part))]
-    return root_mean(np.concatenate(residuals) ** 2)
+    return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
 
 
-def _of_markers(part: Part) -> Array:
-    markers = part.segment.experiment.markers
-    read = part.segment.observation.predicted(part.x, part.phi)
-    off = (read - markers.positions_m[: len(read)]) / markers.sigma_m[:, None]
-    return off[part.segment.observation.present[: len(read)]].ravel()
+def _residuals(part: Part) -> Array:
+    """Those of all readings; of instruments with the tares, clocks and tools that suit best.
 
-
-def _of_sensors(part: Part) -> Array:
-    """Residuals with the tares, clocks and tools that suit best, and these in their deviations.
-
-    Nothing else tells them beforehand, and the residuals are nearly linear in them.
+    Nothing else tells these beforehand, and the residuals are nearly linear in them; what they are
+    in their deviations counts too.
     """
-    sensors, rows = part.segment.sensors, len(part.x)
-    if not sensors:
-        return np.zeros(0)
-    found = part.sensing.linearised(part.sensing.at(part.x), NOTHING)
-    there = np.concatenate([s.wrench.present & s.covered(rows)[:, None] for s in sensors]).ravel()
-    residual = np.concatenate([each.ravel() for each, _ in found])[there]
-    slope = np.concatenate([by.reshape(-1, by.shape[-1]) for _, by in found])[there]
-    slope = slope[:, part.segment.nq :]
+    found, slopes = [], []
+    still = part.sensing.still(part.x)
+    for reading, (residual, slope) in zip(part.segment.readings, still, strict=True):
+        there = reading.there(len(part.looked[len(found)]))[: len(residual)]
+        found.append(residual[there])
+        slopes.append(slope[there] * reading.has_offsets)
+    residual, slope = np.concatenate(found), np.concatenate(slopes)
     own = slope[:, slope.any(axis=0)]
     priors = np.eye(own.shape[1])
     residual, own = np.append(residual, np.zeros(len(priors))), np.concatenate([own, priors])
-    return residual - own @ np.linalg.lstsq(own, residual, rcond=None)[0]
+    return residual - own @ np.linalg.lstsq(own, residual, rcond=None)[0] if own.size else residual
 
 
 def _samples(segment: Segment) -> int:
     """How many first samples are compared: a part of all, and one of each kind of reading."""
     t_s, seen = segment.experiment.t_s, [segment.experiment.markers.first_seen]
     for sensor in segment.sensors:
-        felt_s = sensor.wrench.t_s[sensor.present.any(axis=1).argmax()] + sensor.limit_s
-        seen.append(int(np.searchsorted(t_s, felt_s)) + sensor.late)
+        felt_s = sensor.t_s[sensor.present.any(axis=1).argmax()] + sensor.limit_s
+        seen.append(int(np.searchsorted(t_s, felt_s)) + sensor.channel.on.late)
     return min(len(t_s), max(part_of(len(t_s), SHARES[0]), max(seen) + 1))
 
 

@@ -205,13 +205,13 @@ class Solution:
     def readings_m(self) -> list[Array]:
         """Fitted markers (T, M, 3) of each experiment, with its φ."""
         parts = self.collocation.parts(self.z)
-        return [part.segment.observation.predicted(part.x, part.phi) for part in parts]
+        return [part.segment.markers.of_positions(part.x, part.phi) for part in parts]
 
     @cached_property
     def wrenches(self) -> dict[str, list[Array]]:
         """What the sensors of each fitted experiment should read, (S, 6), NaN where not known."""
         parts = [part for part in self.collocation.parts(self.z) if part.segment.sensors]
-        return {part.segment.experiment.name: part.sensing.readings(part.x) for part in parts}
+        return {part.segment.experiment.name: part.sensing.wrenches(part.x) for part in parts}
 
     @cached_property
     def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:

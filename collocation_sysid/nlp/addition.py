@@ -104,13 +104,9 @@ class Addition(ABC):
 
     # What the loss has of the variables ---------------------------------------------------------
 
-    def loss(self, part: Part, z: Array) -> float:
-        """Its value, over and above that of the program given."""
-        return 0.0
-
-    def gradient(self, part: Part, z: Array) -> tuple[Array, Array]:
-        """∂loss by the variables (count,) and by φ (k,)."""
-        return np.zeros(self.count), np.zeros(len(part.phi))
+    def gradient(self, part: Part) -> Array:
+        """∂loss by them (count,)."""
+        return np.zeros(self.count)
 
     def phi_curvature(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array

@@ -40,6 +40,7 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..fem.body import Linearisation
+from .channel import Motion
 from .charts import Chart
 from .parameters import Parameters
 from .schemes import Scheme
@@ -78,8 +79,8 @@ class Part:
     x : (N, 3n) positions [m], or its first rows
     brought : (N, …) or None
         What the evaluations bring from the past, where it is given; see `Dynamics`.
-    felt : bool
-        Whether its loss has the wrenches that follow from x.
+    given : mapping
+        Of readings, by their numbers, what they look at where that does not follow from x.
     bent : bool
         Whether readings are, or taken as linear in second derivatives.
     """
@@ -89,7 +90,7 @@ class Part:
     phi: Array
     x: Array
     brought: Array | None = None
-    felt: bool = True
+    given: Mapping[int, Array] = field(default_factory=dict)
     bent: bool = True
 
     @cached_property
@@ -102,14 +103,51 @@ class Part:
 
     @cached_property
     def sensing(self) -> Sensing:
-        """Its sensors."""
+        """What is looked at."""
         return Sensing(self.segment, self.setting, self.phi)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """What channels look at."""
+        return self.sensing.motion(self.x)
+
+    @cached_property
+    def looked(self) -> list[Array]:
+        """Of each reading what it looks at (n, e, 3)."""
+        return [
+            self.given[k] if k in self.given else reading.channel.values(self.motion, self.phi)
+            for k, reading in enumerate(self.segment.readings)
+        ]
 
     @property
     def loss(self) -> float:
-        """Of markers and wrenches, without priors."""
-        seen = self.segment.observation.loss(self.x, self.phi)
-        return seen + (self.sensing.loss(self.x) if self.felt else 0.0)
+        """Of all readings, without priors."""
+        pairs = zip(self.segment.readings, self.looked, strict=True)
+        return sum(reading.loss(looked, self.phi) for reading, looked in pairs)
+
+    @cached_property
+    def loss_slopes(self) -> list[tuple[Array, Array]]:
+        """Of each reading ∂loss by what it looks at (n, e, 3), and by its φ (k,)."""
+        pairs = zip(self.segment.readings, self.looked, strict=True)
+        return [reading.loss_slopes(looked, self.phi) for reading, looked in pairs]
+
+    def gradient(self) -> tuple[Array, Array]:
+        """∂loss/∂x (N, 3n) and ∂loss/∂(q, φ) (nq + k,), at what is given."""
+        nq, phi = self.segment.nq, self.phi
+        by_x, by_p, by_reaction = np.zeros_like(self.x), np.zeros(nq + len(phi)), None
+        pairs = zip(self.segment.readings, self.loss_slopes, strict=True)
+        for k, (reading, (by_looked, by_phi)) in enumerate(pairs):
+            by_p[nq:] += by_phi
+            if k not in self.given:
+                pulled = reading.channel.pulled(self.motion, phi, by_looked)
+                by_x, by_p[nq:] = by_x + pulled.by_x, by_p[nq:] + pulled.by_phi
+                if pulled.by_reaction is not None:
+                    by_reaction = pulled.by_reaction + (0.0 if by_reaction is None else by_reaction)
+        if by_reaction is not None:
+            through_x, through_p = self.sensing.pulled(self.x, by_reaction)
+            by_x += through_x
+            by_p[self.segment.moving] += through_p
+        return by_x, by_p
 
     @cached_property
     def forces(self) -> Linearisation:
@@ -138,7 +176,7 @@ class Collocation:
     explicit_grasps : bool, default False
         Grasped nodes as constraint rows instead of bounds.
     huber : float, optional
-        Huber's loss beyond this many standard deviations, see `Observation`.
+        Huber's loss beyond this many standard deviations, see `Instrument`.
     charts : mapping of experiment name to Chart
         Where recordings are read, see `charts`; where their markers start by default, and where
         one is not of the experiment's body and places.
@@ -207,8 +245,9 @@ class Collocation:
     def measurements(self) -> int:
         """Scalar measurements that are present."""
         return sum(
-            segment.observation.count + sum(int(s.present.sum()) for s in segment.sensors)
+            int(reading.components.sum())
             for segment in self.segments
+            for reading in segment.readings
         )
 
     @property
@@ -364,13 +403,9 @@ class Collocation:
         residuals, slopes = self.prior(p)
         by_p, by_x = 2 * residuals * slopes, []
         for part in parts:
-            of_x, of_phi = part.segment.observation.gradient(part.x, part.phi)
+            of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
-            by_p[part.segment.local.places] += of_phi
-            if part.felt and part.segment.sensors:
-                through_x, of_p = part.sensing.gradient(part.x)
-                by_x[-1] += through_x.ravel() * part.segment.length_m
-                by_p[part.segment.places] += of_p
+            by_p[part.segment.places] += of_p
         return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :]])
 
     # Constraints ------------------------------------------------------------------------------
@@ -641,7 +676,7 @@ class Collocation:
         """Root mean square distance of markers from their measurements."""
         squares = samples = 0.0
         for part in self.parts(z):
-            found = part.segment.observation.squared_distances_m2(part.x, part.phi)
+            found = part.segment.markers.squared_distances_m2(part.x, part.phi)
             squares, samples = squares + float(found.sum()), samples + len(found)
         return float(np.sqrt(squares / max(1.0, samples)))
 

@@ -4,14 +4,14 @@ What the points of a body with memory carry follows from positions and parameter
 it ∂g/∂z would be filled below the diagonal; and a measured wrench is a function of what grasps
 give, so that the loss would be one of all that moves around them. Here both stand in z behind what
 the program has, and their equations in g after all other rows, see `overstress`, `reaction_rows`
-and `sensor_rows`: ∂g/∂z and the Lagrangian's Hessian are sparse, and exact. Eliminating both leads
+and `wrench_rows`: ∂g/∂z and the Lagrangian's Hessian are sparse, and exact. Eliminating both leads
 back to the program as it is given, with the same optimum and the same multipliers of its rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import cached_property
 
 import numpy as np
@@ -22,8 +22,9 @@ from .collocation import Collocation, Part
 from .overstress import Overstress
 from .reaction_rows import Reactions
 from .segment import Segment, Weights
-from .sensor_rows import SensorRows
 from .widened import Widened
+from .wrench_channel import GraspWrench
+from .wrench_rows import WrenchRows
 
 
 def made_explicit(collocation: Collocation) -> Collocation:
@@ -61,17 +62,21 @@ class Explicit(Collocation):
         places = Places(self.plain.variables, self.plain.constraints)
         for number, segment in enumerate(self.segments):
             reactions, here = None, (segment, number, self.of_phi.start)
-            sensors = [sensor for sensor in segment.sensors if len(sensor.grid)]
-            if sensors:
+            wrenches = [
+                (k, reading, reading.channel)
+                for k, reading in enumerate(segment.readings)
+                if isinstance(reading.channel, GraspWrench) and reading.channel.count
+            ]
+            if wrenches:
                 reactions = Reactions(*here, places)
                 found.append(reactions)
                 places = reactions.after
             if segment.body.remembers:
                 found.append(Overstress(*here, places, reactions))
                 places = found[-1].after
-            for sensor in sensors:
+            for wrench in wrenches:
                 assert reactions is not None
-                found.append(SensorRows(*here, places, sensor, reactions))
+                found.append(WrenchRows(*here, places, *wrench, reactions))
                 places = found[-1].after
         return tuple(found)
 
@@ -107,8 +112,8 @@ class Explicit(Collocation):
         return np.concatenate([self.plain.pack(p, positions), *following])
 
     def parts(self, z: Array) -> list[Part]:
-        """Every experiment at z, with the memory there, and wrenches left to what is added."""
-        parts = [replace(part, felt=False) for part in super().parts(z)]
+        """Every experiment at z, with the memory and the wrenches there."""
+        parts = super().parts(z)
         for each in self.additions:
             parts[each.number] = each.given(parts[each.number], z)
         return parts
@@ -119,22 +124,11 @@ class Explicit(Collocation):
         free = np.full(self.added(Addition), np.inf)
         return np.concatenate([lower, -free]), np.concatenate([upper, free])
 
-    def objective(self, z: Array) -> float:
-        """L divided by the number of measurements."""
-        parts = self.parts(z)
-        further = sum(each.loss(parts[each.number], z) for each in self.additions)
-        return super().objective(z) + self.loss_scale * further
-
     def gradient(self, z: Array) -> Array:
         """∂objective/∂z."""
         parts = self.parts(z)
-        found = np.zeros(self.variables)
-        found[: self.plain.variables] = self.plain.gradient_of(parts, self.parameters_of(z))
-        for each in self.additions:
-            own, by_phi = each.gradient(parts[each.number], z)
-            found[each.variables] = self.loss_scale * own
-            found[each.phi_columns] += self.loss_scale * by_phi
-        return found
+        further = [self.loss_scale * each.gradient(parts[each.number]) for each in self.additions]
+        return np.concatenate([self.plain.gradient_of(parts, self.parameters_of(z)), *further])
 
     def constraint_values(self, z: Array) -> Array:
         """g, scaled."""

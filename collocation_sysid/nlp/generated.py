@@ -58,6 +58,18 @@ class Generated:
         found[ca.jacobian(y, u).sparsity().get_col()] = True
         return found
 
+    def is_linear(self) -> bool:
+        """Whether slopes by u are always the same."""
+        u, _, y = self._symbols
+        return not ca.depends_on(ca.jacobian(y, u), u)
+
+    @cached_property
+    def curvature_pattern(self) -> NDArray[np.bool_]:
+        """(k, k) which second derivatives there may be."""
+        u, _, y = self._symbols
+        second, _ = ca.hessian(ca.sum1(y), u)
+        return np.array(ca.DM(second.sparsity(), 1.0).full(), dtype=bool)
+
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         u, data = ca.SX.sym("u", self.inputs), ca.SX.sym("data", self.data)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
+from .channel import Forced
 from .forces import Forces
 from .lapack import one_blas_thread
 from .memory import Remembered
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
-from .sensor import Forced
 from .weight import Weight
 
 Progress = Callable[[float], None]
@@ -62,7 +62,7 @@ def newmark(
         x[k], v[k] = state.x, state.v
         if progress:
             progress(k / (len(times) - 1))
-    return x, v, Forced.still(*felt)
+    return x, v, Forced(*felt)
 
 
 class _Stepper:

@@ -66,7 +66,7 @@ class Reactions(Addition):
 
     def following(self, part: Part) -> Array:
         """R as it follows from positions and parameters."""
-        return self._scaled(part.sensing.at(part.x).reaction)
+        return self._scaled(part.motion.forced.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
         return newtons[self.segment.dynamics.first_row :].ravel() / self.segment.force_n

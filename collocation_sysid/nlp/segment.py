@@ -20,26 +20,30 @@ from ..experiment.nuisance import TIME
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.pattern import SymmetricPattern
 from .block_band import Block, BlockBand, Term
+from .channel import Points
 from .charts import Chart
 from .dynamics import Dynamics
 from .held import Grasping, Held
 from .hessian_layout import HessianLayout
 from .inputs import Inputs
+from .local_loss import LocalLoss
+from .markers import MarkerReading
 from .motion_rows import MotionRows, ahead
 from .nuisance import NuisanceMap
-from .observation import Observation
 from .parameters import Parameters, ThetaMap
+from .reading import Reading
 from .row import Row
 from .schemes import Scheme
-from .sensor import Grid, Sensor, sensed_dofs, sensors_of
 from .setting import Setting
 from .sharing import Local
 from .terms import inputs_of, with_inputs
 from .unsymmetric import adding_skew, skew_values
+from .wrench import WrenchReading, sensed_dofs, wrench_readings
+from .wrench_channel import Grid
 
 T = TypeVar("T", bound=np.generic)
 
-CHARTED = ("observation", "hessian_layout")
+CHARTED = ("markers", "readings", "local_loss", "hessian_layout")
 
 
 @dataclass(frozen=True)
@@ -127,9 +131,9 @@ class Segment:
         return NuisanceMap.of(self.experiment, self.local.pivot_m)
 
     @cached_property
-    def observation(self) -> Observation:
-        """The loss."""
-        return Observation(
+    def markers(self) -> MarkerReading:
+        """What its markers read."""
+        return MarkerReading.of(
             self.experiment.markers,
             np.arange(len(self.experiment.t_s)) * self.substeps,
             self.nuisance,
@@ -139,9 +143,20 @@ class Segment:
         )
 
     @cached_property
-    def sensors(self) -> tuple[Sensor, ...]:
+    def sensors(self) -> tuple[WrenchReading, ...]:
         """Of the grasps whose wrench is measured."""
-        return sensors_of(self.experiment, Grid.of(self.dynamics), self.nuisance, self.huber)
+        return wrench_readings(self.experiment, Grid.of(self.dynamics), self.nuisance, self.huber)
+
+    @cached_property
+    def readings(self) -> tuple[Reading, ...]:
+        """All that is measured, the markers first."""
+        return self.markers, *self.sensors
+
+    @cached_property
+    def local_loss(self) -> LocalLoss:
+        """Second derivatives of the loss by x and φ, where it has few."""
+        local = [(r, r.channel) for r in self.readings if isinstance(r.channel, Points)]
+        return LocalLoss(tuple(local), self.variables, self.nuisance.size)
 
     @cached_property
     def sensed_dofs(self) -> Index:
@@ -158,7 +173,7 @@ class Segment:
 
     def following(self, phi: Array) -> tuple[Chart, Array]:
         """A chart where the estimates are, and φ in it; those given where they have not left."""
-        nuisance, places = self.nuisance, self.observation.place_places
+        nuisance, places = self.nuisance, self.markers.place_places
         late = phi[nuisance.places(TIME)] * nuisance.scales[nuisance.places(TIME)]
         shift = float(late.sum()) / self.experiment.timestep_s
         chart, of_places = self.chart.following(np.append(phi, 0.0)[places], shift)
@@ -166,7 +181,7 @@ class Segment:
 
     def placed(self, phi: Array, x: Array) -> tuple[Chart, Array]:
         """The chart, and φ in it, with unknown places on the body's first rows x (rows, 3n)."""
-        markers, rows = self.experiment.markers, self.observation.grid_rows
+        markers, rows = self.experiment.markers, self.markers.grid_rows
         if markers.located.all():
             return self.chart, phi
         points_m, _ = markers.first_samples
@@ -186,11 +201,11 @@ class Segment:
         """First rows of x that `placed` reads; none where all places are known."""
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.present[:, unknown].argmax(axis=0)
-        return 1 + int(self.observation.grid_rows[first].max()) if len(first) else 0
+        return 1 + int(self.markers.grid_rows[first].max()) if len(first) else 0
 
     def places_m(self, phi: Array) -> Array:
         """(M, 3) places of the markers on the undeformed body."""
-        return self.chart.places_m(np.append(phi, 0.0)[self.observation.place_places])
+        return self.chart.places_m(np.append(phi, 0.0)[self.markers.place_places])
 
     @property
     def guess_phi(self) -> Array:
@@ -201,7 +216,7 @@ class Segment:
 
     def _with_places(self, phi: Array, of_places: Array) -> Array:
         moved, here = phi.copy(), self.chart.estimated
-        moved[self.observation.place_places[here]] = of_places[here]
+        moved[self.markers.place_places[here]] = of_places[here]
         return moved
 
     # Sizes and places -------------------------------------------------------------------------
@@ -577,7 +592,7 @@ class Segment:
         Parameters
         ----------
         values : (hessian_layout.entries,) out
-        bent : whether readings are, see `Observation.hessian`
+        bent : whether readings are, see `LocalLoss.hessian`
         memory_weights : μ (N, …) of each branch
             Where the memory is given, Σ μ_k (d_k m_{k−1} + a_k S_k) is added; see `memory`.
 
@@ -605,7 +620,7 @@ class Segment:
             values[: layout.x_entries] = 0
             values[layout.band] = of_band
         values[layout.x_entries :] = 0
-        values[layout.loss] += loss_weight * layout.scale * self.observation.hessian(x, phi, bent)
+        values[layout.loss] += loss_weight * layout.scale * self.local_loss.hessian(x, phi, bent)
         values[layout.by_x] += self.length_m * by_x[..., self.by_state].ravel()
         values[layout.by_q] += twice[: self.nq, self.nq :].ravel()
         by_phi = np.diag(2 * loss_weight * self.local.counted)  # the prior
@@ -651,7 +666,7 @@ class Segment:
         """Structure of the columns that `hessian_values` writes."""
         dofs = np.arange(self.dofs)
         diagonal = self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
-        rows, columns = self.observation.hessian_structure
+        rows, columns = self.local_loss.structure
         return HessianLayout.of(
             self.hessian,
             diagonal,

@@ -1,32 +1,41 @@
-"""The part of the loss that measured wrenches have, at positions x of one experiment.
+"""What is looked at of one experiment at a point, and how residuals follow the parameters.
 
-L_w = Σ ρ(‖(ŷ − w) / σ‖) over the forces, and the torques, of all samples of all sensors.
+Reactions follow from positions x by the equations of motion, see `reaction`; readings from both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Array, Index
+from ..arrays import Array
+from .channel import Forced, Motion
 from .reaction import HeldForces, forces_on, reaction_slopes, reactions
-from .sensor import Forced, Sensor
+from .segment import Segment
+from .setting import Setting
 from .unsymmetric import Submatrix
 
-if TYPE_CHECKING:
-    from .segment import Segment
-    from .setting import Setting
 
+@dataclass(frozen=True, eq=False)
+class Response:
+    """How what is looked at follows the m parameters that move the body, or c poses.
 
-NOTHING = np.zeros(0, dtype=np.int64)
+    Attributes
+    ----------
+    looked : of each reading (R, p, m), what its channel's operator takes of the rows of x
+    held : HeldForces
+        On the sensed dofs; its first column may be that of a step.
+    """
+
+    looked: tuple[Array, ...]
+    held: HeldForces
 
 
 @dataclass(frozen=True, eq=False)
 class Sensing:
-    """The sensors of a segment at a point.
+    """A segment at a point.
 
     Attributes
     ----------
@@ -39,19 +48,15 @@ class Sensing:
     setting: Setting
     phi: Array
 
-    @property
-    def size(self) -> int:
-        """Length of (q, φ)."""
-        return self.segment.nq + len(self.phi)
+    def motion(self, x: Array) -> Motion:
+        """Positions x (N, 3n), or the first rows, with the reactions that follow from them."""
+        return Motion(x, lambda: self._forced(x))
 
-    # What acts on the sensed dofs -------------------------------------------------------------
-
-    def at(self, x: Array) -> Forced:
-        """The reactions at positions x (N, 3n), or at its first rows."""
+    def _forced(self, x: Array) -> Forced:
         dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
         force, mass_kg = forces_on(dynamics, x, self.setting.theta, dofs), self._mass_kg[: len(x)]
         reaction = reactions(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
-        return Forced.still(reaction, x[:, dofs])
+        return Forced(reaction, x[:, dofs])
 
     @property
     def _mass_kg(self) -> Array:
@@ -59,92 +64,94 @@ class Sensing:
         dynamics = self.setting.dynamics
         return dynamics.mass.at(self.setting.theta)[:, self.segment.sensed_dofs]
 
-    def along(self, x: Array, held: HeldForces, moved: Array, first: int | None = None) -> Forced:
-        """The same of the first rows x, from their forces, and how they change.
+    # Along the equations of motion ------------------------------------------------------------
+
+    def read_along(self, rows: Iterable[Array], held: HeldForces) -> Response:
+        """What changes (3n, m) of row after row of x change of what is looked at."""
+        channels = [reading.channel for reading in self.segment.readings]
+        operators = [channel.operator(self.phi) for channel in channels]
+        wanted = [frozenset(channel.rows.tolist()) for channel in channels]
+        looked: list[list[Array]] = [[] for _ in channels]
+        for t, row in enumerate(rows):
+            for found, operator, times in zip(looked, operators, wanted, strict=True):
+                if t in times:
+                    found.append(operator @ row)
+        return Response(tuple(map(np.stack, looked)), held)
+
+    def looked_along(self, by: Array, held: HeldForces) -> Response:
+        """The same of the first rows (rows, 3n, m) at once."""
+        found, (_, dofs, count) = [], by.shape
+        for channel in (reading.channel for reading in self.segment.readings):
+            rows = channel.rows[channel.rows < len(by)]
+            columns = by[rows].transpose(1, 0, 2).reshape(dofs, len(rows) * count)
+            at = channel.operator(self.phi) @ columns
+            found.append(at.reshape(len(at), len(rows), count).transpose(1, 0, 2))
+        return Response(tuple(found), held)
+
+    def moving(
+        self, x: Array, response: Response, step: Array | None = None, by_p: bool = True
+    ) -> list[Motion]:
+        """The motion as each reading looks at it, and how it changes.
 
         Parameters
         ----------
-        moved : (rows, g, c) how the dofs move
-        first : int, optional
-            Column from which on they are those of what moves the body.
+        x : (rows, 3n), at which the forces of the response are
+        step : (rows, 3n), optional
+            After it everything is looked at, to first order; its forces are their first column.
+        by_p : whether the columns are those of what moves the body
         """
+
+        def forced(moved: Array) -> Forced:
+            return self._along(x, response.held, moved, step, by_p)
+
+        at = x if step is None else x + step
+        return [
+            Motion(at, lambda moved=looked: forced(moved), looked) for looked in response.looked
+        ]
+
+    def _along(
+        self, x: Array, held: HeldForces, moved: Array, step: Array | None, by_p: bool
+    ) -> Forced:
         dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
+        if step is not None:
+            moved = np.concatenate([step[:, dofs, None], moved], axis=2)
         acceleration, mass_kg = dynamics.acceleration(x)[:, dofs], self._mass_kg[: len(x)]
-        reaction = reactions(dynamics, mass_kg, held.force, acceleration)
+        reaction, at = reactions(dynamics, mass_kg, held.force, acceleration), x[:, dofs]
         by = reaction_slopes(dynamics, mass_kg, held.slopes, moved)
-        if first is not None:
-            rows = slice(len(x))
-            by[..., first:] += self.setting.inertia_slopes(rows, acceleration, dofs)
-        return Forced(reaction, x[:, dofs], by, moved)
+        if by_p:
+            first = 0 if step is None else 1
+            by[..., first:] += self.setting.inertia_slopes(slice(len(x)), acceleration, dofs)
+        if step is None:
+            return Forced(reaction, at, by, moved)
+        return Forced(reaction + by[..., 0], at + moved[..., 0], by[..., 1:], moved[..., 1:])
 
-    # Residuals --------------------------------------------------------------------------------
+    def linearised(
+        self, x: Array, response: Response, step: Array | None = None
+    ) -> list[tuple[Array, Array]]:
+        """Residuals (s, G, 3) of each reading, and slopes (s, G, 3, size), see `moving`."""
+        segment, size, found = self.segment, self.segment.nq + len(self.phi), []
+        motions = self.moving(x, response, step)
+        for reading, motion in zip(segment.readings, motions, strict=True):
+            looked = reading.channel.linearised(motion, self.phi, segment.moving, size)
+            found.append(reading.linearised(*looked, self.phi, size))
+        return found
 
-    def linearised(self, forced: Forced, columns: Index) -> list[tuple[Array, Array]]:
-        """Residuals (S, 2, 3) of each sensor, and slopes (S, 2, 3, size) by (q, φ)."""
-        return [
-            sensor.linearised(forced, columns, self.phi, self.size)
-            for sensor in self.segment.sensors
-        ]
+    def still(self, x: Array) -> list[tuple[Array, Array]]:
+        """The same, and slopes (s, G, 3, k) by φ, at the first rows x, none of which move."""
+        forced, none = self._forced(x), np.zeros(0, dtype=np.int64)
+        nothing, found = np.zeros((*forced.reaction.shape, 0)), []
+        forced = replace(forced, reaction_by=nothing, position_by=nothing)
+        for reading in self.segment.readings:
+            motion, count = Motion(x, lambda: forced), len(self.phi)
+            looked = reading.channel.linearised(motion, self.phi, none, count)
+            found.append(reading.linearised(*looked, self.phi, count))
+        return found
 
-    def response(self, forced: Forced) -> list[Array]:
-        """Changes (S, 2, 3, c) of the residuals of each sensor by the c changes of `forced`."""
-        count = forced.reaction_by.shape[2]
-        columns, size = np.arange(count), count + len(self.phi)
-        return [
-            sensor.linearised(forced, columns, self.phi, size)[1][..., :count]
-            for sensor in self.segment.sensors
-        ]
-
-    def projected(self, x: Array, held: HeldForces, moved: Array) -> list[tuple[Array, Array]]:
-        """The same after a feasibility step, which is the first of the columns, to first order."""
-        forced = self.along(x, held, moved, first=1)
-        after = Forced(
-            forced.reaction + forced.reaction_by[..., 0],
-            forced.position_m + forced.position_by[..., 0],
-            forced.reaction_by[..., 1:],
-            forced.position_by[..., 1:],
-        )
-        return self.linearised(after, self.segment.moving)
-
-    def readings(self, x: Array) -> list[Array]:
+    def wrenches(self, x: Array) -> list[Array]:
         """What each sensor should read (S, 6), NaN where that is not known."""
-        return self.of(self.segment.sensors, self.at(x))
+        return [s.of_forced(self.motion(x).forced, self.phi) for s in self.segment.sensors]
 
-    def of(self, sensors: Sequence[Sensor], forced: Forced) -> list[Array]:
-        """The same of the experiment's sensors on any grid, from the reactions there."""
-        return [sensor.readings(forced, self.phi) for sensor in sensors]
-
-    # Loss -------------------------------------------------------------------------------------
-
-    def loss(self, x: Array) -> float:
-        """L_w."""
-        if not self.segment.sensors:
-            return 0.0
-        forced = self.at(x)
-        given = [
-            sensor.given(forced, NOTHING, self.phi, self.size) for sensor in self.segment.sensors
-        ]
-        pairs = zip(self.segment.sensors, given, strict=True)
-        return sum(sensor.loss(value, self.phi) for sensor, (value, _) in pairs)
-
-    def gradient(self, x: Array) -> tuple[Array, Array]:
-        """∂L_w/∂x (N, 3n) and ∂L_w/∂(q, φ) (nq + k,)."""
-        forced, by_p = self.at(x), np.zeros(self.size)
-        of_reaction, of_place = np.zeros_like(forced.reaction), np.zeros_like(forced.reaction)
-        for sensor in self.segment.sensors:
-            value, by_phi = sensor.given(forced, NOTHING, self.phi, self.size)
-            by_given, by_own = sensor.loss_slopes(value, self.phi)
-            by_p += np.einsum("ka,kap->p", by_given, by_phi)
-            by_p[self.segment.nq + sensor.read_phi] += by_own
-            by_force, by_place = sensor.arms(forced)
-            k, on_grid = sensor.grid[: len(value)], sensor.before_low_pass(by_given, self.phi)
-            rows = np.ix_(k + sensor.late, sensor.places), np.ix_(k, sensor.places)
-            of_reaction[rows[0]] += np.einsum("ka,kag->kg", on_grid, by_force)
-            of_place[rows[1]] += np.einsum("ka,kag->kg", on_grid, by_place)
-        by_x, through = self.pulled(x, of_reaction)
-        by_x[:, self.segment.sensed_dofs] += of_place
-        by_p[self.segment.moving] += through
-        return by_x, by_p
+    # Backward ---------------------------------------------------------------------------------
 
     def pulled(self, x: Array, weights: Array) -> tuple[Array, Array]:
         """Slopes of Σ weights · R by x (N, 3n) and by what moves the body, at weights (N, g)."""

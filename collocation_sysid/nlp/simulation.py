@@ -12,6 +12,7 @@ from ..arrays import Array
 from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..experiment.nuisance import Nuisance
+from .channel import Forced
 from .dynamics import Dynamics
 from .marching import Progress, march
 from .newmark import newmark
@@ -20,7 +21,8 @@ from .nuisance import NuisanceMap
 from .parameters import Parameters, theta_of
 from .reaction import forces_on, reactions
 from .schemes import MOST_STEPS, Scheme
-from .sensor import Forced, Grid, sensed_dofs, sensors_of
+from .wrench import sensed_dofs, wrench_readings
+from .wrench_channel import Grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +121,14 @@ def simulate(
         at, force = Grid.of(dynamics), forces_on(dynamics, grid, theta, sensed)
         mass_kg, acceleration = dynamics.mass.at(theta)[:, sensed], dynamics.acceleration(grid)
         reaction = reactions(dynamics, mass_kg, force, acceleration[:, sensed])
-        forced = Forced.still(reaction, grid[:, sensed])
+        forced = Forced(reaction, grid[:, sensed])
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
     markers = experiment.markers.observe(positions)
     ideal = NuisanceMap.of(replace(experiment, nuisance=Nuisance.none()))
     wrenches = tuple(
-        sensor.readings(forced, np.zeros(ideal.size))
-        for sensor in sensors_of(experiment, at, ideal)
+        sensor.of_forced(forced, np.zeros(ideal.size))
+        for sensor in wrench_readings(experiment, at, ideal)
     )
     return Trajectory(experiment.t_s, positions, v.reshape(shape), markers, (at, forced), wrenches)
 

@@ -71,7 +71,7 @@ def _instability(part: Part) -> Instability | None:
     experiment = part.segment.experiment
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
-    t_s, rows = experiment.t_s[samples], part.segment.observation.grid_rows[samples]
+    t_s, rows = experiment.t_s[samples], part.segment.markers.grid_rows[samples]
     held, theta = experiment.held(t_s).reshape(len(t_s), -1), part.setting.theta
     growths = np.array(
         [

@@ -107,7 +107,7 @@ def replays(finished: Answer) -> list[Replay]:
     """The experiments as they are looked at: those fitted, then those for validation."""
     solution = finished.solution
     fitted = {
-        segment.experiment.name: (positions[segment.observation.grid_rows], readings)
+        segment.experiment.name: (positions[segment.markers.grid_rows], readings)
         for segment, positions, readings in zip(
             solution.collocation.segments, solution.positions_m, solution.readings_m, strict=True
         )

@@ -7,16 +7,17 @@ possibly nuisance parameters of single experiments, such as the offset of a mark
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation, Part
+from ..nlp.collocation import Collocation
 from ..nlp.parameters import ThetaMap
-from .sensitivity import Response, responses
+from ..nlp.reading import as_weights
+from .sensitivity import responses
 
 Mask = NDArray[np.bool_]
 
@@ -173,19 +174,29 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """
     p, blocks = collocation.parameters_of(z), []
     for part, response in zip(collocation.parts(z), responses(collocation, z), strict=True):
-        experiment = part.segment.experiment
-        relaxed = part.segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
-        for block in (_of_markers(part, response), *_of_sensors(part, response)):
-            slope = np.zeros((*block.residual.shape, len(p)))
-            slope[..., part.segment.places] = block.slope
-            block = replace(
-                block,
-                slope=slope,
-                misfit=block.residual,
-                static=experiment.static,
-                relaxed_first=relaxed,
+        segment, experiment = part.segment, part.segment.experiment
+        relaxed = segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
+        found = part.sensing.linearised(part.x, response)
+        for reading, (misfit, by_own) in zip(segment.readings, found, strict=True):
+            residual, by_own = as_weights(misfit, by_own, collocation.huber)
+            slope = np.zeros((*residual.shape, len(p)))
+            slope[..., segment.places] = by_own
+            blocks.append(
+                FitBlock(
+                    name=experiment.name,
+                    t_s=reading.t_s,
+                    marker_names=reading.names,
+                    present=np.asarray(reading.components.any(axis=2)),
+                    residual=residual,
+                    slope=slope,
+                    sigma_m=reading.sigmas,
+                    misfit=misfit,
+                    components=reading.components,
+                    of_sensor=reading is not segment.markers,
+                    static=experiment.static,
+                    relaxed_first=relaxed,
+                )
             )
-            blocks.append(block if collocation.huber is None else _reweighted(block, collocation))
     prior_residual, prior_slope = collocation.prior(p)
     lower, upper = collocation.bounds_p
     return LinearisedFit(
@@ -197,60 +208,3 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
         derived=Derived.of((s.constants for s in collocation.segments), p[: collocation.nq]),
     )
-
-
-def _of_markers(part: Part, response: Response) -> FitBlock:
-    """The block of an experiment's markers, with slopes by its own (q, φ)."""
-    segment, markers = part.segment, part.segment.experiment.markers
-    residual, slope = segment.observation.linearised(
-        part.x, part.phi, response.markers, segment.moving, segment.nq
-    )
-    name, present = segment.experiment.name, segment.observation.present
-    return FitBlock(
-        name,
-        markers.t_s,
-        markers.names,
-        present,
-        residual,
-        slope,
-        markers.sigma_m,
-    )
-
-
-def _of_sensors(part: Part, response: Response) -> list[FitBlock]:
-    """Likewise those of its sensors."""
-    sensors, found = part.segment.sensors, []
-    if not sensors:
-        return found
-    forced = part.sensing.along(part.x, response.held, response.moved, first=0)
-    linear = part.sensing.linearised(forced, part.segment.moving)
-    for k, (sensor, (residual, slope)) in enumerate(zip(sensors, linear, strict=True)):
-        which = "" if len(sensors) == 1 else f" {k + 1}"
-        seen = sensor.present.reshape(-1, 2, 3)
-        found.append(
-            FitBlock(
-                part.segment.experiment.name,
-                sensor.wrench.t_s,
-                (f"force{which}", f"torque{which}"),
-                np.asarray(seen.any(axis=2)),
-                residual,
-                slope,
-                sensor.wrench.sigmas[[0, 3]],
-                components=seen,
-                of_sensor=True,
-            )
-        )
-    return found
-
-
-def _reweighted(block: FitBlock, collocation: Collocation) -> FitBlock:
-    """Samples beyond Huber's threshold as it sees them.
-
-    Slopes have the weight of the fit's normal equations; residuals end at the threshold, so that a
-    few wild samples tell nothing of the others' noise.
-    """
-    assert collocation.huber is not None
-    length = np.linalg.norm(block.residual, axis=2)
-    weight = (collocation.huber / np.maximum(length, collocation.huber))[..., None]
-    slope = block.slope * np.sqrt(weight)[..., None]
-    return replace(block, residual=block.residual * weight, slope=slope)

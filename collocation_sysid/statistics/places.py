@@ -72,7 +72,7 @@ def _std_errors_m(part: Part, uncertainty: Uncertainty | None) -> Array | None:
     at = np.array([row[name] for name in segment.nuisance.names], dtype=np.int64)
     errors = np.zeros(chart.points_m.shape)
     for m in chart.estimated:
-        here = at[segment.observation.place_places[m]]
+        here = at[segment.markers.place_places[m]]
         of_phi = uncertainty.nuisance_covariance[np.ix_(here, here)]
         along = chart.sigma_m[m] * chart.axes[m]
         errors[m] = np.sqrt(np.einsum("ik,kl,il->i", along, of_phi, along))

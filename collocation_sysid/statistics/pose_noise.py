@@ -23,7 +23,6 @@ from ..nlp.collocation import Collocation, Part
 from ..nlp.lapack import one_blas_thread
 from ..nlp.reaction import HeldForces
 from ..nlp.tangent import BlockSolver
-from .sensitivity import read_along
 
 # Samples of D η, and the fewest and the memory where bodies are large.
 DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
@@ -96,7 +95,7 @@ def pose_noise_draws(
     noises: list[PoseNoise] = []
     for part in collocation.parts(z):
         here = [_noise(part.segment.experiment.name, g) for g in part.segment.experiment.grasps]
-        found: list[Array | None] = [None] * (1 + len(part.segment.sensors))
+        found: list[Array | None] = [None] * len(part.segment.readings)
         if any(noise.sigma_m or noise.sigma_rad for noise in here):
             drawn = _drawn(part, here, np.random.default_rng(seed))
             if any(np.sqrt(np.mean(each**2)) >= NEGLIGIBLE for each in drawn):
@@ -115,7 +114,7 @@ def _noise(name: str, grasp: Grasp) -> PoseNoise:
 
 
 def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) -> list[Array]:
-    """(K, T, M, 3) changes of the residuals of the markers, and of each sensor."""
+    """(K, T, M, 3) changes of the residuals of each reading."""
     segment, held = part.segment, part.setting.held
     numbers = held.positions_m.size * 8
     count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
@@ -124,17 +123,19 @@ def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) ->
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
         shifts, turns = _poses_drawn(part, grasp, noise, rng, count)
         _add_noise(moved, part, grasp, shifts, turns)
-        off += [] if grasp.wrench is None else [(shifts, turns)]
-    sensing = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), count)
-    rows = BlockSolver(segment).response(part.x, part.setting, moved, sensing)
-    response = read_along(part, rows, sensing)
-    changes = [segment.observation.response(part.x, part.phi, response.markers)]
-    if segment.sensors:
-        forced = part.sensing.along(part.x, response.held, response.moved)
-        of_body = part.sensing.response(forced)
-        for sensor, change, (shifts, turns) in zip(segment.sensors, of_body, off, strict=True):
-            changes.append(change + sensor.frame_response(forced, part.phi, shifts, turns))
-    return [np.moveaxis(change, 3, 0) for change in changes]
+        off.append((grasp, shifts, turns))
+    forces = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), count)
+    rows = BlockSolver(segment).response(part.x, part.setting, moved, forces)
+    response = part.sensing.read_along(rows, forces)
+    motions, changes = part.sensing.moving(part.x, response, by_p=False), []
+    for reading, motion in zip(segment.readings, motions, strict=True):
+        columns, size = np.arange(count), count + len(part.phi)
+        looked, slopes = reading.channel.linearised(motion, part.phi, columns, size)
+        by = slopes.by[..., :count]
+        for grasp, shifts, turns in off:
+            by = by + reading.channel.carried(grasp, motion, part.phi, shifts, turns)
+        changes.append(np.moveaxis(reading.changes(looked, by, part.phi), 3, 0))
+    return changes
 
 
 def _poses_drawn(

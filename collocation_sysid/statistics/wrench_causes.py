@@ -16,8 +16,9 @@ from ..errors import InputError, SimulationError
 from ..experiment.wrench import Wrench
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
+from ..nlp.channel import Forced
 from ..nlp.collocation import Collocation, Part
-from ..nlp.sensor import Forced, Sensor, without_sensors
+from ..nlp.wrench import WrenchReading, without_sensors
 from .cause import Cause
 
 # Residuals up to so many standard deviations need no cause; what is right leaves so much less.
@@ -43,20 +44,18 @@ def wrench_causes(solution: Solution) -> list[Cause]:
         return []
     found = []
     for part in _from_markers(solution.collocation):
-        forced = part.sensing.at(part.x)
+        forced = part.motion.forced
         for sensor in part.segment.sensors:
             found += _of_sensor(part, sensor, forced)
     return found
 
 
 def _missed(part: Part) -> bool:
-    if not part.segment.sensors:
-        return False
-    residuals = part.sensing.linearised(part.sensing.at(part.x), np.zeros(0, dtype=np.int64))
-    pairs = zip(part.segment.sensors, residuals, strict=True)
+    pairs = zip(part.segment.readings, part.looked, strict=True)
     return any(
-        float(np.sum(residual**2)) > MISFIT**2 * sensor.present.sum()
-        for sensor, (residual, _) in pairs
+        float(np.sum(sensor.residuals(looked, part.phi) ** 2)) > MISFIT**2 * sensor.present.sum()
+        for sensor, looked in pairs
+        if isinstance(sensor, WrenchReading)
     )
 
 
@@ -80,7 +79,7 @@ def _from_markers(collocation: Collocation) -> list[Part]:
     return found
 
 
-def _of_sensor(part: Part, sensor: Sensor, forced: Forced) -> list[Cause]:
+def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> list[Cause]:
     tare = part.segment.experiment.nuisance.tare or 0.0
     misfit = _misfit(part, sensor, forced, tare)
     if misfit <= MISFIT:
@@ -90,7 +89,7 @@ def _of_sensor(part: Part, sensor: Sensor, forced: Forced) -> list[Cause]:
     tried.append((_Trial("wrench-tare", zeroed, sensor.wrench), sensor.wrench, np.inf))
     found, name = [], part.segment.experiment.name
     for trial, wrench, allowed in tried:
-        left = _misfit(part, replace(sensor, wrench=wrench), forced, allowed)
+        left = _misfit(part, sensor.told(wrench), forced, allowed)
         strength = misfit / max(1.0, left)
         if strength > BETTER:
             sentence = f"the wrench of '{name}': {trial.said} ({strength:.2g} times nearer)"
@@ -98,10 +97,10 @@ def _of_sensor(part: Part, sensor: Sensor, forced: Forced) -> list[Cause]:
     return found
 
 
-def _misfit(part: Part, sensor: Sensor, forced: Forced, tare: float) -> float:
+def _misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> float:
     """RMS of the residuals in standard deviations, tares of so many sigmas allowed for."""
     nuisance = part.segment.nuisance
-    read = sensor.readings(forced, np.zeros(nuisance.size))
+    read = sensor.of_forced(forced, np.zeros(nuisance.size))
     # Sigmas are those of what is measured, whatever a trial makes of it.
     apart = (read - sensor.wrench.values) / sensor.wrench.sigmas
     there = np.isfinite(apart)
