@@ -58,6 +58,7 @@ class Generated:
         found[ca.jacobian(y, u).sparsity().get_col()] = True
         return found
 
+    @cached_property
     def is_linear(self) -> bool:
         """Whether slopes by u are always the same."""
         u, _, y = self._symbols

@@ -120,7 +120,7 @@ class MarkerReading(Reading):
     @cached_property
     def _window(self) -> Window:
         count = len(self.markers.names)
-        place = np.stack([self._times - self._first_neighbour, self.t_s])
+        place = np.stack([1.0 * (self._times - self._first_neighbour), self.t_s])
         places = self._around[:, None] * count + np.arange(count)[:, None]
         return Window(places, np.repeat(place[..., None], count, axis=2))
 
