@@ -365,7 +365,7 @@ class Sweep:
         backs = [back - k * model.substeps for k in range(-around, around + 1)]
         x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
         values = seen[..., 0].reshape(len(seen), -1, 3)
-        slopes = markers.channel.slopes_of(x, self.phi, self.moving, seen[..., 1:])
+        slopes = markers.channel.slopes_of(x, self.shape_functions, self.moving, seen[..., 1:])
         residual, slope = markers.linearised(values, slopes, self.phi, model.size)
         return residual[0] - reading.tracks_m / markers.sigmas[:, None], slope[0]
 

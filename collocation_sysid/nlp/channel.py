@@ -185,10 +185,10 @@ class Points:
         at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
         return np.einsum("ma...,tmai->tmi...", weights, at)
 
-    def _by_place(self, x: Array, phi: Array) -> Array:
+    def _by_place(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
         """(R, estimated, 3, k) slopes by their own places."""
-        (nodes, shape), here = self.shape(phi), self.chart.estimated
-        return self._combined(x, nodes[here], shape.slopes[here])
+        (nodes, functions), here = shape, self.chart.estimated
+        return self._combined(x, nodes[here], functions.slopes[here])
 
     def values(self, motion: Motion, phi: Array) -> Array:
         """(R, e, 3) [m]."""
@@ -205,12 +205,14 @@ class Points:
         """The same with slopes."""
         values = self.values(motion, phi)
         by = np.zeros((len(values), 3 * self.each, 0)) if motion.by is None else motion.by
-        return values, self.slopes_of(motion.x, phi, columns, by)
+        return values, self.slopes_of(motion.x, self.shape(phi), columns, by)
 
-    def slopes_of(self, x: Array, phi: Array, columns: Index, by: Array) -> Slopes:
+    def slopes_of(
+        self, x: Array, shape: tuple[Index, ShapeFunctions], columns: Index, by: Array
+    ) -> Slopes:
         """Slopes of the values, H x changing by (R, 3e, c) with the parameters at `columns`."""
         here, by = self.chart.estimated, by.reshape(len(by), self.each, 3, by.shape[2])
-        return Slopes(columns, by, here, self.places[here], self._by_place(x, phi))
+        return Slopes(columns, by, here, self.places[here], self._by_place(x, shape))
 
     def pulled(self, motion: Motion, phi: Array, by_values: Array) -> Pulled:
         """Slopes of a scalar from those by the values."""
@@ -218,7 +220,9 @@ class Points:
         flat = by_values.reshape(len(by_values), -1)
         by_x[self.rows] = (self.operator(phi).T @ flat.T).T
         if len(here):
-            own = np.einsum("tmi,tmik->mk", by_values[:, here], self._by_place(motion.x, phi))
+            own = np.einsum(
+                "tmi,tmik->mk", by_values[:, here], self._by_place(motion.x, self.shape(phi))
+            )
             by_phi[self.places[here]] = own
         return Pulled(by_x, None, by_phi)
 
@@ -267,10 +271,10 @@ class Points:
         if x is None:
             values = np.ones(len(here[0]))
         else:
-            _, shape = self.shape(phi)
+            nodes, shape = self.shape(phi)
             weights = shape.weights[self._corners][:, None]
             of_x = np.broadcast_to(weights, (self.count, len(weights), 3))
-            own = self._by_place(x, phi)
+            own = self._by_place(x, (nodes, shape))
             values = np.concatenate([of_x.ravel(), own.ravel(), np.ones(size)])
         whole = 3 * self.each * self.count + size
         return sp.csr_array((values, here), shape=(whole, variables + size))

@@ -298,8 +298,8 @@ class GraspWrench:
             by_lag = smoothed_slope(e_a_b, value, read)
             slope[..., first + place] += self.nuisance.scales[place] * by_lag
             value = read
-        slope = slope.reshape(-1, 2, 3, size)
-        return value.reshape(-1, 2, 3), Slopes.along(np.arange(size), slope)
+        slope = slope.reshape(len(k), 2, 3, size)
+        return value.reshape(len(k), 2, 3), Slopes.along(np.arange(size), slope)
 
     def pulled(self, motion: Motion, phi: Array, by_values: Array) -> Pulled:
         """Slopes of a scalar from those by Y."""
@@ -333,7 +333,7 @@ class GraspWrench:
         k = self.grid[: len(value)]
         off = np.concatenate([turns[k], shifts[k]], axis=2)
         change = np.einsum("abn,ncb->nac", slopes, off)
-        return self.read_changes(change, phi).reshape(-1, 2, 3, change.shape[2])
+        return self.read_changes(change, phi).reshape(len(change), 2, 3, change.shape[2])
 
     def read_changes(self, change: Array, phi: Array) -> Array:
         """Those of Y (n, 6, c) from those of W."""
