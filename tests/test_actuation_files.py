@@ -94,6 +94,9 @@ def test_a_driven_box_is_read_solved_and_shown(driven):
     assert result["parameters"]["mu_pa"]["value"] == pytest.approx(TRUTH["mu_pa"], rel=1e-3)
     assert "tendon_1, more than stated [1]" in result["nuisance"]["drive"]
     assert list((driven / "run").glob("**/mesh.*"))
+    shown = run_command("report", driven / "run", "--to", driven / "page.html")
+    assert shown.code == 0, shown.err
+    assert "tendon_1, more than stated" in (driven / "page.html").read_text()
 
 
 def test_a_group_of_triangles_is_the_wall(driven):

@@ -93,7 +93,19 @@ def assert_same_information(ours: LeastSquares, theirs: LeastSquares, atol: floa
     np.testing.assert_allclose(found / scale, expected / scale, atol=atol)
 
 
-@pytest.mark.parametrize("nuisance", [IDEAL, Nuisance()], ids=["ideal", "as in a laboratory"])
+OF_THE_USER = Nuisance.none(
+    own=[
+        cs.NuisanceRow("growth", "1", 0.02, reading=lambda y, k, t_s, data: (1 + k * t_s) * y),
+        cs.NuisanceRow("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    "nuisance",
+    [IDEAL, Nuisance(), OF_THE_USER],
+    ids=["ideal", "as in a laboratory", "a user's own"],
+)
 def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
     problem, count = swing(nuisance=nuisance), 30

@@ -7,7 +7,7 @@ from .force_files import read_forces, read_pressure, read_tension
 from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
-from .nuisance import Nuisance
+from .nuisance import Nuisance, NuisanceRow
 from .pose_files import displaced_axes, read_displacement, read_poses
 from .poses import PoseSequence
 from .pressure import Pressure
@@ -26,6 +26,7 @@ __all__ = [
     "MarkerTable",
     "Markers",
     "Nuisance",
+    "NuisanceRow",
     "Placement",
     "PointMass",
     "PoseSequence",

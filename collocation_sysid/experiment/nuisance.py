@@ -7,7 +7,7 @@ limits, tables and texts follow from it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,12 +35,13 @@ SHOWN |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
 class NuisanceRow:
     """Something that may not be known exactly of a recording; its prior is normal about zero.
 
-    A recording has its values by components (markers, grasps, …) and axes.
+    A recording has its values by components (markers, grasps, …) and axes. Rows of a user's own say
+    what they make of a marker's reading, or of its time, and go into `Nuisance(own=[…])`.
 
     Attributes
     ----------
     name : str
-        Field of `Nuisance`.
+        Field of `Nuisance`, or of a user's own choice.
     unit : str
         Of its values: "m", "s", "rad", …
     sigma : float or None
@@ -48,13 +49,13 @@ class NuisanceRow:
     said : str
         What it is, for documentation.
     label : str
-        The same for tables of results, with {which} component and {axis}.
-    key, prior : str
-        Keys of the problem file, of [experiment.nuisance] and in its table.
+        The same for tables of results, with {which} component and {axis}; the name by default.
+    key : str
+        Of [experiment.nuisance] in the problem file.
     beside : float or None
         The deviation where the key's table has other priors only.
     of : str
-        What there is one of: the recording, or each marker, grasp, …
+        What there is one of: the recording, or each marker, grasp, …; the first two of one's own.
     axes : str
         Names of the components of a vector, apart by blanks; one number without.
     changes : tuple of str
@@ -74,11 +75,13 @@ class NuisanceRow:
     same : callable
         Of an experiment: what must be the same in recordings that share it, by its name.
     reading : callable, optional
-        ``reading(y, values, t_s, data) -> y``, what it makes of a marker's reading y (3,), an
-        expression of CasADi: of its values (one, or as many as axes), the time, and the
-        recording's `RecordingData`.
+        ``reading(y, values, t_s, data) -> y``, what it makes of a marker's reading y (3,) [m], an
+        expression of CasADi: of its values (one, or as many as axes), the time, and of the
+        recording `data.pivot_m`, the middle of the undeformed body in its first pose,
+        `data.gravity_m_s2`, `data.interval_s` and `data.duration_s`.
     clock : callable, optional
-        ``clock(values, t_s, data)``, how much later than at t_s a marker was seen [s].
+        ``clock(values, t_s, data)``, how much later than at t_s a marker was seen [s]; samples are
+        read up to two away.
     """
 
     name: str
@@ -88,7 +91,6 @@ class NuisanceRow:
     label: str = ""
     _: KW_ONLY
     key: str = ""
-    prior: str = ""
     beside: float | None = None
     of: Of = "recording"
     axes: str = ""
@@ -103,6 +105,17 @@ class NuisanceRow:
     same: Callable[[Any], dict[str, Any]] = lambda experiment: {}
     reading: Callable[[Any, Any, Any, Any], Any] | None = None
     clock: Callable[[Any, Any, Any], Any] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.label:
+            which, axis = " of {which}" * (self.of == "marker"), ", {axis}" * bool(self.axes)
+            vars(self)["label"] = self.name.replace("_", " ") + which + axis
+
+    @property
+    def prior(self) -> str:
+        """Key of the deviation in the problem file."""
+        unit = {"1": "", "σ": "_sigmas"}.get(self.unit, f"_{self.unit.lower()}")
+        return f"prior{unit}"
 
     @property
     def usual(self) -> str:
@@ -152,275 +165,89 @@ def _grasped(experiment: Any) -> dict[str, Any]:
     return {"body": id(experiment.body), "nodes in its grasps": nodes}
 
 
-PLACE = NuisanceRow(
-    "marker_offset_m",
-    "m",
-    1e-3,
-    "errors of the places in reference_m without a reference_sigma_m; they turn with the body",
-    "place of {which}, {axis}",
-    key="marker_offsets",
-    prior="prior_m",
-    of="place",
-    axes="x y z",
-    changes=(),
-    reach=FREELY,
-    step=_edges,
-    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
-)
-OFFSET = NuisanceRow(
-    "camera_offset_m",
-    "m",
-    None,
-    "a constant offset of each marker in the cameras' frame",
-    "camera offset of {which}, {axis}",
-    key="camera_offsets",
-    prior="prior_m",
-    of="marker",
-    axes="x y z",
-    reach=FREELY,
-    told="camera offsets up to {size}",
-    by="length",
-    reading=_shifted,
-)
-TIME = NuisanceRow(
-    "time_shift_s",
-    "s",
-    5e-3,
-    "how much later than their times say markers were seen, on the grasps' clock",
-    "time shift",
-    key="time_shift",
-    prior="prior_s",
-    changes=("clock",),
-    applies=_moves,
-    told="markers seen {size} {way} than their times say{limit}",
+# fmt: off
+PLACE = NuisanceRow("marker_offset_m", "m", 1e-3, key="marker_offsets", of="place", axes="x y z",
+    changes=(), reach=FREELY, step=_edges,
+    label="place of {which}, {axis}",
+    said="errors of the places in reference_m without a reference_sigma_m; they turn with the body",
+    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface})
+OFFSET = NuisanceRow("camera_offset_m", "m", None, key="camera_offsets", of="marker", axes="x y z",
+    reach=FREELY, by="length",
+    label="camera offset of {which}, {axis}", told="camera offsets up to {size}",
+    said="a constant offset of each marker in the cameras' frame", reading=_shifted)
+TIME = NuisanceRow("time_shift_s", "s", 5e-3, key="time_shift", changes=("clock",), applies=_moves,
+    label="time shift", told="markers seen {size} {way} than their times say{limit}",
+    said="how much later than their times say markers were seen, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
-    clock=lambda values, t_s, data: values,
-)
-TURN = NuisanceRow(
-    "pose_turn_rad",
-    "rad",
-    None,
-    "a constant turn of grasps and body in the cameras' frame, which turns gravity in the body's",
-    "turn of the pose, {axis}",
-    key="pose",
-    prior="prior_rad",
-    axes="x y z",
-    changes=("reading", "gravity"),
-    told="poses turned by {size}",
+    clock=lambda values, t_s, data: values)
+TURN = NuisanceRow("pose_turn_rad", "rad", None, key="pose", axes="x y z",
+    changes=("reading", "gravity"), by="length",
+    label="turn of the pose, {axis}", told="poses turned by {size}",
+    said="a constant turn of grasps and body in the cameras' frame, which turns gravity in the "
+         "body's", reading=_turned)
+SHIFT = NuisanceRow("pose_shift_m", "m", None, key="pose", axes="x y z", reach=FREELY, by="length",
+    label="shift of the pose, {axis}", told="poses shifted by {size}",
+    said="a constant shift of both", reading=_shifted)
+TILT = NuisanceRow("gravity_rad", "rad", DEGREE, key="gravity", axes="first second",
+    changes=("gravity",), applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     by="length",
-    reading=_turned,
-)
-SHIFT = NuisanceRow(
-    "pose_shift_m",
-    "m",
-    None,
-    "a constant shift of both",
-    "shift of the pose, {axis}",
-    key="pose",
-    prior="prior_m",
-    axes="x y z",
-    reach=FREELY,
-    told="poses shifted by {size}",
-    by="length",
-    reading=_shifted,
-)
-TILT = NuisanceRow(
-    "gravity_rad",
-    "rad",
-    DEGREE,
-    "a tilt of the direction of gravity",
-    "tilt of gravity, {axis}",
-    key="gravity",
-    prior="prior_rad",
-    axes="first second",
-    changes=("gravity",),
-    applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
-    told="gravity tilted by {size}",
-    by="length",
-    same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
-)
-GRASP_TURN = NuisanceRow(
-    "hand_eye_rad",
-    "rad",
-    0.5 * DEGREE,
-    "a constant turn of the body in its grasps",
-    "turn in the grasp, {axis}",
-    key="hand_eye",
-    prior="prior_rad",
-    axes="x y z",
-    changes=("grasps",),
-    applies=_seen_in_grasp,
-    told="body turned in its grasp by {size}",
-    by="length",
-    same=_grasped,
-)
-GRASP_SHIFT = NuisanceRow(
-    "hand_eye_m",
-    "m",
-    1e-3,
-    "a constant shift of it there; both where the start is an equilibrium and markers see it",
-    "shift in the grasp, {axis}",
-    key="hand_eye",
-    prior="prior_m",
-    axes="x y z",
-    changes=("grasps",),
-    applies=_seen_in_grasp,
-    told="body shifted in its grasp by {size}",
-    by="length",
-    same=_grasped,
-)
-ZERO = NuisanceRow(
-    "displacement_zero_m",
-    "m",
-    1e-4,
-    "a constant offset of each displacement along each of its axes",
-    "zero of grasp {which}, {axis}",
-    key="displacement_zero",
-    prior="prior_m",
-    of="grasp",
-    axes="x y z",
-    changes=("grasps",),
-    told="zero of a displacement off by {size}",
-    by="worst",
-)
-TENSION_FACTOR = NuisanceRow(
-    "tension_factor",
-    "1",
-    None,
-    "a factor on the tension of each tendon, how far from one",
-    "{which}, more than stated",
-    key="tension_factor",
-    prior="prior",
-    of="tendon",
+    label="tilt of gravity, {axis}", told="gravity tilted by {size}",
+    said="a tilt of the direction of gravity", same=lambda e: {"gravity": tuple(e.gravity_m_s2)})
+GRASP_TURN = NuisanceRow("hand_eye_rad", "rad", 0.5 * DEGREE, key="hand_eye", axes="x y z",
+    changes=("grasps",), applies=_seen_in_grasp, by="length",
+    label="turn in the grasp, {axis}", told="body turned in its grasp by {size}",
+    said="a constant turn of the body in its grasps", same=_grasped)
+GRASP_SHIFT = NuisanceRow("hand_eye_m", "m", 1e-3, key="hand_eye", axes="x y z",
+    changes=("grasps",), applies=_seen_in_grasp, by="length",
+    label="shift in the grasp, {axis}", told="body shifted in its grasp by {size}",
+    said="a constant shift of it there; both where the start is an equilibrium and markers see it",
+    same=_grasped)
+ZERO = NuisanceRow("displacement_zero_m", "m", 1e-4, key="displacement_zero", of="grasp",
+    axes="x y z", changes=("grasps",), by="worst",
+    label="zero of grasp {which}, {axis}", told="zero of a displacement off by {size}",
+    said="a constant offset of each displacement along each of its axes")
+TENSION_FACTOR = NuisanceRow("tension_factor", "1", None, key="tension_factor", of="tendon",
     changes=("drives",),
-    told="{which} by {signed}",
-)
-TENSION_LOST = NuisanceRow(
-    "tension_lost_n",
-    "N",
-    None,
-    "tension of each tendon that friction takes",
-    "{which}, lost",
-    key="tension_lost",
-    prior="prior_n",
-    of="tendon",
+    label="{which}, more than stated", told="{which} by {signed}",
+    said="a factor on the tension of each tendon, how far from one")
+TENSION_LOST = NuisanceRow("tension_lost_n", "N", None, key="tension_lost", of="tendon",
     changes=("drives",),
-    told="{which} {signed}",
-)
-PRESSURE_FACTOR = NuisanceRow(
-    "pressure_factor",
-    "1",
-    None,
-    "a factor on each pressure, how far from one",
-    "{which}, more than stated",
-    key="pressure_factor",
-    prior="prior",
-    of="pressure",
+    label="{which}, lost", told="{which} {signed}",
+    said="tension of each tendon that friction takes")
+PRESSURE_FACTOR = NuisanceRow("pressure_factor", "1", None, key="pressure_factor", of="pressure",
     changes=("drives",),
-    told="{which} by {signed}",
-)
-PRESSURE_LOST = NuisanceRow(
-    "pressure_lost_pa",
-    "Pa",
-    None,
-    "an offset that each pressure lacks",
-    "{which}, lost",
-    key="pressure_lost",
-    prior="prior_pa",
-    of="pressure",
+    label="{which}, more than stated", told="{which} by {signed}",
+    said="a factor on each pressure, how far from one")
+PRESSURE_LOST = NuisanceRow("pressure_lost_pa", "Pa", None, key="pressure_lost", of="pressure",
     changes=("drives",),
-    told="{which} {signed}",
-)
-JOINING = NuisanceRow(
-    "joining_s",
-    "s",
-    1e-2,
-    "how much later than stated each point mass or force joins or leaves, where it does so within "
-    "the recording",
-    "{which}",
-    key="joining",
-    prior="prior_s",
-    of="load",
-    changes=("loads",),
+    label="{which}, lost", told="{which} {signed}", said="an offset that each pressure lacks")
+JOINING = NuisanceRow("joining_s", "s", 1e-2, key="joining", of="load", changes=("loads",),
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
-    told="{which} {number}{error}{unit} {way} than {stated}",
-)
-TARE = NuisanceRow(
-    "tare",
-    "σ",
-    10.0,
-    "a constant offset of each component of a wrench, in its sigmas",
-    "tare{which} of {axis}",
-    key="tare",
-    prior="prior_sigmas",
-    of="sensor",
-    changes=("sensor",),
-    reach=FREELY,
-    told="tare up to {size}",
+    label="{which}", told="{which} {number}{error}{unit} {way} than {stated}",
+    said="how much later than stated each point mass or force joins or leaves, where it does so "
+         "within the recording")
+TARE = NuisanceRow("tare", "σ", 10.0, key="tare", of="sensor", changes=("sensor",), reach=FREELY,
     by="worst",
-)
-SENSOR_TIME = NuisanceRow(
-    "sensor_time_s",
-    "s",
-    5e-3,
-    "how much later than their times say wrenches were measured; three deviations at most",
-    "time shift of the sensor{which}",
-    key="sensor_time",
-    prior="prior_s",
-    of="sensor",
-    changes=("sensor",),
-    applies=_moves,
-    low=-3.0,
-    high=3.0,
-    told="sensor late by {size}",
-    by="worst",
-)
-SENSOR_LAG = NuisanceRow(
-    "sensor_lag_s",
-    "s",
-    None,
-    "time constant of a first-order low-pass in the sensor; from zero to three deviations",
-    "lag of the sensor{which}",
-    key="sensor_lag",
-    prior="prior_s",
-    of="sensor",
-    changes=("sensor",),
-    applies=_moves,
-    low=0.0,
-    high=3.0,
-    told="lag of the sensor {size}",
-    by="worst",
-)
-TOOL_MASS = NuisanceRow(
-    "tool_kg",
-    "kg",
-    None,
-    "a mass between a sensor and the body",
-    "mass of the tool{which}",
-    key="tool",
-    prior="prior_kg",
-    of="sensor",
-    changes=("sensor",),
-    low=0.0,
-    told="tool of {size}",
-    by="worst",
-)
-TOOL_CENTRE = NuisanceRow(
-    "tool_m",
-    "m",
-    None,
-    "its centre about the sensor's point; in the world's frame that of the grasped nodes",
-    "centre of the tool{which}, {axis}",
-    key="tool",
-    prior="prior_m",
+    label="tare{which} of {axis}", told="tare up to {size}",
+    said="a constant offset of each component of a wrench, in its sigmas")
+SENSOR_TIME = NuisanceRow("sensor_time_s", "s", 5e-3, key="sensor_time", of="sensor",
+    changes=("sensor",), applies=_moves, low=-3.0, high=3.0, by="worst",
+    label="time shift of the sensor{which}", told="sensor late by {size}",
+    said="how much later than their times say wrenches were measured; three deviations at most")
+SENSOR_LAG = NuisanceRow("sensor_lag_s", "s", None, key="sensor_lag", of="sensor",
+    changes=("sensor",), applies=_moves, low=0.0, high=3.0, by="worst",
+    label="lag of the sensor{which}", told="lag of the sensor {size}",
+    said="time constant of a first-order low-pass in the sensor; from zero to three deviations")
+TOOL_MASS = NuisanceRow("tool_kg", "kg", None, key="tool", of="sensor", changes=("sensor",),
+    low=0.0, by="worst",
+    label="mass of the tool{which}", told="tool of {size}",
+    said="a mass between a sensor and the body")
+TOOL_CENTRE = NuisanceRow("tool_m", "m", None, key="tool", of="sensor", axes="x y z",
+    changes=("sensor",), applies=lambda experiment: bool(experiment.nuisance.tool_kg), by="worst",
     beside=0.05,
-    of="sensor",
-    axes="x y z",
-    changes=("sensor",),
-    applies=lambda experiment: bool(experiment.nuisance.tool_kg),
-    told="its centre off by {size}",
-    by="worst",
-)
+    label="centre of the tool{which}, {axis}", told="its centre off by {size}",
+    said="its centre about the sensor's point; in the world's frame that of the grasped nodes")
+# fmt: on
 
 # In the order of φ; neighbours of one component stand together.
 ROWS = (
@@ -434,8 +261,13 @@ class _Deviations:
     """What `Nuisance` does with its fields."""
 
     scope: Mapping[str, str]
+    own: Sequence[NuisanceRow]
 
     def __post_init__(self) -> None:
+        for row in self.own:
+            _require_own(row)
+            if [each.name for each in self.rows].count(row.name) > 1:
+                raise InputError(f"two nuisance parameters are named {row.name!r}")
         for row in self.rows:
             value = self.sigma(row)
             if value is not None and not value > 0:
@@ -450,17 +282,27 @@ class _Deviations:
     @property
     def rows(self) -> tuple[NuisanceRow, ...]:
         """All that may be estimated."""
-        return ROWS
+        return (*ROWS, *self.own)
 
     def sigma(self, row: NuisanceRow) -> float | None:
         """Standard deviation of a row's prior; None where it is not estimated."""
-        return getattr(self, row.name)
+        return row.sigma if row in self.own else getattr(self, row.name)
 
     @classmethod
     def none(cls, **deviations: Any) -> Nuisance:
         """Nothing is estimated but what is named."""
         nothing: dict[str, Any] = {row.name: None for row in ROWS}
         return Nuisance(**(nothing | deviations))
+
+
+def _require_own(row: NuisanceRow) -> None:
+    """Refuse a row of a user's own that does not say what it does."""
+    if row.of not in ("recording", "marker"):
+        raise InputError(f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'")
+    if row.sigma is None:
+        raise InputError(f"{row.name} has no sigma; expected the deviation of its prior")
+    if (row.reading is None) == (row.clock is None):
+        raise InputError(f"{row.name} has to have a reading or a clock, one of both")
 
 
 _SAID = """Standard deviations of an experiment's nuisance parameters; None where not estimated.
@@ -475,6 +317,8 @@ Attributes
 _SCOPE_SAID = """
 scope : mapping of the name of a field to "shared", or "shared" and a word
     Those that are the same in all recordings that have the word; each recording has its own else.
+own : sequence of NuisanceRow
+    More of them, that change what markers read or when.
 """
 
 if TYPE_CHECKING:
@@ -491,7 +335,8 @@ else:
         "Nuisance",
         [
             *((row.name, "float | None", field(default=row.sigma)) for row in ROWS),
-            ("scope", "Mapping[str, str]", field(default_factory=dict)),
+            ("scope", "Mapping[str, str]", field(default_factory=dict, hash=False)),
+            ("own", "Sequence[NuisanceRow]", field(default=(), hash=False)),
         ],
         bases=(_Deviations,),
         frozen=True,

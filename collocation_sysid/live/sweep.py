@@ -366,6 +366,8 @@ class Sweep:
         x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
         values = seen[..., 0].reshape(len(seen), -1, 3)
         slopes = markers.channel.slopes_of(x, self.shape_functions, self.moving, seen[..., 1:])
+        since_s = (self.row - 1 - back) / model.substeps * model.interval_s
+        markers = markers.later(since_s)
         residual, slope = markers.linearised(values, slopes, self.phi, model.size)
         return residual[0] - reading.tracks_m / markers.sigmas[:, None], slope[0]
 

@@ -8,6 +8,7 @@ h(x_t) without φ, see `channel` and `nuisance`.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -128,6 +129,14 @@ class MarkerReading(Reading):
         """Of the samples that the first ones known suffice to read."""
         samples = int(np.count_nonzero(self._around[:, -1] < known))
         return Window(self._window.places[:samples], self._window.data[:, :samples])
+
+    def later(self, by_s: float) -> MarkerReading:
+        """The same of samples so much later."""
+        other, data, instruments = copy(self), self._window.data.copy(), self._instruments
+        data[1] += by_s
+        moved = self._window._replace(data=data)
+        vars(other).update(_window=moved, _instruments=instruments)
+        return other
 
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Y of a marker, from its plain places at neighbouring samples."""

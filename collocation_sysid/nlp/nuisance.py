@@ -19,12 +19,13 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
-from typing import NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
 
 from ..arrays import Array, Index
+from ..errors import InputError
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp, held_nodes
 from ..experiment.loads import Change, Force, PointMass
@@ -45,6 +46,7 @@ from ..experiment.nuisance import (
     rotation,
 )
 from ..experiment.wrench import COMPONENTS, UNITS, Wrench
+from ..files import reason
 from .generated import Generated
 
 Load = TypeVar("Load", PointMass, Force)
@@ -146,7 +148,7 @@ class NuisanceMap:
         steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         held = held_nodes(experiment.grasps)
-        return cls(
+        found = cls(
             entries,
             tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
             scales,
@@ -160,6 +162,28 @@ class NuisanceMap:
             tuple(timed for _, timed in _timed(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
+        for row in experiment.nuisance.own:
+            found._require_smooth(row)
+        return found
+
+    def _require_smooth(self, row: NuisanceRow) -> None:
+        """Refuse an expression of a user's own that cannot be read with, or has no slopes."""
+        y, t_s = ca.SX.sym("y", 3), ca.SX.sym("t_s")
+        values = ca.SX.sym("values", max(1, len(row.axes.split())))
+        what = "reading" if row.reading else "clock"
+        try:
+            made: Any = row.reading and row.reading(y, values, t_s, self)
+            made = ca.SX(row.clock(values, t_s, self) if row.clock else made)
+        except Exception as error:
+            raise InputError(f"the {what} of {row.name} failed: {reason(error)}") from error
+        wanted = (3, 1) if row.reading else (1, 1)
+        if made.shape != wanted:
+            found = f"the {what} of {row.name} has the shape {made.shape}"
+            raise InputError(f"{found}; expected {wanted}")
+        slopes = ca.Function("slopes", [y, values, t_s], [made, ca.jacobian(made, values)])
+        at = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
+        if not all(np.isfinite(part.full()).all() for part in at):
+            raise InputError(f"the {what} of {row.name} or its slopes are not finite at zero")
 
     @property
     def size(self) -> int:
@@ -221,13 +245,6 @@ class NuisanceMap:
     def of_clock(self) -> Index:
         """Positions in φ of what shifts the times at which markers are seen."""
         return self._where(lambda e: e.row.clock is not None)
-
-    @cached_property
-    def reads_plainly(self) -> bool:
-        """Whether a marker is read as it is, at its place on the body, if by another clock."""
-        return all(
-            e.row.reading is None and e.row.clock in (None, TIME.clock) for e in self.entries
-        )
 
     def late_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """How much later than at t_s a marker was seen, at its φ."""

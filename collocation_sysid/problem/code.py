@@ -1,4 +1,4 @@
-"""Materials and forces from Python files: foreign code, run only when allowed."""
+"""What a problem file takes from Python files: foreign code, run only when allowed."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..errors import InputError, hint_at
+from ..experiment.nuisance import NuisanceRow
 from ..fem.materials import Energy, Material
 from ..fem.node_force import NodeForce
 from ..files import reason
+from .nuisance_schema import OwnRow
 from .recording import existing_file, selection
 from .schema import CodeSection, NodeForceSection
 
@@ -61,18 +63,7 @@ def load_function(
     InputError
         If running code is not allowed, the file or the function is not there, or the file fails.
     """
-    if not allowed:
-        raise InputError(
-            f"found the file {section.file}, which would be run as Python code; allow that with "
-            "--allow-code (allow_code=True from Python) if you trust it",
-            None,
-            key,
-        )
-    file = existing_file(folder, section.file, f"{key}.file")
-    try:
-        names = runpy.run_path(str(file))
-    except (Exception, SystemExit) as error:
-        raise InputError(f"running it failed: {reason(error)}", file) from error
+    file, names = _run(section.file, folder, key, allowed)
     found = names.get(section.function)
     if not callable(found) and not isinstance(found, NodeForce):
         functions = [n for n, v in names.items() if callable(v) and not n.startswith("_")]
@@ -82,3 +73,39 @@ def load_function(
             file,
         )
     return file, cast(Callable[..., Any], found)
+
+
+def load_row(section: OwnRow, folder: Path, key: str, allowed: bool) -> NuisanceRow:
+    """Run the file and take a nuisance parameter from it.
+
+    Raises
+    ------
+    InputError
+        If running code is not allowed, the file or the row is not there, or the file fails.
+    """
+    file, names = _run(section.file, folder, key, allowed)
+    found = names.get(section.row)
+    if not isinstance(found, NuisanceRow):
+        rows = [name for name, value in names.items() if isinstance(value, NuisanceRow)]
+        raise InputError(
+            f"there is no NuisanceRow {section.row!r}; expected one of "
+            f"{', '.join(rows) or 'none'}{hint_at(section.row, rows)}",
+            file,
+        )
+    return found
+
+
+def _run(name: str, folder: Path, key: str, allowed: bool) -> tuple[Path, dict[str, Any]]:
+    """The file, and the names that are in it after it has run."""
+    if not allowed:
+        raise InputError(
+            f"found the file {name}, which would be run as Python code; allow that with "
+            "--allow-code (allow_code=True from Python) if you trust it",
+            None,
+            key,
+        )
+    file = existing_file(folder, name, f"{key}.file")
+    try:
+        return file, runpy.run_path(str(file))
+    except (Exception, SystemExit) as error:
+        raise InputError(f"running it failed: {reason(error)}", file) from error

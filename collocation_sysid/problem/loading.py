@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..errors import InputError
+from ..experiment.nuisance import NuisanceRow
 from ..fem.body import Body
 from ..fem.constants import constant_named
 from ..fem.materials import Material
@@ -16,8 +17,9 @@ from ..fem.plausible import oddities
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..nlp.parameters import Parameters, Tied, Unknown
-from .code import load_force, load_material
+from .code import load_force, load_material, load_row
 from .densities import completed, guessed
+from .nuisance_schema import OwnRow
 from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file, selection
@@ -52,8 +54,12 @@ def read_problem(
     parameters = _located(path, "parameters", lambda: _load_parameters(guessed(given, body), body))
     odd = _located(path, "object", lambda: [oddity.sentence for oddity in oddities(body)])
     experiments, notes = [], []
+
+    def row_of(section: OwnRow) -> NuisanceRow:
+        return load_row(section, folder, "nuisance.own", allow_code)
+
     for section in file.experiment:
-        reader = RecordingReader(section, folder, body, parameters, simulation)
+        reader = RecordingReader(section, folder, body, parameters, simulation, row_of)
         with _blamed_on(odd):
             experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
         notes += reader.notes

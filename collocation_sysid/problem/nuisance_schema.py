@@ -6,12 +6,13 @@ A key has the priors of one row of the table, or of several.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from itertools import groupby
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Optional
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, create_model, model_validator
 
-from ..checked import Positive
+from ..checked import Positive, Text
 from ..experiment import Nuisance
 from ..experiment.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
 from .section import Section, given_keys
@@ -25,8 +26,8 @@ def _scope(word: str) -> str:
     return word
 
 
-class Prior(Section):
-    """How well something is known; what is left out of several is taken as exact."""
+class Scoped(Section):
+    """Something of a recording, or of several."""
 
     scope: Annotated[str, AfterValidator(_scope)] = Field(
         "recording",
@@ -34,6 +35,17 @@ class Prior(Section):
         + SCOPES
         + ".",
     )
+
+
+class OwnRow(Scoped):
+    """A nuisance parameter of the user's own: a NuisanceRow in a Python file."""
+
+    file: Text = Field(description="Python file; it is run, which needs --allow-code.")
+    row: Text = Field(description="Name of the NuisanceRow in it.")
+
+
+class Prior(Scoped):
+    """How well something is known; what is left out of several is taken as exact."""
 
     usual: ClassVar[bool] = False
 
@@ -80,6 +92,8 @@ def _section() -> type[Section]:
     for key, rows in KEYS.items():
         said = " ".join(f"{row.said[0].upper()}{row.said[1:]}: {_said(row)}." for row in rows)
         fields[key] = (or_none(_prior(key, rows)) | None, Field(None, description=said))
+    said = "[[experiment.nuisance.own]] tables: what a Python file makes of markers' readings."
+    fields["own"] = (list[OwnRow], Field(default_factory=list, description=said))
     said = (
         "What is estimated of this recording alone, each with a prior around zero.\n\n"
         'What has a prior by default is estimated unless it is "none".'
@@ -98,12 +112,15 @@ else:
     NuisanceOrNone = or_none(NuisanceSection)
 
 
-def nuisance_of(section: Section | Literal["none"]) -> Nuisance:
-    """The defaults, with what the table says otherwise."""
+def nuisance_of(
+    section: Section | Literal["none"], row_of: Callable[[OwnRow], NuisanceRow]
+) -> Nuisance:
+    """The defaults, with what the table says otherwise, and rows of the user's own."""
     if section == "none":
         return Nuisance.none()
     found: dict[str, float | None] = {}
     scope: dict[str, str] = {}
+    assert isinstance(section, NuisanceSection)
     for key, rows in KEYS.items():
         given = getattr(section, key)
         if given == "none":
@@ -114,4 +131,8 @@ def nuisance_of(section: Section | Literal["none"]) -> Nuisance:
             found |= known if any(known.values()) else {}
             if given.scope != "recording":
                 scope |= {row.name: given.scope for row in rows}
-    return Nuisance(**found, scope=scope)
+    tables: list[OwnRow] = vars(section)["own"]
+    own = [row_of(each) for each in tables]
+    said = {row.name: each.scope for row, each in zip(own, tables, strict=True)}
+    scope |= {name: word for name, word in said.items() if word != "recording"}
+    return Nuisance(**found, scope=scope, own=own)

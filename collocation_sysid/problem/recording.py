@@ -37,6 +37,7 @@ from ..experiment import (
 from ..experiment.clock import TIME_TOLERANCE_S
 from ..experiment.coverage import refuse_untold
 from ..experiment.loads import Change
+from ..experiment.nuisance import NuisanceRow
 from ..experiment.wrench_files import within
 from ..fem.body import Body
 from ..fem.selection import Ball, Box, Indices, Named, Selection
@@ -44,7 +45,7 @@ from ..files import require_regular
 from ..methods.scan import usual_constants
 from ..nlp.parameters import Parameters
 from ..statistics.description import doubts
-from .nuisance_schema import nuisance_of
+from .nuisance_schema import OwnRow, nuisance_of
 from .recording_schema import (
     ExperimentSection,
     ForceSection,
@@ -112,7 +113,9 @@ class RecordingReader:
         body: Body,
         parameters: Parameters,
         simulation: bool,
+        row_of: Callable[[OwnRow], NuisanceRow],
     ) -> None:
+        self.row_of = row_of
         self.section = section
         self.folder = folder
         self.body = body
@@ -158,7 +161,7 @@ class RecordingReader:
                 forces=forces,
                 tendons=tendons,
                 pressures=pressures,
-                nuisance=nuisance_of(section.nuisance),
+                nuisance=nuisance_of(section.nuisance, self.row_of),
             )
 
         n = len(self.body.nodes_m)
