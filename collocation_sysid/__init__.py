@@ -30,9 +30,9 @@ from .experiment import (
 from .fem.body import Body
 from .fem.constants import Constant
 from .fem.materials import Material
-from .fem.memory import Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
+from .fem.prony import Prony
 from .fem.regions import Region
 from .fem.selection import Ball, Box, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh

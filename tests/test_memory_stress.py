@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.memory import Carried, Fading, Prony
+from collocation_sysid.fem.memory import Branch, fading
+from collocation_sysid.fem.prony import Prony
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.memory import History, Remembered
+from collocation_sysid.nlp.memory import History, Recursion, Remembered
 from collocation_sysid.nlp.simulation import simulate
 from collocation_sysid.nlp.unsymmetric import whole
 
@@ -207,7 +208,7 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
     v = rng.standard_normal(x.shape)
     stiffening = np.outer([0.1, 0.3, 0.3], np.arange(1.0, 1.0 + len(body.parts)))
     overstress = 30.0 * rng.standard_normal((3, body.stresses.width))
-    carried = replace(Carried.nothing(body, 3), overstress=overstress, stiffening=stiffening)
+    carried = replace(body.memory.nothing(3), overstress=overstress, stiffening=stiffening)
     at = body.linearise(x, v, theta, carried=carried)
     np.testing.assert_allclose(
         at.force, body.force(x, v, theta, carried=carried), rtol=1e-11, atol=1e-12
@@ -222,19 +223,23 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
     )  # fmt: skip
 
 
-def test_how_fast_a_branch_fades_is_differentiated():
-    spacing_s, theta = np.array([1e-4, 0.01, 0.3]), np.array([0.4, 0.07])
-    for of in (
-        lambda g, tau: Fading.over(g, tau, spacing_s),
-        lambda g, tau: Fading.after(g, tau, 0.1),
-    ):
-        for k in range(2):
-            step = 1e-6 * np.eye(2)[k]
-            ahead, behind, here = of(*(theta + step)), of(*(theta - step)), of(*theta)
-            np.testing.assert_allclose(here.c_by[k], (ahead.c - behind.c) / 2e-6, rtol=1e-6)
-            np.testing.assert_allclose(
-                here.e_by[k], (ahead.e - behind.e) / 2e-6, rtol=1e-6, atol=1e-9
-            )
+def test_how_fast_a_branch_fades_is_exact_and_differentiated():
+    until_next_s, theta = np.array([1e-4, 0.01, 0.3]), np.array([0.4, 0.07])
+    branch, loaded_s = Branch(0, slice(0), slice(0), 0, 1), 0.1
+    here = Recursion.of(branch, theta, until_next_s, loaded_s)
+    np.testing.assert_allclose(here.d, np.exp(-until_next_s / theta[1]))
+    np.testing.assert_allclose(here.c[0], theta[0] * np.exp(-loaded_s / theta[1]))
+    _, c = fading(*theta, until_next_s[1])
+    np.testing.assert_allclose(here.c[2], c)
+    np.testing.assert_allclose(here.a[1], here.d[1] * here.c[1] - c)
+    for k in range(2):
+        step = 1e-6 * np.eye(2)[k]
+        ahead, behind = (
+            Recursion.of(branch, theta + s, until_next_s, loaded_s) for s in (step, -step)
+        )
+        for j, name in enumerate("cda"):
+            slope = (getattr(ahead, name) - getattr(behind, name)) / 2e-6
+            np.testing.assert_allclose(here.by[j, k], slope, rtol=1e-6, atol=1e-9)
 
 
 # Descriptions -----------------------------------------------------------------------------------

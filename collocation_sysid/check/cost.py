@@ -10,7 +10,6 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..fem.memory import branches_of
 from ..methods.reduced_space import memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
@@ -75,7 +74,7 @@ def costs(
 def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
     """What interior point has of each experiment, the overstress of its memory included."""
     return [
-        len(segment.free_dofs) + sum(b.own.stop - b.own.start for b in branches_of(segment.body))
+        len(segment.free_dofs) + sum(b.own.stop - b.own.start for b in segment.body.memory.branches)
         for segment in collocation.segments
     ]
 

@@ -20,62 +20,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import InputError
-from .constants import SHARE, TAU, Constant
-
-if TYPE_CHECKING:
-    from .body import Body
-
-
-@dataclass(frozen=True)
-class Prony:
-    """A branch of the memory: a spring of `share` times the stiffness, behind a dashpot.
-
-    Attributes
-    ----------
-    name : str
-        Stands before the names of its constants: ``prony_1.share``, ``prony_1.tau_s``.
-    """
-
-    name: str
-
-    def __post_init__(self) -> None:
-        if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
-            raise InputError(
-                f"the branch's name is {self.name!r}; expected letters, digits, - and _, which "
-                "stand before the names of its parameters"
-            )
-
-    @property
-    def constants(self) -> tuple[Constant, Constant]:
-        """Its share g and its relaxation time τ."""
-        share, tau = (replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU))
-        return share, tau
-
-
-def as_branches(given: Sequence[str | Prony]) -> tuple[Prony, ...]:
-    """Branches from their names, or themselves.
-
-    Raises
-    ------
-    InputError
-        For a name that cannot be one, or is there twice.
-    """
-    if isinstance(given, str):
-        raise InputError(f"prony is {given!r}; expected a sequence of names")
-    branches = tuple(b if isinstance(b, Prony) else Prony(b) for b in given)
-    names = [branch.name for branch in branches]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two branches of a part are named {name!r}; names must differ")
-    return branches
+from .regions import Part
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +46,6 @@ class Carried:
     stiffening: Array
     slopes: Array
     bends: Array
-
-    @classmethod
-    def nothing(cls, body: Body, states: int) -> Carried:
-        """Of a body that has relaxed."""
-        count = len(body.constants)
-        sizes = (width(body),), (len(body.parts),), (count,), (count, count)
-        return cls(*(np.zeros((states, *size)) for size in sizes))
 
     def runs(self, part: int) -> Iterator[tuple[slice, float]]:
         """Rows that follow one another with the same s of a part, and that."""
@@ -134,84 +79,64 @@ class Branch:
     tau: int
 
 
-def branches_of(body: Body) -> list[Branch]:
-    """All branches of a body."""
-    found: list[Branch] = []
-    starts, own = _starts(body), 0
-    for number, part in enumerate(body.parts):
-        first = body.starts[number] + part.of_law
-        points = slice(starts[number], starts[number + 1])
-        for k in range(len(part.prony)):
-            here = slice(own, own + points.stop - points.start)
-            found.append(Branch(number, points, here, first + 2 * k, first + 2 * k + 1))
-            own = here.stop
-    return found
-
-
-def width(body: Body) -> int:
-    """How many numbers the points of a body carry."""
-    return _starts(body)[-1]
-
-
-def point_places(body: Body, number: int) -> NDArray[np.int64]:
-    """(E, q, 6) where in that row the points of a part are."""
-    cells, points = len(body.parts[number].cells), body.geometry.shape[1]
-    own = np.arange(cells * points).reshape(cells, points, 1)
-    return _starts(body)[number] + own + cells * points * np.arange(6)
-
-
-def _starts(body: Body) -> list[int]:
-    points = body.geometry.shape[1]
-    sizes = [6 * points * len(part.cells) if part.prony else 0 for part in body.parts]
-    return [0, *np.cumsum(sizes).tolist()]
-
-
 @dataclass(frozen=True, eq=False)
-class Fading:
-    """e and c of a branch over intervals, each with its derivatives by g and τ.
+class PointLayout:
+    """What the points of a body carry, in one row: the parts with memory in turn.
 
     Attributes
     ----------
-    e, c : (N,)
-    e_by, c_by : (2, N) by g, by τ
-    e_bent, c_bent : (2, 2, N)
+    parts : tuple of Part
+    first : (parts,) where the constants of each part's laws of memory begin in θ
+    points : int
+        Quadrature points of an element.
+    constants : int
+        Length of θ.
     """
 
-    e: Array
-    c: Array
-    e_by: Array
-    c_by: Array
-    e_bent: Array
-    c_bent: Array
+    parts: tuple[Part, ...]
+    first: Sequence[int]
+    points: int
+    constants: int
 
-    @classmethod
-    def over(cls, share: float, tau_s: float, spacing_s: Array) -> Fading:
-        """Over intervals (N,) [s] in which S changes evenly."""
-        ratio = spacing_s / tau_s
-        e, lost = np.exp(-ratio), -np.expm1(-ratio) / ratio
-        none, by_tau = np.zeros_like(e), (lost - e) / tau_s
-        e_bent, c_bent = e * ratio * (ratio - 2) / tau_s**2, -share * e * ratio / tau_s**2
-        return cls(
-            e,
-            share * lost,
-            np.stack([none, e * ratio / tau_s]),
-            np.stack([lost, share * by_tau]),
-            np.array([[none, none], [none, e_bent]]),
-            np.array([[none, by_tau], [by_tau, c_bent]]),
-        )
+    @cached_property
+    def starts(self) -> list[int]:
+        """Where in the row each part begins, and where the last ends."""
+        sizes = [6 * self.points * len(p.cells) if p.prony else 0 for p in self.parts]
+        return [0, *np.cumsum(sizes).tolist()]
 
-    @classmethod
-    def after(cls, share: float, tau_s: float, held_s: float) -> Fading:
-        """Of stress that came at once and was held for a time: Q = c S."""
-        # Of what was held forever nothing is left, and e · ratio is no number.
-        ratio = np.array([min(held_s / tau_s, 1e3)])
-        e = np.exp(-ratio)
-        none, by_tau, bent = 0 * e, e * ratio / tau_s, e * ratio * (ratio - 2) / tau_s**2
-        return cls(
-            e,
-            share * e,
-            np.stack([none, by_tau]),
-            np.stack([e, share * by_tau]),
-            np.array([[none, none], [none, bent]]),
-            np.array([[none, by_tau], [by_tau, share * bent]]),
-        )
+    @property
+    def width(self) -> int:
+        """Length of the row."""
+        return self.starts[-1]
+
+    def of_part(self, number: int) -> NDArray[np.int64]:
+        """(E, q, 6) where in the row the points of a part are."""
+        cells = len(self.parts[number].cells)
+        own = np.arange(cells * self.points).reshape(cells, self.points, 1)
+        return self.starts[number] + own + cells * self.points * np.arange(6)
+
+    @cached_property
+    def branches(self) -> list[Branch]:
+        """Those of all parts."""
+        found: list[Branch] = []
+        own = 0
+        for number, part in enumerate(self.parts):
+            points = slice(self.starts[number], self.starts[number + 1])
+            for k in range(len(part.prony)):
+                here = slice(own, own + points.stop - points.start)
+                place = self.first[number] + 2 * k
+                found.append(Branch(number, points, here, place, place + 1))
+                own = here.stop
+        return found
+
+    def nothing(self, states: int) -> Carried:
+        """What points that have relaxed bring into some states."""
+        count = self.constants
+        sizes = (self.width,), (len(self.parts),), (count,), (count, count)
+        return Carried(*(np.zeros((states, *size)) for size in sizes))
+
+
+def fading(share: float, tau_s: float, spacing_s: float) -> tuple[float, float]:
+    """E and c of a branch over an interval [s] in which S changes evenly."""
+    ratio = spacing_s / tau_s
+    return float(np.exp(-ratio)), share * float(-np.expm1(-ratio) / ratio)

@@ -14,8 +14,8 @@ from ..errors import InputError
 from .constants import DENSITY, GAMMA_M, Constant
 from .damping import Damping, as_damping
 from .materials import Energy, Material, as_material
-from .memory import Prony, as_branches
 from .mesh import TetMesh
+from .prony import Prony, as_branches
 from .selection import Selection
 
 

@@ -13,22 +13,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from ..arrays import Array, Index
 from .batched import COMPILING, Batch, Evaluator
+from .discretisation import Discretisation
 from .elements import Element
 from .expressions import Law, carried_energy, first_piola, second_piola, six_of
 from .kernel import PointKernel
-from .memory import point_places, width
 from .pattern import dofs_of
 from .point import Pieces, Point
-
-if TYPE_CHECKING:
-    from .body import Body
 
 
 def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
@@ -133,9 +129,9 @@ class Stresses:
     Kernels are compiled when they are first needed.
     """
 
-    def __init__(self, body: Body) -> None:
+    def __init__(self, body: Discretisation) -> None:
         self.body = body
-        self.width = width(body)
+        self.width = body.memory.width
         self._evaluators: dict[tuple[str, int], Evaluator] = {}
 
     def stress(self, x: Array, theta: Array) -> Array:
@@ -147,7 +143,7 @@ class Stresses:
         body, found = self.body, np.zeros((len(x), theta_q.shape[1], self.width))
         for number, part in enumerate(body.parts):
             if part.prony:
-                count, places = len(part.material.constants), point_places(body, number)
+                count, places = len(part.material.constants), body.memory.of_part(number)
                 out = np.zeros((len(x), count * places.size))
                 self._run("stress_by_theta", number, [x], theta, out, add=False)
                 first = body.starts[number]
@@ -179,7 +175,7 @@ class Stresses:
         points, dofs = [], []
         for number, part in enumerate(self.body.parts):
             if part.prony:
-                own = point_places(self.body, number)
+                own = self.body.memory.of_part(number)
                 of_cells = dofs_of(self.body.cells[part.cells])
                 shape = (*own.shape, of_cells.shape[1])
                 points.append(np.broadcast_to(own[..., None], shape).ravel())
@@ -247,7 +243,7 @@ class Stresses:
     def _batch(self, name: str, number: int) -> Batch:
         """Every point as an element of its own."""
         body = self.body
-        part, places = body.parts[number], point_places(body, number)
+        part, places = body.parts[number], body.memory.of_part(number)
         kernel = KERNELS[name](body.element, Law(part.material, part.damping))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)

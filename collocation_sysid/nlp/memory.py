@@ -20,14 +20,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from ..arrays import Array
 from ..fem.body import Body, Curvature
-from ..fem.memory import Branch, Carried, Fading, branches_of
+from ..fem.memory import Branch, Carried, fading
+from .generated import Generated
 
 # Stress slopes of so many evaluations are kept at a time.
 CHUNK = 16
+
+
+def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
+    """c, d and a of an evaluation, of (g, τ).
+
+    Data are the time from the one before, or since the load of the start came, and whether it is
+    the start, and the time to the next.
+    """
+    share, tau_s = u[0], u[1]
+    since_s, began, on_s = data[0], data[1], data[2]
+
+    def even(spacing_s: ca.SX) -> ca.SX:
+        return -share * ca.expm1(-spacing_s / tau_s) * tau_s / spacing_s
+
+    c = began * share * ca.exp(-since_s / tau_s) + (1 - began) * even(since_s + began)
+    e = ca.exp(-on_s / tau_s)
+    return ca.vertcat(c, e, e * c - even(on_s))
+
+
+COEFFICIENTS = Generated(_coefficients, 2, 3)
+# Of what was held for so many relaxation times nothing is left.
+LONG = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,48 +61,39 @@ class Recursion:
     Attributes
     ----------
     branch : Branch
+    u, data : (2, N) and (3, N) of `COEFFICIENTS`
     c, d, a : (N,)
-    c_by, d_by, a_by : (2, N)
-    c_bent, d_bent, a_bent : (2, 2, N)
+    by : (3, 2, N) their slopes
     """
 
     branch: Branch
+    u: Array
+    data: Array
     c: Array
     d: Array
     a: Array
-    c_by: Array
-    d_by: Array
-    a_by: Array
-    c_bent: Array
-    d_bent: Array
-    a_bent: Array
+    by: Array
 
     @classmethod
     def of(cls, branch: Branch, theta: Array, until_next_s: Array, loaded_s: float) -> Recursion:
         """Of a branch, from the times (N,) from each evaluation to the next."""
-        share, tau_s = float(theta[branch.share]), float(theta[branch.tau])
-        begun = Fading.after(share, tau_s, loaded_s)
-        on = Fading.over(share, tau_s, until_next_s)
-        c, c_by, c_bent = (
-            np.concatenate([first, later[..., :-1]], axis=-1)
-            for first, later in (
-                (begun.c, on.c),
-                (begun.c_by, on.c_by),
-                (begun.c_bent, on.c_bent),
-            )
-        )
-        a_by = on.e_by * c + on.e * c_by - on.c_by
-        mixed = on.e_by[:, None] * c_by
-        a_bent = on.e_bent * c + mixed + mixed.swapaxes(0, 1) + on.e * c_bent - on.c_bent
-        a = on.e * c - on.c
-        return cls(branch, c, on.e, a, c_by, on.e_by, a_by, c_bent, on.e_bent, a_bent)
+        count = len(until_next_s)
+        u = np.repeat(theta[[branch.share, branch.tau]][:, None], count, axis=1)
+        since_s = np.append(min(loaded_s, LONG * theta[branch.tau]), until_next_s[:-1])
+        data = np.stack([since_s, np.arange(count) == 0, until_next_s])
+        (c, d, a), by = COEFFICIENTS.slopes(u, data)
+        return cls(branch, u, data, c, d, a, by)
+
+    def bent(self, weights: Array) -> Array:
+        """Second derivatives (2, 2, N) of the sum of c, d and a with weights (3, N)."""
+        return COEFFICIENTS.curvature(self.u, self.data, weights)
 
 
 def recursions_of(
     body: Body, theta: Array, until_next_s: Array, loaded_s: float
 ) -> list[Recursion]:
     """Those of all branches of a body."""
-    return [Recursion.of(b, theta, until_next_s, loaded_s) for b in branches_of(body)]
+    return [Recursion.of(b, theta, until_next_s, loaded_s) for b in body.memory.branches]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,14 +147,15 @@ class History:
 
     def carried(self, rows: slice) -> Carried:
         """What some of the evaluations bring from the past."""
-        found = Carried.nothing(self.body, len(self.xi[rows]))
+        found = self.body.memory.nothing(len(self.xi[rows]))
         for r, m in zip(self.recursions, self.brought, strict=True):
+            only_c = np.outer([1.0, 0.0, 0.0], np.ones_like(r.c))
+            bent = r.bent(only_c)
             found.overstress[:, r.branch.points] += m[rows]
             found.stiffening[:, r.branch.part] += r.c[rows]
-            found.slopes[:, r.branch.share] = r.c_by[0, rows]
-            found.slopes[:, r.branch.tau] = r.c_by[1, rows]
             own = slice(r.branch.share, r.branch.tau + 1)
-            found.bends[:, own, own] = np.moveaxis(r.c_bent[..., rows], 2, 0)
+            found.slopes[:, own] = r.by[0, :, rows].T
+            found.bends[:, own, own] = np.moveaxis(bent[..., rows], 2, 0)
         return found
 
     @property
@@ -176,7 +192,7 @@ class History:
         of_stress = self.stress_weights(mus)
         for r, m, mu in zip(self.recursions, self.brought, mus, strict=True):
             own = self.stress[:, r.branch.points]
-            along = r.d_by @ np.sum(mu * m, axis=1) + r.a_by @ np.sum(mu * own, axis=1)
+            along = r.by[1] @ np.sum(mu * m, axis=1) + r.by[2] @ np.sum(mu * own, axis=1)
             by_q += along @ theta_q[[r.branch.share, r.branch.tau]]
         for start in range(0, len(self.xi), CHUNK):
             rows = slice(start, start + CHUNK)
@@ -213,10 +229,10 @@ class History:
             own, points = slice(r.branch.share, r.branch.tau + 1), r.branch.points
             of_m = np.sum(mu * m, axis=1)
             of_stress = np.sum(mu * self.stress[:, points], axis=1)
-            curvature.theta[:, own] += (r.d_by * of_m + r.a_by * of_stress).T
-            bent = r.d_bent * of_m + r.a_bent * of_stress
-            curvature.theta_theta[:, own, own] += np.moveaxis(bent, 2, 0)
-            for place, a_by in zip((r.branch.share, r.branch.tau), r.a_by, strict=True):
+            weights = np.stack([0 * of_m, of_m, of_stress])
+            curvature.theta[:, own] += np.einsum("ct,cjt->tj", weights, r.by)
+            curvature.theta_theta[:, own, own] += np.moveaxis(r.bent(weights), 2, 0)
+            for place, a_by in zip((r.branch.share, r.branch.tau), r.by[2], strict=True):
                 weights = np.zeros_like(self.stress)
                 weights[:, points] = a_by[:, None] * mu
                 pulled = stresses.pulled(self.xi, weights, self.theta)
@@ -224,7 +240,7 @@ class History:
             for start in range(0, len(self.xi), CHUNK):
                 rows = slice(start, start + CHUNK)
                 slopes = stresses.stress_by(self.xi[rows], self.theta, units)[:, :, points]
-                by = np.einsum("tqp,tp,bt->tbq", slopes, mu[rows], r.a_by[:, rows])
+                by = np.einsum("tqp,tp,bt->tbq", slopes, mu[rows], r.by[2][:, rows])
                 curvature.theta_theta[rows, own, elastic] += by
                 curvature.theta_theta[rows, elastic, own] += by.swapaxes(1, 2)
 
@@ -255,14 +271,14 @@ class Remembered:
     @property
     def now(self) -> Carried:
         """What this very state bears beside S."""
-        found = Carried.nothing(self.body, 1)
+        found = self.body.memory.nothing(1)
         for branch, overstress in zip(self.branches, self.overstress, strict=True):
             found.overstress[0, branch.points] += overstress
         return found
 
     def ahead(self, interval_s: float) -> Carried:
         """What a state after an interval brings from this one."""
-        found = Carried.nothing(self.body, 1)
+        found = self.body.memory.nothing(1)
         for branch, overstress in zip(self.branches, self.overstress, strict=True):
             e, c = self._fading(branch, interval_s)
             brought = e * overstress - c * self.stress[branch.points]
@@ -280,19 +296,18 @@ class Remembered:
         return Remembered(self.body, self.theta, self.branches, stress, overstress)
 
     def _fading(self, branch: Branch, interval_s: float) -> tuple[float, float]:
-        share, tau_s = float(self.theta[branch.share]), float(self.theta[branch.tau])
-        over = Fading.over(share, tau_s, np.array([interval_s]))
-        return float(over.e[0]), float(over.c[0])
+        return fading(self.theta[branch.share], self.theta[branch.tau], interval_s)
 
 
 def start_carried(body: Body, theta: Array, loaded_s: float) -> Carried | None:
     """What the start shape bears beside S, where a load has not been there for long."""
     if not body.remembers or np.isinf(loaded_s):
         return None
-    found = Carried.nothing(body, 1)
-    for branch in branches_of(body):
-        begun = Fading.after(float(theta[branch.share]), float(theta[branch.tau]), loaded_s)
-        found.stiffening[:, branch.part] += begun.c
+    found = body.memory.nothing(1)
+    for branch in body.memory.branches:
+        found.stiffening[:, branch.part] += theta[branch.share] * np.exp(
+            -loaded_s / theta[branch.tau]
+        )
     return found
 
 
@@ -330,7 +345,7 @@ class Slopes:
         self._own = []
         for r in history.recursions:
             own = theta_q[[r.branch.share, r.branch.tau]].T
-            self._own.append((np.flatnonzero(own.any(axis=1)), own @ r.d_by, own @ r.a_by))
+            self._own.append((np.flatnonzero(own.any(axis=1)), own @ r.by[1], own @ r.by[2]))
 
     def force(self) -> Array:
         """What they add to dF at the next evaluation, (3n, columns)."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..fem.memory import Branch, branches_of
+from ..fem.memory import Branch
 from .addition import Addition
 from .collocation import Part
 from .memory import CHUNK, History
@@ -75,7 +75,7 @@ class Overstress(Addition):
     @cached_property
     def branches(self) -> list[Branch]:
         """Those of the body."""
-        return branches_of(self.segment.body)
+        return self.segment.body.memory.branches
 
     @property
     def width(self) -> int:
@@ -254,9 +254,9 @@ class Overstress(Addition):
             slopes = stresses.stress_by(history.xi[rows], history.theta, theta_q)
             for r, m in zip(history.recursions, history.brought, strict=True):
                 points, own = r.branch.points, theta_q[[r.branch.share, r.branch.tau]].T
-                change = np.einsum("qt,tp->qtp", own @ r.d_by[:, rows], m[rows])
+                change = np.einsum("qt,tp->qtp", own @ r.by[1][:, rows], m[rows])
                 stress = history.stress[rows, points]
-                change += np.einsum("qt,tp->qtp", own @ r.a_by[:, rows], stress)
+                change += np.einsum("qt,tp->qtp", own @ r.by[2][:, rows], stress)
                 change += np.einsum("t,tqp->qtp", r.a[rows], slopes[:, :, points])
                 found[:, rows, r.branch.own] = -change
         return found / self.unit_pa
@@ -306,7 +306,7 @@ class Overstress(Addition):
         by_q = np.zeros((segment.nq, *self.shape))
         recursions = setting.dynamics.recursions(setting.theta)
         for r, mu in zip(recursions, self.weights(multipliers), strict=True):
-            fading = theta_q[[r.branch.share, r.branch.tau]].T @ r.d_by[:, 1:]
+            fading = theta_q[[r.branch.share, r.branch.tau]].T @ r.by[1][:, 1:]
             by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", fading, mu[1:])
         place, own, _, _ = self._slopes
         scale = segment.length_m * self.unit_pa[own]

@@ -1,0 +1,265 @@
+"""Parts of a body in finite elements, and the kernels of their laws over all elements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike
+
+from ..arrays import Array, Index
+from ..errors import InputError
+from .batched import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
+from .elements import Element, element_named, reference_geometry
+from .expressions import KERNELS, Law, energy_kernel
+from .memory import Carried, PointLayout
+from .mesh import TetMesh
+from .model import Model, Theta
+from .node_force import NodeForce
+from .nodes import Nodes
+from .pattern import SymmetricPattern, element_destinations, in_ascending_order
+from .regions import Part
+from .selection import Selection
+
+
+class Discretisation(Model):
+    """A mesh of elements with quadrature points, and evaluators of what is summed over them.
+
+    Parameters
+    ----------
+    parts, forces : see `Model`
+    mesh, element, evaluator, threads : see `Body`
+    """
+
+    def __init__(
+        self,
+        parts: tuple[Part, ...],
+        forces: tuple[NodeForce, ...],
+        mesh: TetMesh,
+        element: str,
+        evaluator: str,
+        threads: int | None,
+    ) -> None:
+        super().__init__(parts, forces)
+        self.mesh = mesh
+        self.element: Element = element_named(element)
+        if self.remembers and self.element.mean_dilatation:
+            raise InputError(
+                f"element '{element}' averages the dilatation and cannot have a memory (prony); "
+                "expected tet10 or tet4"
+            )
+        self.nodes = Nodes.of_element(mesh, self.element)
+        self.nodes_m: Array = self.nodes.points_m
+        self.cells: Index = self.nodes.cells
+        self.threads = threads or available_threads()
+        self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
+        self._evaluators: dict[str, list[Evaluator]] = {}
+        self._choice = EvaluatorChoice(evaluator)
+        # Derivatives need no operations but those of the energy and the ones every evaluator has.
+        for part in self.parts:
+            law = Law(part.material, part.damping)
+            self._choice.check(energy_kernel(self.element, law).pieces)
+
+    def select(self, selection: Selection) -> Index:
+        """Return the nodes of a `selection.Selection`, sorted.
+
+        Boxes and balls act on all nodes. Indices and point arrays are of the mesh's nodes; a node
+        on an edge is selected when both of the edge's ends are.
+
+        Raises
+        ------
+        InputError
+            If there are none.
+        """
+        return selection.resolve(self.nodes)
+
+    @property
+    def evaluator(self) -> str:
+        """How element kernels are evaluated: "simd" or "casadi"."""
+        return self._choice.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Why it is not "simd", if the material is to blame."""
+        return self._choice.notes
+
+    def make_evaluator(self, batch: Batch) -> Evaluator:
+        """Build the evaluator of a batch of this body's material."""
+        return self._choice.make(batch)
+
+    @cached_property
+    def part_of_cells(self) -> Index:
+        """(E,) number of the part that each cell belongs to."""
+        numbers = np.zeros(len(self.cells), dtype=np.int64)
+        for k, part in enumerate(self.parts):
+            numbers[part.cells] = k
+        return numbers
+
+    @property
+    def remembers(self) -> bool:
+        """Whether any part has a memory."""
+        return any(part.prony for part in self.parts)
+
+    @cached_property
+    def memory(self) -> PointLayout:
+        """What the points of the parts with memory carry."""
+        first = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
+        return PointLayout(self.parts, first, self.geometry.shape[1], len(self.constants))
+
+    @cached_property
+    def unsymmetric(self) -> bool:
+        """Whether the slopes of the force have a skew part."""
+        laws = any(part.damping.stress is not None for part in self.parts)
+        return laws or any(force.turns for force in self.forces)
+
+    @cached_property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity of the stiffness matrix."""
+        return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
+
+    @cached_property
+    def linearisation_width(self) -> int:
+        """Length of one timestep's row of `linearise`."""
+        entries = (2 + self.unsymmetric) * self.pattern.entries
+        return (1 + len(self.constants)) * self.pattern.size + entries
+
+    @cached_property
+    def curvature_width(self) -> int:
+        """Length of one timestep's row of `curvature`."""
+        k = len(self.constants)
+        entries = (2 + self.unsymmetric) * self.pattern.entries
+        return 2 * k * self.pattern.size + entries + k * (k + 1)
+
+    def volume_ratios(self, positions: ArrayLike) -> Array:
+        """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
+        nodes, (count, points) = len(self.nodes_m), self.geometry.shape[:2]
+        x = self._states(positions)[0].reshape(-1, nodes, 3)
+        by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
+        slopes = (self._shape_slopes @ by_node).reshape(3, count * points, 3, len(x))
+        a, b, c = slopes.transpose(0, 2, 1, 3)
+        ratios = (
+            a[0] * (b[1] * c[2] - b[2] * c[1])
+            + a[1] * (b[2] * c[0] - b[0] * c[2])
+            + a[2] * (b[0] * c[1] - b[1] * c[0])
+        )
+        return ratios.reshape(count, points, -1).transpose(2, 0, 1)
+
+    @cached_property
+    def _shape_slopes(self) -> sp.csr_array:
+        """Slopes along each axis, at every quadrature point, of what has values at the nodes."""
+        count, points = self.geometry.shape[:2]
+        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
+        values = np.moveaxis(gradients, 3, 0)
+        columns = np.broadcast_to(self.cells[:, None], values.shape)
+        starts = np.arange(0, values.size + 1, self.element.nodes)
+        shape = (3 * count * points, len(self.nodes_m))
+        return sp.csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
+
+    # Assembly -------------------------------------------------------------------------------
+
+    def _states(self, *fields: ArrayLike) -> list[Array]:
+        """Every field as (T, 3n); native code relies on their shapes."""
+        nodes = len(self.nodes_m)
+        arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
+        for array in arrays:
+            if array.size % (3 * nodes) or array.size != arrays[0].size:
+                raise InputError(
+                    f"node fields of shapes {', '.join(str(a.shape) for a in arrays)}; "
+                    f"expected ({nodes}, 3) or (T, {nodes}, 3), with the same T in all"
+                )
+        return [array.reshape(-1, 3 * nodes) for array in arrays]
+
+    def _state(self, positions: ArrayLike) -> Array:
+        states = self._states(positions)[0]
+        if len(states) != 1:
+            raise InputError(
+                f"positions hold {len(states)} states; expected one, ({len(self.nodes_m)}, 3)"
+            )
+        return states
+
+    def _evaluate(
+        self,
+        name: str,
+        fields: Sequence[Array],
+        theta: Theta,
+        out: Array | None = None,
+        carried: Carried | None = None,
+    ) -> Array:
+        if len(theta) != len(self.constants):
+            raise InputError(
+                f"{len(theta)} constants given, expected {len(self.constants)}: "
+                f"{', '.join(self.constants)}"
+            )
+        with COMPILING:
+            if name not in self._evaluators:
+                batches = [self._batch(name, k) for k in range(len(self.parts))]
+                self._evaluators[name] = [self.make_evaluator(batch) for batch in batches]
+        width = self._width(name)
+        shape = (len(fields[0]), width)
+        if out is None:
+            out = np.empty(shape)
+        elif out.shape != shape or out.dtype != float or not out.flags.c_contiguous:
+            raise InputError(f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}")
+        shares = self.split(np.asarray(theta, dtype=float))
+        for k, evaluate in enumerate(self._evaluators[name]):
+            values = shares[k][: self.parts[k].of_points].copy()
+            if not self.parts[k].prony or name == "energy":
+                evaluate(fields, values, out, self.threads, add=k > 0)
+                continue
+            past = carried or self.memory.nothing(len(out))
+            for rows, values[-1] in past.runs(k):
+                here, own = [field[rows] for field in fields], past.overstress[rows]
+                evaluate(here, values, out[rows], self.threads, k > 0, own)
+        return out
+
+    def _width(self, name: str) -> int:
+        return {
+            "energy": 1,
+            "force": self.pattern.size,
+            "linearisation": self.linearisation_width,
+            "curvature": self.curvature_width,
+        }[name]
+
+    def _batch(self, name: str, number: int) -> Batch:
+        """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
+        part = self.parts[number]
+        memory = bool(part.prony) and name != "energy"
+        kernel = KERNELS[name](self.element, Law(part.material, part.damping, memory))
+        cells, geometry = self.cells[part.cells], self.geometry[part.cells]
+        if part.damping.stress is not None:
+            # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
+            # other triangle has another sign.
+            cells, geometry = in_ascending_order(cells, geometry)
+        vector, lower = element_destinations(self.pattern, cells)
+        total, count = len(self.constants), len(cells)
+        # γ_m and the density come after the constants of the points and need no elements.
+        columns = self.starts[number] + np.arange(part.of_points)
+        by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
+        square = (columns[:, None] + total * columns).ravel()
+        whole = np.zeros((count, 1), dtype=np.int64)
+        places = {
+            "energy": (whole, 1),
+            "force": (vector, self.pattern.size),
+            "by_position": (lower, self.pattern.entries),
+            "by_velocity": (lower, self.pattern.entries),
+            "by_theta": (by_theta, total * self.pattern.size),
+            "position_position": (lower, self.pattern.entries),
+            "position_velocity": (lower, self.pattern.entries),
+            "position_theta": (by_theta, total * self.pattern.size),
+            "velocity_theta": (by_theta, total * self.pattern.size),
+            "theta_theta": (np.broadcast_to(square, (count, len(square))), total**2),
+            "gradient_theta": (np.broadcast_to(columns, (count, len(columns))), total),
+            "by_position_skew": (lower, self.pattern.entries),
+            "position_velocity_skew": (lower, self.pattern.entries),
+        }
+        used = [places[output] for output in kernel.contractions]
+        starts = np.cumsum([0] + [length for _, length in used])
+        destinations = np.hstack(
+            [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
+        )
+        own = self.memory.of_part(number) if memory else None
+        if own is not None and name == "curvature":
+            own = np.concatenate([own, own + self.memory.width], axis=-1)
+        return Batch(kernel, cells, geometry, destinations, self._width(name), own)
