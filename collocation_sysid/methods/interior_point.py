@@ -12,8 +12,10 @@ from pydantic import BeforeValidator
 from ..arrays import Array
 from ..checked import Count, Finite, NotNegative, Positive, Text, Whole
 from ..nlp.collocation import Collocation
+from ..nlp.explicit import made_explicit
 from . import nlpsol
 from .callbacks import NlpFunctions
+from .condensed import condensed
 from .method import Watch
 from .options import Options
 from .recorder import Recorder
@@ -121,11 +123,11 @@ class InteriorPoint(Options):
             If IPOPT does not know an option.
         """
         recorder = Recorder(self.name, collocation, watch)
-
-        def hessian(program: Collocation) -> _DampedHessian:
-            return _DampedHessian(program, self)
-
-        found = nlpsol.solve(recorder, start, "ipopt", hessian, self._settings, IPOPT_STATUS)
+        with recorder.stopwatch.building():
+            program = condensed(made_explicit(collocation))
+            hessian = _DampedHessian(program, self)
+        settings = hessian, self._settings, IPOPT_STATUS
+        found = nlpsol.solve(recorder, program, start, "ipopt", *settings)
         if found.said == "Invalid_Option":
             recorder.notes.append(
                 f"linear_solver = '{self.linear_solver}' needs a library that is not installed; "

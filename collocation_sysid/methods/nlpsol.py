@@ -18,9 +18,10 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..nlp.collocation import Collocation
-from ..nlp.explicit import carried_over, made_explicit
+from ..nlp.explicit import carried_over
 from ..starting import LEFT
 from .callbacks import HessianValues, Monitor, NlpFunctions
+from .condensed import whole_multipliers
 from .recorder import Recorder
 from .solution import Status
 
@@ -60,23 +61,24 @@ class Outcome:
 
 def solve(
     recorder: Recorder,
+    program: Collocation,
     start: Array | None,
     plugin: str,
-    hessian: Callable[[Collocation], HessianValues],
+    hessian: HessianValues,
     settings: Settings,
     statuses: Mapping[str, Status],
 ) -> Outcome:
     """Solve the recorder's collocation; Ctrl-C ends it after the iteration, or after 2 s.
 
-    The solver gets the program with the memory of bodies as variables, see `explicit`.
-
     Parameters
     ----------
     recorder : Recorder
+    program : Collocation
+        The recorder's as the solver gets it, see `explicit` and `condensed`.
     start : (variables,) ndarray, optional
     plugin : str
     hessian : callable
-        Of that program, what writes second derivatives, see `NlpFunctions`.
+        Writes second derivatives of the program, see `NlpFunctions`.
     settings : callable
         The plugin's settings, given the functions.
     statuses : mapping
@@ -91,8 +93,7 @@ def solve(
     errors: list[BaseException] = []
     with watch.building():
         start = recorder.start(start)
-        program = made_explicit(collocation)
-        functions = NlpFunctions(program, hessian(program), errors)
+        functions = NlpFunctions(program, hessian, errors)
         monitor = Monitor(recorder, program, errors)
         given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
         solver = _nlpsol(plugin, functions, given)
@@ -111,8 +112,9 @@ def solve(
         z, multipliers = monitor.best or (began, np.zeros(program.constraints))
     # A solver that never began leaves its count as memory had it.
     iterations = 0 if status is Status.REFUSED else count or max(0, len(recorder.history) - 1)
-    answer = carried_over(z, program, collocation), multipliers[: collocation.constraints]
-    return Outcome(status, said, *answer, iterations, functions.calls)
+    of_rows = whole_multipliers(program, z, multipliers)[: collocation.constraints]
+    at = carried_over(z, program, collocation)
+    return Outcome(status, said, at, of_rows, iterations, functions.calls)
 
 
 def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
