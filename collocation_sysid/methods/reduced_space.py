@@ -21,25 +21,21 @@ even a rung cannot be simulated as a whole, the rows that can be are solved firs
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from ..arrays import Array
-from ..checked import Count, Positive
 from ..errors import InputError
 from ..fem.batched import at_once
 from ..nlp.collocation import Collocation
-from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
 from ..nlp.tangent import BlockSolver
 from .curvature import require_second_derivatives
-from .ladder import SHARES, Shares
 from .leg import trajectory
 from .method import Watch
-from .options import Options
 from .recorder import Recorder
-from .search import Search
+from .search import Search, SearchOptions
 from .solution import Solution, Status
 from .start import completed
 from .workers import Here, Workers
@@ -49,43 +45,10 @@ MISFIT = 3.0
 
 
 @dataclass(frozen=True)
-class ReducedSpace(Options):
-    """Gauss–Newton steps of the parameters, with the trajectories that the dynamics give them.
-
-    Attributes
-    ----------
-    tolerance : float
-        Largest last step of a parameter's logarithm.
-    max_iterations : int
-        Sweeps over all rungs of the ladder; a rejected trial counts.
-    trust : float
-        First trust region: longest step of a parameter's logarithm.
-    ladder : tuple of float
-        Shares of the recording solved one after another, ending with 1; a start needs none.
-    rung_decrease : float
-        All rungs but the last end when a step promises to lower the loss by less than this share.
-    rung_prior : float
-        On them a prior of this standard deviation of the logarithm holds each parameter near its
-        guess: a short horizon says nothing about some, and would let them run to their bounds.
-    hessian : {"gauss-newton", "exact"}
-        Once a step moves no parameter by more than 10 %, what Gauss–Newton leaves out is learned
-        from the steps, or computed exactly from the Lagrangian: a second sweep an iteration, for
-        large residuals. Before, both are Gauss–Newton.
-    factorisation : {"auto", "band", "sparse", "supernodal"}
-        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated
-        to cost least.
-    """
+class ReducedSpace(SearchOptions):
+    """Gauss–Newton steps of the parameters, with the trajectories that the dynamics give them."""
 
     name: ClassVar[str] = "reduced-space"
-
-    tolerance: Positive = 1e-8
-    max_iterations: Count = 200
-    trust: Positive = 1.0
-    ladder: Shares = SHARES
-    rung_decrease: Positive = 0.05
-    rung_prior: Positive = 2.3
-    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
-    factorisation: Choice = "auto"
 
     @one_blas_thread()
     def __call__(

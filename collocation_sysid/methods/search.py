@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ..arrays import Array
+from ..checked import Count, Positive
 from ..errors import SimulationError
+from ..nlp.factorisation import Choice
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
-from .ladder import FEWEST, part_of
+from .ladder import FEWEST, SHARES, Shares, part_of
 from .leg import Seen
+from .options import Options
 from .recorder import Recorder
 from .secant import updated, with_curvature
 from .solution import Iteration, Status
 
 if TYPE_CHECKING:
     from ..nlp.collocation import Collocation
-    from .reduced_space import ReducedSpace
     from .workers import Workers
 
 # A trial's infeasibility may be this share of its step's length, or this share of an edge of
@@ -43,12 +46,50 @@ LOCAL = 0.1
 REREADINGS = 40
 
 
+@dataclass(frozen=True)
+class SearchOptions(Options):
+    """How parameters are searched for.
+
+    Attributes
+    ----------
+    tolerance : float
+        Largest last step of a parameter's logarithm.
+    max_iterations : int
+        Sweeps over all rungs of the ladder; a rejected trial counts.
+    trust : float
+        First trust region: longest step of a parameter's logarithm.
+    ladder : tuple of float
+        Shares of the recording solved one after another, ending with 1; a start needs none.
+    rung_decrease : float
+        All rungs but the last end when a step promises to lower the loss by less than this share.
+    rung_prior : float
+        On them a prior of this standard deviation of the logarithm holds each parameter near its
+        guess: a short horizon says nothing about some, and would let them run to their bounds.
+    hessian : {"gauss-newton", "exact"}
+        Once a step moves no parameter by more than 10 %, what Gauss–Newton leaves out is learned
+        from the steps, or computed exactly from the Lagrangian: a second sweep an iteration, for
+        large residuals. Before, both are Gauss–Newton.
+    factorisation : {"auto", "band", "sparse", "supernodal"}
+        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated
+        to cost least.
+    """
+
+    tolerance: Positive = 1e-8
+    max_iterations: Count = 200
+    trust: Positive = 1.0
+    ladder: Shares = SHARES
+    rung_decrease: Positive = 0.05
+    rung_prior: Positive = 2.3
+    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
+    factorisation: Choice = "auto"
+
+
 class Search:
     """The state of a solve: the best point, the trust region, and the budget."""
 
     def __init__(
         self,
-        options: ReducedSpace,
+        options: SearchOptions,
         recorder: Recorder,
         start: Array | None,
         workers: Workers | None = None,
