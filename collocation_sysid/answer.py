@@ -17,10 +17,10 @@ from .methods.solution import Solution
 from .nlp.parameters import Parameters
 from .problem import Problem
 from .rollout import Rollout
-from .statistics.cause import Cause
 from .statistics.concern import Concern
 from .statistics.diagnostics import MarkerDiagnosis
 from .statistics.estimates import Estimate
+from .statistics.hypothesis import Hypothesis
 from .statistics.identifiability import verdicts
 from .statistics.linearised import Derived
 from .statistics.numerical import Refinement
@@ -45,7 +45,7 @@ class Answer:
     profiles : tuple of Profile, those asked for
     notes : tuple of str
         What went wrong after the solve.
-    causes : tuple of Cause
+    causes : tuple of Hypothesis
         What is likely described wrongly, likeliest first.
     refinement : Refinement or None
         What the discretisation does: solved again where that was asked for, else what the step
@@ -61,7 +61,7 @@ class Answer:
     diagnoses: tuple[MarkerDiagnosis, ...] = ()
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[Hypothesis, ...] = ()
     refinement: Refinement | None = None
     missing: str = ""
 

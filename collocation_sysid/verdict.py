@@ -10,7 +10,6 @@ from .check.motion import Motion, motion_of
 from .errors import SimulationError
 from .experiment.nuisance import TIME
 from .experiment.turning import TOO_FAST, fastest_turn
-from .fem.plausible import odd_material, oddities
 from .methods.solution import Solution, Status, pooled_wrench_rms
 from .nlp.schemes import as_scheme
 from .nlp.stability import instabilities
@@ -18,6 +17,7 @@ from .problem import Problem
 from .rollout import Rollout
 from .statistics.concern import Concern
 from .statistics.diagnostics import MarkerDiagnosis
+from .statistics.plausible import odd_material, oddities
 from .statistics.scale import scale_concern
 from .statistics.trust import (
     clock_concerns,

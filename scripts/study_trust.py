@@ -28,7 +28,6 @@ from collocation_sysid import Run, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.experiment import Experiment, Grasp, Markers
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.plausible import oddities
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
 from collocation_sysid.methods.scan import usual_constants
 from collocation_sysid.nlp.parameters import Unknown
@@ -36,6 +35,7 @@ from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.recording import refuse_other_scale
 from collocation_sysid.statistics.causes import likely_causes
+from collocation_sysid.statistics.plausible import oddities
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
 SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3

@@ -16,7 +16,7 @@ from collocation_sysid.experiment import displaced_axes, read_displacement, read
 from collocation_sysid.experiment.force_files import read_pressure
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.description import doubts
+from collocation_sysid.statistics.modal import doubts
 
 TIMES = [0.0, 0.1, 0.2]
 PRESSED_MM = [0.0, 0.25, 0.5]

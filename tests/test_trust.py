@@ -18,8 +18,8 @@ from collocation_sysid.methods.solution import Status
 from collocation_sysid.output.record import result
 from collocation_sysid.output.remedies import REMEDIES
 from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.cause import Cause
 from collocation_sysid.statistics.concern import SENTENCES, Concern
+from collocation_sysid.statistics.hypothesis import Hypothesis
 from collocation_sysid.statistics.trust import (
     Trust,
     fit_concerns,
@@ -233,9 +233,9 @@ def test_the_verdict_is_shown_stored_and_fed():
     assert "mm from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
     assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
-    caused = replace(found, causes=(Cause("clock", "the clock is late", 9.0),))
+    caused = replace(found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),))
     assert caused.trust.verdict == "doubtful"
-    assert caused.trust.reasons == ("likely: the clock is late",)
+    assert caused.trust.reasons[0].startswith("likely: the wrench: it seems zeroed with the body")
 
 
 def test_an_answer_that_did_not_converge_is_doubtful():

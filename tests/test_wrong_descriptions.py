@@ -17,13 +17,13 @@ from collocation_sysid.check.hold import hold_warnings, holds_of
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Grasp
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.plausible import odd_material, oddities
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.problem import Problem
 from collocation_sysid.run import run, solve
 from collocation_sysid.statistics.causes import likely_causes
+from collocation_sysid.statistics.plausible import odd_material, oddities
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from twins import BODIES, SOFT, STIFF, twin

@@ -25,8 +25,8 @@ from ..nlp.schemes import as_scheme
 from ..nlp.stability import instabilities
 from ..nlp.wrench_rows import WrenchRows
 from ..problem import Problem
-from ..statistics.cause import Cause
 from ..statistics.concern import Concern, as_said
+from ..statistics.hypothesis import Hypothesis
 from ..statistics.numerical import MOST_SUBSTEPS
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
@@ -104,7 +104,7 @@ class Findings:
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
     holds : tuple of Hold, one for each grasp
-    causes : tuple of Cause
+    causes : tuple of Hypothesis
         What is likely described wrongly; their sentences are the first warnings.
     notes : tuple of str
     concerns : tuple of Concern
@@ -132,7 +132,7 @@ class Findings:
     jacobian_error: float
     hessian_error: float
     holds: tuple[Hold, ...]
-    causes: tuple[Cause, ...]
+    causes: tuple[Hypothesis, ...]
     notes: tuple[str, ...]
     concerns: tuple[Concern, ...]
 
@@ -148,7 +148,8 @@ class Findings:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON and tables."""
-        return asdict(self) | {"warnings": self.warnings}
+        causes = [cause.as_dict() for cause in self.causes]
+        return asdict(replace(self, causes=())) | {"causes": causes, "warnings": self.warnings}
 
 
 def glance(problem: Problem) -> Glance:

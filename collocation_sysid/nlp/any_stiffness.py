@@ -39,6 +39,10 @@ class Described:
     gravity_m_s2 : (3,)
     mesh_scale : float
         By which the mesh and the markers' places on it are too small.
+    lag_s : float
+        By which the markers' clock is late.
+    name : str
+        The experiment's, quoted.
     """
 
     t_s: Array
@@ -47,6 +51,8 @@ class Described:
     tracks_m: Array
     gravity_m_s2: Array
     mesh_scale: float = 1.0
+    lag_s: float = 0.0
+    name: str = ""
 
     @classmethod
     def of(cls, experiment: Experiment) -> Described | None:
@@ -57,7 +63,8 @@ class Described:
         t_s = experiment.t_s[:MOST_SAMPLES]
         rotations, translations = grasp.poses.at(t_s)
         tracks = experiment.markers.positions_m[:MOST_SAMPLES]
-        return cls(t_s, rotations, translations, tracks, experiment.gravity_m_s2)
+        name, gravity_m_s2 = f"'{experiment.name}'", experiment.gravity_m_s2
+        return cls(t_s, rotations, translations, tracks, gravity_m_s2, name=name)
 
     def carry(self, points_m: Array) -> Array:
         """Points (..., T, M, 3) in the grasp's frame where it carries them."""
@@ -152,7 +159,8 @@ class Sway:
         limit = scale * self.size_m
         # Small strains are assumed: what sways farther than the body is long, stays there.
         far = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
-        return described.carry(scale * self.places_m + swayed / np.maximum(far, 1.0))
+        seen = described.carry(scale * self.places_m + swayed / np.maximum(far, 1.0))
+        return later(seen, described.t_s, described.lag_s) if described.lag_s else seen
 
     def _omega(self, scale: float) -> Array:
         """(S, K) angular frequencies."""
@@ -168,6 +176,16 @@ class Sway:
         pushed = np.einsum("tij,tj->ti", inverse, lift)
         spun = inverse @ _acceleration(described.rotations, step_s) * described.mesh_scale
         return pushed @ self.pushed.T - np.einsum("tij,kij->tk", spun, self.turned)
+
+
+def later(seen: Array, t_s: Array, lag_s: float) -> Array:
+    """Predictions (S, T, M, 3) seen `lag_s` later, NaN where they end."""
+    at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
+    low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
+    share = (at - low)[:, None, None]
+    found = (1 - share) * seen[:, low] + share * seen[:, low + 1]
+    found[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
+    return found
 
 
 def _acceleration(x: Array, step_s: float) -> Array:

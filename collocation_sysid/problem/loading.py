@@ -13,10 +13,10 @@ from ..fem.body import Body
 from ..fem.constants import constant_named
 from ..fem.materials import Material
 from ..fem.mesh import TetMesh
-from ..fem.plausible import oddities
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..nlp.parameters import Parameters, Tied, Unknown
+from ..statistics.plausible import oddities
 from .code import load_force, load_material, load_row
 from .densities import completed, guessed
 from .nuisance_schema import OwnRow

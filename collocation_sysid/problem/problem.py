@@ -11,7 +11,6 @@ from ..checked import Positive
 from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
-from ..fem.plausible import oddities
 from ..methods import METHODS
 from ..methods.described import require_method
 from ..methods.method import Method
@@ -21,6 +20,7 @@ from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
 from ..nlp.sharing import locals_of
 from ..nlp.simulation import require_steps
+from ..statistics.plausible import oddities
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
 from ..statistics.uncertainty import ErrorsOption, NoiseOption

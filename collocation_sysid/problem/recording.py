@@ -44,7 +44,7 @@ from ..fem.selection import Ball, Box, Indices, Named, Selection
 from ..files import require_regular
 from ..methods.scan import usual_constants
 from ..nlp.parameters import Parameters
-from ..statistics.description import doubts
+from ..statistics.modal import doubts
 from .nuisance_schema import OwnRow, nuisance_of
 from .recording_schema import (
     ExperimentSection,

@@ -1,6 +1,6 @@
 """Why a fit misses its markers: what is tried, refitted, and fits far better is the likely cause.
 
-Doubts about the description (`statistics.description`) come for little. The others are changes of
+Doubts about the description (`modal`) come for little. The others are changes of
 one experiment, the one that fits worst: it is fitted again without each mistake, and the factor by
 which its misfit falls is the cause's strength. Of gravity's directions the body's modes choose the
 one that is tried.
@@ -8,8 +8,8 @@ one that is tried.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,12 +18,13 @@ from ..errors import InputError, SimulationError
 from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp
 from ..experiment.poses import PoseSequence
+from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..nlp.any_stiffness import Described
-from .cause import Cause, ranked
-from .description import Comparison, doubts
+from .hypothesis import Hypothesis, Trial, clock, ranked
 from .mistakes import gravity_mistakes
+from .modal import Comparison, doubts
 from .work import against_the_load
 from .wrench_causes import wrench_causes
 
@@ -45,14 +46,7 @@ SAME_LAG_S = 5e-4
 SHORTEST = 4
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    cause: str
-    said: str
-    experiment: Experiment
-
-
-def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Cause, ...]:
+def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
     """What is likely described wrongly, likeliest first; empty where the residuals are noise.
 
     Parameters
@@ -64,63 +58,51 @@ def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Cause,
 
     Returns
     -------
-    tuple of Cause
+    tuple of Hypothesis
         Their `strength` is the factor by which the misfit falls without the mistake.
     """
     fitted = [segment.experiment for segment in solution.collocation.segments]
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
-    causes, worst = [], fitted[int(np.argmax(misfits))]
-    causes += wrench_causes(solution)
-    causes += [cause for each in fitted for cause in against_the_load(each)]
-    if max(misfits) <= NOISE:
-        return ranked(causes)
-    causes += doubts(worst, solution.parameters, solution.collocation.huber)
-    if max((each.strength for each in causes), default=0.0) < CERTAIN:
-        causes += _refitted(solution, worst, budget)
-    return ranked(causes)
+    found = [*wrench_causes(solution), *(cause for e in fitted for cause in against_the_load(e))]
+    if max(misfits) > NOISE:
+        worst = fitted[int(np.argmax(misfits))]
+        found += doubts(worst, solution.parameters, solution.collocation.huber)
+        if max((each.strength for each in found), default=0.0) < CERTAIN:
+            found += _refitted(solution, worst, budget)
+    return ranked(found)
 
 
-def _refitted(solution: Solution, experiment: Experiment, budget: int | None) -> list[Cause]:
-    """Causes without which the experiment fits far better."""
-    given, constants = _first_samples(experiment), solution.parameters
+def _refitted(solution: Solution, experiment: Experiment, budget: int | None) -> list[Hypothesis]:
+    """What the experiment fits far better without."""
+    given = first_samples(experiment, MOST_SAMPLES)
     alone = _Alone(solution, given, budget)
-    base = solution.readings_m[0] if alone.is_whole else alone.fit(given)
-    if base is None:
+    read = alone.fit(given)
+    if read is None:
         return []
-    misfit = _misfit(given, base)
-    found = [] if given.static else [_best_lag(alone, given, base)]
-    for trial in (*_slip(given, base), *_trials(given, constants)):
-        if (read := alone.fit(trial.experiment)) is not None:
-            found.append((trial, _misfit(trial.experiment, read)))
-    causes = []
-    for trial, left in found:
-        strength = misfit / max(1.0, left)
-        if strength > BETTER or left < NOISE < misfit:
-            sentence = f"'{experiment.name}': {trial.said} ({strength:.2g} times nearer)"
-            causes.append(Cause(trial.cause, sentence, strength))
-    return causes
+    trial = Trial(_misfit(given, read), alone.left, BETTER, least=1.0, noise=NOISE)
+    of = f"'{experiment.name}'"
+    lags = [] if given.static else _best_lag(alone, given, read, of)
+    comparison = Comparison.of(given, solution.parameters)
+    turned = [] if comparison is None else _other_gravity(given, comparison)
+    return [*trial.of([*lags, *_slip(given, read, of), *turned, *_other_layers(given, of)])]
 
 
-def _trials(given: Experiment, constants: Mapping[str, float]) -> Iterator[_Trial]:
-    comparison = Comparison.of(given, constants)
-    if comparison is not None:
-        others = gravity_mistakes(comparison.given)
-        nearest = min(others, key=lambda m: comparison.misfit_m(m.without), default=None)
-        if nearest is not None:
-            turned = replace(given, gravity_m_s2=nearest.without.gravity_m_s2)
-            yield _Trial(nearest.cause, nearest.said, turned)
-    for deeper, said in ((True, "deeper"), (False, "less deep")):
-        layered = _one_layer(given, deeper)
-        if layered is not None:
-            yield _Trial(
-                "grasp-layer",
-                f"the fit is better if the grasp holds one layer of nodes {said}: check the box of "
-                "grasp.nodes against where the fingers end",
-                layered,
-            )
+def _other_gravity(given: Experiment, comparison: Comparison) -> Iterator[Hypothesis]:
+    """Of gravity's directions the one that suits the body's modes best."""
+    others = gravity_mistakes(comparison.given)
+    nearest = min(others, key=lambda each: comparison.misfit_m(each.without), default=None)
+    if nearest is not None:
+        gravity_m_s2 = nearest.without.gravity_m_s2
+        yield replace(nearest, without=replace(given, gravity_m_s2=gravity_m_s2))
 
 
-def _slip(given: Experiment, read: Array) -> Iterator[_Trial]:
+def _other_layers(given: Experiment, of: str) -> Iterator[Hypothesis]:
+    for deeper, deep in ((True, "deeper"), (False, "less deep")):
+        if (layered := _one_layer(given, deeper)) is not None:
+            yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
+
+
+def _slip(given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
     """The experiment without the marker whose residuals step most, if one does."""
     residual = _residual(given, read)
     described = Described.of(given)
@@ -132,13 +114,9 @@ def _slip(given: Experiment, read: Array) -> Iterator[_Trial]:
         return
     tracks = np.array(given.markers.positions_m)
     tracks[:, m] = np.nan
-    name, at_s = given.markers.names[m], given.t_s[clearest[m][1]]
-    yield _Trial(
-        "marker-slip",
-        f"marker {name} slips at about t = {at_s:.4g} s: give it markers.weights = 0, or end "
-        "window_s before",
-        replace(given, markers=replace(given.markers, positions_m=tracks)),
-    )
+    data = {"marker": given.markers.names[m], "t_s": given.t_s[clearest[m][1]]}
+    without = replace(given, markers=replace(given.markers, positions_m=tracks))
+    yield Hypothesis("marker-slip", of, data, without)
 
 
 def _step(residual: Array) -> tuple[float, int]:
@@ -165,13 +143,25 @@ class _Alone:
         self.collocation = solution.collocation
         fitted = [segment.experiment for segment in self.collocation.segments]
         rows = sum(len(experiment.t_s) for experiment in fitted)
-        self.is_whole = len(fitted) == 1 and len(given.t_s) == rows
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(given.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
+        self.known: dict[Experiment, Array | None] = {}
+        if len(fitted) == 1 and len(given.t_s) == rows:
+            self.known[given] = solution.readings_m[0]
 
     def fit(self, experiment: Experiment) -> Array | None:
         """Fitted markers (T, M, 3); None where there is no fit."""
+        if experiment not in self.known:
+            self.known[experiment] = self._fit(experiment)
+        return self.known[experiment]
+
+    def left(self, experiment: Experiment) -> float | None:
+        """Misfit of the fit; None where there is none."""
+        read = self.fit(experiment)
+        return None if read is None else _misfit(experiment, read)
+
+    def _fit(self, experiment: Experiment) -> Array | None:
         if self.sweeps <= 0:
             return None
         method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
@@ -185,10 +175,10 @@ class _Alone:
         return found.readings_m[0] if ended else None
 
 
-def _best_lag(alone: _Alone, given: Experiment, read: Array) -> tuple[_Trial, float]:
-    """The lag by which residuals and velocities agree, refitted a few times, and what it leaves."""
-    misfit, lag_s = _misfit(given, read), 0.0
-    best, least, shifted = 0.0, misfit, given
+def _best_lag(alone: _Alone, given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
+    """The lag by which residuals and velocities agree, refitted a few times."""
+    least, lag_s, shifted = _misfit(given, read), 0.0, given
+    best = None
     for _ in range(CLOCK_REFITS):
         more_s = _lag_s(shifted, read)
         lag_s += more_s
@@ -200,14 +190,9 @@ def _best_lag(alone: _Alone, given: Experiment, read: Array) -> tuple[_Trial, fl
             break
         shifted, read = later, fitted
         if (now := _misfit(shifted, read)) < least:
-            best, least = lag_s, now
-    late = "late" if best > 0 else "early"
-    said = (
-        f"the markers' clock is {late} by about {1e3 * abs(best):.2g} ms against the poses': "
-        f"{'add' if best > 0 else 'subtract'} that to t_s of the poses, or estimate it with "
-        "nuisance.time_shift"
-    )
-    return _Trial("clock", said, shifted), least
+            best, least = clock(of, lag_s, shifted), now
+    if best is not None:
+        yield best
 
 
 def with_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
@@ -272,12 +257,6 @@ def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
         return replace(experiment, grasps=grasps)
     except InputError:
         return None
-
-
-def _first_samples(experiment: Experiment) -> Experiment:
-    markers, here = experiment.markers, slice(MOST_SAMPLES)
-    few = replace(markers, t_s=markers.t_s[here], positions_m=markers.positions_m[here])
-    return replace(experiment, t_s=experiment.t_s[here], markers=few) if few.samples else experiment
 
 
 def _residual(experiment: Experiment, read: Array) -> Array:

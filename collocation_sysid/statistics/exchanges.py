@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..nlp.any_stiffness import carrying
-from .cause import Cause
+from .hypothesis import Hypothesis
 
 # Another order of the names suits so many times better before it is believed.
 CLEARLY = 2.5
@@ -21,7 +21,7 @@ CLEARLY = 2.5
 TAMED = 0.2
 
 
-def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Cause, ...]:
+def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypothesis, ...]:
     """Markers whose names are exchanged for a part of the recording.
 
     Parameters
@@ -47,11 +47,8 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Cause
     real = np.argsort(right)[order[first]]
     listed = ", ".join(f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first]))
     also = ", and at other times" if at[-1] >= end else ""
-    sentence = (
-        f"'{experiment.name}': markers have each other's names {when}{also}: {listed}; exchange "
-        "them back there, or leave these samples out"
-    )
-    return (Cause("markers-exchanged", sentence, strength),)
+    data = {"when": f"{when}{also}", "names": listed}
+    return (Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data, strength=strength),)
 
 
 def _orders(experiment: Experiment) -> tuple[Index, float]:

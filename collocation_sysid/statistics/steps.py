@@ -6,12 +6,14 @@ starts or stops suddenly shows one of them only.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..nlp.any_stiffness import carrying
-from .cause import Cause
+from .hypothesis import Hypothesis
 
 # A step is so many times what else happens between samples.
 SUDDEN = 4.0
@@ -20,18 +22,13 @@ LIVELY = 0.9
 FEWEST = 8
 
 
-def steps(experiment: Experiment) -> tuple[Cause, ...]:
-    """Poses that jump and markers that slip, the clearest first."""
-    tracks = experiment.markers.positions_m
-    if len(tracks) < FEWEST:
-        return ()
-    grasp = carrying(experiment)
-    found = []
-    poses = None
-    if grasp is not None:
-        poses = grasp.poses.carry(_corners(experiment), experiment.t_s)
-        found += _jump(experiment, poses)
-    return tuple(sorted([*found, *_slips(experiment, poses)], key=lambda c: -c.strength))
+def steps(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Poses that jump and markers that slip."""
+    if len(experiment.markers.positions_m) < FEWEST:
+        return
+    if (grasp := carrying(experiment)) is not None:
+        yield from _jump(experiment, grasp.poses.carry(_corners(experiment), experiment.t_s))
+    yield from _slips(experiment)
 
 
 def _corners(experiment: Experiment) -> Array:
@@ -47,51 +44,38 @@ def step_sizes(x: Array) -> Array:
     return np.sqrt(np.maximum(opposite, 0.0))
 
 
-def _jump(experiment: Experiment, carried: Array) -> list[Cause]:
-    poses = step_sizes(carried).max(axis=1)
-    k = int(poses.argmax())
-    markers = step_sizes(experiment.markers.positions_m)
-    here = markers[k][np.isfinite(markers[k])]
-    if not len(here):
-        return []
-    sigma_m = float(np.median(experiment.markers.sigma_m))
+def _jump(experiment: Experiment, carried: Array) -> Iterator[Hypothesis]:
+    sizes = step_sizes(carried).max(axis=1)
+    k = int(sizes.argmax())
+    markers = step_sizes(experiment.markers.positions_m)[k]
     moved = np.linalg.norm(np.diff(carried, 2, axis=0), axis=2).max(axis=1)
-    else_m = max(_lively(moved), float(np.median(here)), 2 * sigma_m)
-    strength = float(poses[k]) / else_m
-    if strength < SUDDEN:
-        return []
-    sentence = (
-        f"'{experiment.name}': the poses jump by {1e3 * poses[k]:.2g} mm at "
-        f"t = {experiment.t_s[k + 2]:.4g} s and the markers do not: repair the poses there, or end "
-        "window_s before"
-    )
-    return [Cause("pose-jump", sentence, strength)]
+    sigma_m = float(np.median(experiment.markers.sigma_m))
+    if np.isfinite(markers).any():
+        usual_m = max(_lively(moved), float(np.nanmedian(markers)), 2 * sigma_m)
+        yield from _sudden("pose-jump", experiment, k, float(sizes[k]), usual_m)
 
 
-def _slips(experiment: Experiment, poses: Array | None) -> list[Cause]:
-    tracks, names = experiment.markers.positions_m, experiment.markers.names
-    sizes = step_sizes(tracks)
-    found = []
-    for m, name in enumerate(names):
+def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
+    markers = experiment.markers
+    sizes = step_sizes(markers.positions_m)
+    for m, name in enumerate(markers.names):
         if not np.isfinite(sizes[:, m]).any():
             continue
         k = int(np.nanargmax(sizes[:, m]))
-        others = np.delete(sizes[k], m)
-        others = others[np.isfinite(others)]
-        else_m = max(
-            _lively(sizes[:, m]),
-            float(others.max(initial=0.0)),
-            2 * float(experiment.markers.sigma_m[m]),
-        )
-        strength = float(sizes[k, m]) / else_m
-        if strength > SUDDEN and _lasts(tracks, m, k + 2, float(sizes[k, m])):
-            sentence = (
-                f"'{experiment.name}': marker {name} slips by {1e3 * sizes[k, m]:.2g} mm at "
-                f"t = {experiment.t_s[k + 2]:.4g} s, the others do not: give it markers.weights = "
-                "0, or end window_s before"
-            )
-            found.append(Cause("marker-slip", sentence, strength))
-    return found
+        others, size_m = np.delete(sizes[k], m), float(sizes[k, m])
+        most_m = float(others[np.isfinite(others)].max(initial=0.0))
+        usual_m = max(_lively(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
+        if _lasts(markers.positions_m, m, k + 2, size_m):
+            yield from _sudden("marker-slip/alone", experiment, k, size_m, usual_m, name)
+
+
+def _sudden(
+    code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
+) -> Iterator[Hypothesis]:
+    """A step between samples k + 1 and k + 2, if it is far larger than what is usual."""
+    data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
+    if size_m >= SUDDEN * usual_m:
+        yield Hypothesis(code, f"'{experiment.name}'", data, strength=size_m / usual_m)
 
 
 def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:

@@ -15,11 +15,11 @@ import numpy as np
 
 from ..arrays import Array
 from ..nlp.stability import Instability
-from .cause import Cause
 from .concern import Concern, as_said, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import normal_isf
 from .estimates import Estimate
+from .hypothesis import Hypothesis
 from .noise import NoiseLevel
 from .numerical import Refinement
 from .uncertainty import Uncertainty
@@ -97,7 +97,7 @@ class Trust:
         return Trust.of((*grave.concerns, *light.concerns))
 
 
-def cause_concerns(causes: Iterable[Cause]) -> list[Concern]:
+def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     """What is likely described wrongly."""
     found: list[Concern] = []
     for cause in causes:

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..experiment.experiment import Experiment
-from .cause import Cause
+from .hypothesis import Hypothesis
 
 # Of load and displacement; noise and hysteresis leave it above zero.
 AGAINST = -0.8
 FEWEST = 3
 
 
-def against_the_load(experiment: Experiment) -> Iterator[Cause]:
+def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
     """Displacements of a static experiment whose own load goes the other way.
 
     What moves may be pushed against its displacement, by its inertia.
@@ -24,19 +24,13 @@ def against_the_load(experiment: Experiment) -> Iterator[Cause]:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
         for axis in grasp.zero:
-            moved_m, load_n = (
-                shifts_m[:, "xyz".index(axis)],
-                grasp.wrench.values[:, "xyz".index(axis)],
-            )
+            along = "xyz".index(axis)
+            moved_m, load_n = shifts_m[:, along], grasp.wrench.values[:, along]
             there = np.isfinite(load_n)
             if there.sum() < FEWEST or not (np.ptp(moved_m[there]) and np.ptp(load_n[there])):
                 continue
             together = float(np.corrcoef(moved_m[there], load_n[there])[0, 1])
             if together < AGAINST:
-                yield Cause(
-                    "sign",
-                    f"'{experiment.name}': along {axis} grasp {k} and the force that it gives go "
-                    f"opposite ways (correlation {together:.2f}), as if the body gave work: one of "
-                    "both signs is wrong; set sign = -1 of its displacement or of its wrench",
-                    1 / (1 + together + 1e-3),
-                )
+                data = {"axis": axis, "grasp": k, "correlation": together}
+                strength = 1 / (1 + together + 1e-3)
+                yield Hypothesis("sign", f"'{experiment.name}'", data, strength=strength)

@@ -7,19 +7,19 @@ bent. Tares are allowed for by their priors.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
-from ..experiment.wrench import Wrench
+from ..experiment.wrench import Frame, Wrench
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..nlp.channel import Forced
 from ..nlp.collocation import Collocation, Part
 from ..nlp.wrench import WrenchReading, without_sensors
-from .cause import Cause
+from .hypothesis import Hypothesis, Trial
 
 # Residuals up to so many standard deviations need no cause; what is right leaves so much less.
 MISFIT, BETTER = 1.3, 1.5
@@ -27,18 +27,17 @@ MOST_SWEEPS = 40
 # Clocks may be off by this share of a recording.
 LATEST, SHIFTS = 0.25, 60
 # What forces, and torques, are written in by mistake.
-FORCE_UNITS = {"kilograms-force": 9.80665, "millinewtons": 1e-3, "pounds-force": 4.4482216}
-TORQUE_UNITS = {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}
+UNITS = (
+    (
+        "forces",
+        {"kilograms-force": 9.80665, "millinewtons": 1e-3, "pounds-force": 4.4482216},
+        slice(0, 3),
+    ),
+    ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, slice(3, 6)),
+)
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    cause: str
-    said: str
-    wrench: Wrench
-
-
-def wrench_causes(solution: Solution) -> list[Cause]:
+def wrench_causes(solution: Solution) -> list[Hypothesis]:
     """What is likely described wrongly of the wrenches; empty where they fit."""
     if not any(map(_missed, solution.collocation.parts(solution.z))):
         return []
@@ -79,22 +78,14 @@ def _from_markers(collocation: Collocation) -> list[Part]:
     return found
 
 
-def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> list[Cause]:
+def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hypothesis]:
+    def left(without: tuple[Wrench, float]) -> float:
+        return _misfit(part, sensor.told(without[0]), forced, without[1])
+
     tare = part.segment.experiment.nuisance.tare or 0.0
-    misfit = _misfit(part, sensor, forced, tare)
-    if misfit <= MISFIT:
-        return []
-    tried = [(trial, trial.wrench, tare) for trial in _trials(sensor.wrench)]
-    zeroed = "it seems zeroed with the body in hand: zero it before, or widen nuisance.tare"
-    tried.append((_Trial("wrench-tare", zeroed, sensor.wrench), sensor.wrench, np.inf))
-    found, name = [], part.segment.experiment.name
-    for trial, wrench, allowed in tried:
-        left = _misfit(part, sensor.told(wrench), forced, allowed)
-        strength = misfit / max(1.0, left)
-        if strength > BETTER:
-            sentence = f"the wrench of '{name}': {trial.said} ({strength:.2g} times nearer)"
-            found.append(Cause(trial.cause, sentence, strength))
-    return found
+    misfit, of = left((sensor.wrench, tare)), f"the wrench of '{part.segment.experiment.name}'"
+    if misfit > MISFIT:
+        yield from Trial(misfit, left, BETTER, least=1.0).of(_mistakes(of, sensor.wrench, tare))
 
 
 def _misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> float:
@@ -112,41 +103,30 @@ def _misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> f
     return float(np.sqrt(np.nanmean((apart - offsets) ** 2)))
 
 
-def _trials(wrench: Wrench) -> Iterator[_Trial]:
-    yield _Trial(
-        "wrench-sign",
-        "all of it fits with the other sign: it is what the body gives the grasp; change its sign",
-        replace(wrench, values=-wrench.values),
-    )
-    other = "grasp" if wrench.frame == "world" else "world"
-    yield _Trial(
-        "wrench-frame",
-        f'it is in the frame of the {other}: set frame = "{other}"',
-        replace(wrench, frame=other),
-    )
-    for units, columns in ((FORCE_UNITS, slice(0, 3)), (TORQUE_UNITS, slice(3, 6))):
+def _mistakes(of: str, wrench: Wrench, tare: float) -> Iterator[Hypothesis]:
+    """Each undone: the wrench, and how many sigmas its tare may have."""
+    opposite = replace(wrench, values=-wrench.values)
+    yield Hypothesis("wrench-sign", of, without=(opposite, tare))
+    other: Frame = "grasp" if wrench.frame == "world" else "world"
+    turned = replace(wrench, frame=other)
+    yield Hypothesis("wrench-frame", of, {"other": other}, (turned, tare))
+    for what, units, columns in UNITS:
         for unit, factor in units.items():
-            yield _Trial(
-                "wrench-unit",
-                f"its {'forces' if columns.start == 0 else 'torques'} seem to be in {unit}: "
-                f"multiply by {factor:g}",
-                _scaled(wrench, columns, factor),
-            )
+            data = {"what": what, "unit": unit, "factor": factor}
+            yield Hypothesis("wrench-unit", of, data, (_scaled(wrench, columns, factor), tare))
     span_s = LATEST * float(np.ptp(wrench.t_s))
     for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
-        when = "later" if shift_s < 0 else "earlier"
-        yield _Trial(
-            "wrench-clock",
-            f"it was measured about {1e3 * abs(shift_s):.2g} ms {when} than its times say: its "
-            "clock is not that of the poses",
-            replace(wrench, t_s=wrench.t_s + shift_s),
-        )
+        data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
+        shifted = replace(wrench, t_s=wrench.t_s + shift_s)
+        yield Hypothesis("wrench-clock", of, data, (shifted, tare))
+    yield Hypothesis("wrench-tare", of, without=(wrench, np.inf))
 
 
 def _scaled(wrench: Wrench, columns: slice, factor: float) -> Wrench:
+    """With components in another unit, and their noise, which is no smaller than stated."""
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor
-    if columns.start == 0:
-        return replace(wrench, values=values, sigma_n=wrench.sigma_n * max(1.0, factor))
-    sigma_nm = None if wrench.sigma_nm is None else wrench.sigma_nm * max(1.0, factor)
-    return replace(wrench, values=values, sigma_nm=sigma_nm)
+    sigma = "sigma_n" if columns.start == 0 else "sigma_nm"
+    stated = getattr(wrench, sigma)
+    larger = None if stated is None else stated * max(1.0, factor)
+    return replace(wrench, values=values, **{sigma: larger})

@@ -1,0 +1,187 @@
+"""Does the description of a recording fit its tracks? Told before solving, for any stiffness.
+
+The markers of bodies of many stiffnesses (`nlp.any_stiffness`) are compared with the tracks: for
+the description as given, and without each of the mistakes that people make. What fits far better
+is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.linalg import ArpackError
+from scipy.spatial.transform import Rotation
+
+from ..arrays import Array, Index
+from ..errors import SimulationError
+from ..experiment.experiment import Experiment
+from ..nlp.any_stiffness import Described, Sway, later
+from .exchanges import exchanges
+from .hypothesis import Hypothesis, Trial, clock, ranked
+from .mistakes import mistakes
+from .steps import steps
+from .work import against_the_load
+
+# The misfit falls by this factor at least before a cause is named.
+FAR_BETTER = 2.0
+# What has numbers to fit has to fit better still than what has none.
+FITTED = 1.5
+# Small strains and a few modes predict no better than to this part of the body's size.
+ROUGHLY = 0.005
+# Samples beyond this share may be anything: exchanged labels, reflections.
+USED = 0.9
+LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
+# Of the recording: a lag leaves most of it.
+LONGEST_LAG = 0.3
+REFITS = 3
+
+
+def doubts(
+    experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
+) -> tuple[Hypothesis, ...]:
+    """What is likely wrong with a recording's description, likeliest first; mostly nothing.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    constants : mapping of name to value
+        Of the body, any that keep the ratios of stiffness within it.
+    huber : float, optional
+        Of the loss, where it is Huber's.
+    """
+    if experiment.static or not experiment.markers.names:
+        return ranked(against_the_load(experiment))
+    comparison = Comparison.of(experiment, constants)
+    tried = () if comparison is None else comparison.doubts()
+    return ranked([*tried, *exchanges(experiment, huber), *steps(experiment)])
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Descriptions of one experiment against its tracks.
+
+    Attributes
+    ----------
+    given : Described
+    names : (M,) of the markers
+    sway : Sway
+    floor_m : float
+        Misfit that is to be expected at least.
+    """
+
+    given: Described
+    names: tuple[str, ...]
+    sway: Sway
+    floor_m: float
+
+    @classmethod
+    def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Comparison | None:
+        """That of an experiment, see `doubts`; None where the body has no modes to tell by.
+
+        Nor where tendons or pressures drive it, which is beyond a sway under gravity.
+        """
+        given = None if experiment.actuators else Described.of(experiment)
+        if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
+            return None
+        try:
+            sway = Sway.of(experiment, constants)
+        except (SimulationError, np.linalg.LinAlgError, ArpackError):
+            return None
+        markers = experiment.markers
+        noise_m = np.sqrt(3) * np.median(markers.sigma_m)
+        return cls(given, markers.names, sway, float(np.hypot(noise_m, ROUGHLY * sway.size_m)))
+
+    def misfit_m(self, described: Described) -> float:
+        """Misfit of the stiffness that suits best."""
+        return float(self._misfits_m(described, self.sway.predicted(described)).min())
+
+    def best(self, described: Described) -> Array:
+        """(T, M, 3) markers for the stiffness that suits best."""
+        predicted = self.sway.predicted(described)
+        return predicted[int(self._misfits_m(described, predicted).argmin())]
+
+    def doubts(self) -> Iterator[Hypothesis]:
+        """All that fits far better than what is given."""
+        trial = Trial(self.misfit_m(self.given), self.misfit_m, FAR_BETTER)
+        yield from trial.of([*mistakes(self.given), *self._other_frames(), *self._other_clock()])
+        yield from self._other_names()
+
+    def _misfits_m(self, described: Described, predicted: Array) -> Array:
+        """(S,) root mean square distance of most samples, and what is to be expected at least."""
+        present = np.isfinite(described.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
+        distance = np.linalg.norm(predicted - described.tracks_m, axis=3)[:, present]
+        squares = np.sort(distance**2, axis=1)
+        used = max(1, int(np.ceil(USED * squares.shape[1])))
+        return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
+
+    def _other_frames(self) -> Iterator[Hypothesis]:
+        """The rigid motions before the poses, and of the tracks, that suit best."""
+        given, places_m = self.given, self.sway.places_m
+        if not _fixes_rotation(places_m):
+            return
+        own = seen = given
+        for k in range(REFITS):
+            best = (
+                own.pulled_back(self.best(own))
+                if k
+                else np.broadcast_to(places_m, given.tracks_m.shape)
+            )
+            own = own.after(*_rigid(best, own.pulled_back(own.tracks_m)))
+            turn, shift_m = _rigid(seen.tracks_m, self.best(seen))
+            seen = replace(seen, tracks_m=seen.tracks_m @ turn.T + shift_m)
+        yield Hypothesis("gripper-frame", given.name, without=own, handicap=FITTED)
+        yield Hypothesis("camera-frame", given.name, without=seen, handicap=FITTED)
+
+    def _other_clock(self) -> Iterator[Hypothesis]:
+        given = self.given
+        predicted = self.sway.predicted(given)
+        allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(given.t_s)].tolist()
+        seen = (later(predicted, given.t_s, lag_s) for lag_s in allowed)
+        misfits = [self._misfits_m(given, each).min() for each in seen]
+        if misfits:
+            lag_s = allowed[int(np.argmin(misfits))]
+            yield clock(given.name, lag_s, replace(given, lag_s=lag_s), FITTED)
+
+    def _other_names(self) -> Iterator[Hypothesis]:
+        """Markers that have each other's name, tried on these."""
+        given = self.given
+        squares = np.sum((given.tracks_m[:, :, None] - self.best(given)[:, None]) ** 2, axis=3)
+        there = np.isfinite(squares).any(axis=0).all()
+        if not there or len(self.names) < 2:
+            return
+        _, chosen = linear_sum_assignment(np.nanmean(squares, axis=0))
+        moved = np.flatnonzero(chosen != np.arange(len(chosen)))
+        if not len(moved):
+            return
+        few, renamed = (
+            _with_markers(given, given.tracks_m[:, order], moved)
+            for order in (np.arange(len(chosen)), np.argsort(chosen))
+        )
+        listed = ", ".join(f"{self.names[k]} is {self.names[chosen[k]]}" for k in moved)
+        found = Hypothesis("markers-exchanged", given.name, {"names": listed}, renamed)
+        yield from Trial(self.misfit_m(few), self.misfit_m, FAR_BETTER).of([found])
+
+
+def _with_markers(given: Described, tracks_m: Array, markers: Index) -> Described:
+    """With the tracks of some markers only."""
+    few_m = np.full_like(tracks_m, np.nan)
+    few_m[:, markers] = tracks_m[:, markers]
+    return replace(given, tracks_m=few_m)
+
+
+def _rigid(from_m: Array, to_m: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) and translation (3,) that bring points to others, both (T, M, 3)."""
+    both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
+    a, b = from_m[both], to_m[both]
+    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0].as_matrix()
+    return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
+
+
+def _fixes_rotation(places_m: Array) -> bool:
+    if len(places_m) < 3:
+        return False
+    extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+    return bool(extents[1] > 0.1 * extents[0])
