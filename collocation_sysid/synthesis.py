@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +18,64 @@ from .output.writers import FRAMES_FILE, require_replaceable, run_folder, write_
 from .problem import Problem
 
 
+@dataclass(frozen=True)
+class Recipe:
+    """How data are made.
+
+    Attributes
+    ----------
+    integrator : str
+        newmark, or a scheme: midpoint, backward-euler, bdf2.
+    timestep_s : float
+        Newmark's step.
+    noise_m : float
+        Standard deviation of the noise.
+    noise_n : float
+        The same of measured forces.
+    noise_nm : float
+        The same of measured torques.
+    seed : int
+        Seed of the noise.
+    frames : --frames/--no-frames
+        Also write frames for ParaView.
+
+    Raises
+    ------
+    InputError
+        For an unknown integrator, and a timestep, noise or seed that cannot be.
+    """
+
+    integrator: str = "newmark"
+    timestep_s: float | None = None
+    noise_m: float = 0.0
+    noise_n: float = 0.0
+    noise_nm: float = 0.0
+    seed: int = 0
+    frames: bool = False
+
+    def __post_init__(self) -> None:
+        known = ("newmark", *SCHEMES)
+        if self.integrator not in known:
+            expected = f"expected one of {', '.join(known)}"
+            raise InputError(f"found {self.integrator!r}; {expected}", None, "--integrator")
+        if self.timestep_s is not None and not 0 < self.timestep_s < np.inf:
+            expected = "expected a number of seconds above 0"
+            raise InputError(f"found {self.timestep_s:g}; {expected}", None, "--timestep-s")
+        noises = {"-m": (self.noise_m, "metres"), "-n": (self.noise_n, "newtons")}
+        for end, (size, unit) in (noises | {"-nm": (self.noise_nm, "N m")}).items():
+            if not 0 <= size < np.inf:
+                message = f"found {size:g}; expected {unit}, 0 or more"
+                raise InputError(message, None, f"--noise{end}")
+        if self.seed < 0:
+            message = f"found {self.seed}; expected a whole number, 0 or more"
+            raise InputError(message, None, "--seed")
+
+
 def write_data(
     problem: Problem,
     folder: str | Path,
-    integrator: str = "newmark",
-    timestep_s: float | None = None,
-    noise_m: float = 0.0,
-    seed: int = 0,
-    frames: bool = False,
+    recipe: Recipe | None = None,
     progress: Callable[[float], None] | None = None,
-    noise_n: float = 0.0,
-    noise_nm: float = 0.0,
 ) -> list[Path]:
     """Simulate every experiment at the parameters' guesses and write poses, markers and wrenches.
 
@@ -38,13 +86,10 @@ def write_data(
         Made where it is missing; gets ``<experiment>_markers.csv``, ``<experiment>_poses.csv``
         (``_poses_2`` … for further grasps), ``<experiment>_wrench.csv`` (``_wrench_2`` …) of
         grasps whose wrench is measured, and ``<experiment>/`` with frames when asked for.
-    integrator, timestep_s
-        See `simulate`.
-    noise_m : float
-        Standard deviation of the normal noise on every coordinate.
-    seed : int
-    noise_n, noise_nm : float
-        The same of every component of the wrenches.
+    recipe : Recipe, optional
+        Without noise by default.
+    progress : callable, optional
+        Called with the share of a simulation that is done.
 
     Returns
     -------
@@ -54,35 +99,32 @@ def write_data(
     Raises
     ------
     InputError
-        For a parameter without a guess, an unknown integrator, a timestep, noise or seed that
-        cannot be, and before a file that the problem reads is overwritten.
+        For a parameter without a guess, and before a file that the problem reads is overwritten.
     SimulationError
         Before anything is written.
     """
-    place = Path(folder)
+    place, recipe = Path(folder), recipe or Recipe()
     _refuse_unguessed(problem)
-    noises = {"--noise-m": noise_m, "--noise-n": noise_n, "--noise-nm": noise_nm}
-    _refuse_options(integrator, timestep_s, noises, seed)
     _refuse_inputs(problem, place)
-    for experiment in problem.experiments if frames else ():
+    for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
-    rng = np.random.default_rng(seed)
-    given, substeps = problem.parameters, problem.first_substeps
+    rng, how = np.random.default_rng(recipe.seed), (recipe.integrator, recipe.timestep_s)
     simulated = [
-        simulate(experiment, given, integrator, timestep_s, substeps, None, progress)
-        for experiment in problem.experiments
+        simulate(e, problem.parameters, *how, problem.first_substeps, None, progress)
+        for e in problem.experiments
     ]
     written = []
     with ExitStack() as whole:  # all files appear at its end, or none
         for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
             files = _tables(experiment, place)
             drafts = [whole.enter_context(whole_file(file)) for file in files]
-            _write_tables(experiment, trajectory, drafts, rng, (noise_m, noise_n, noise_nm))
+            _write_tables(experiment, trajectory, drafts, rng, recipe)
             written += files
-            if frames:
-                folder = place / experiment.name
+            if recipe.frames:
+                folder, body = place / experiment.name, experiment.body
                 there = run_folder(folder, mark=FRAMES_FILE, what="simulation")
-                _write_frames(experiment, trajectory, whole.enter_context(there))
+                at = whole.enter_context(there), trajectory.t_s, trajectory.positions_m
+                write_frames(*at, body.cells, body.element, body.nodes_m)
                 written.append(folder / FRAMES_FILE)
     return written
 
@@ -92,11 +134,10 @@ def _write_tables(
     trajectory: Trajectory,
     files: Sequence[Path],
     rng: np.random.Generator,
-    noises: tuple[float, float, float],
+    recipe: Recipe,
 ) -> None:
     """Write markers, poses and wrenches into the files of `_tables`."""
-    noise_m, *of_wrench = noises
-    noise = noise_m * rng.normal(size=trajectory.markers_m.shape)
+    noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names, tracks = experiment.markers.names, trajectory.markers_m + noise
     write_markers_csv(files[0], experiment.t_s, names, tracks)
     count = len(experiment.grasps)
@@ -106,27 +147,8 @@ def _write_tables(
     sensed = zip(files[1 + count :], sensors, trajectory.wrenches, strict=True)
     for file, sensor, wrench in sensed:
         measured = np.where(sensor.measured, wrench, np.nan)
-        noise = np.repeat(of_wrench, 3) * rng.normal(size=wrench.shape)
+        noise = np.repeat([recipe.noise_n, recipe.noise_nm], 3) * rng.normal(size=wrench.shape)
         write_wrench_csv(file, sensor.t_s, measured + noise)
-
-
-def _refuse_options(
-    integrator: str, timestep_s: float | None, noises: Mapping[str, float], seed: int
-) -> None:
-    known = ("newmark", *SCHEMES)
-    if integrator not in known:
-        raise InputError(
-            f"found {integrator!r}; expected one of {', '.join(known)}", None, "--integrator"
-        )
-    if timestep_s is not None and not 0 < timestep_s < np.inf:
-        raise InputError(
-            f"found {timestep_s:g}; expected a number of seconds above 0", None, "--timestep-s"
-        )
-    for (option, size), unit in zip(noises.items(), ("metres", "newtons", "N m"), strict=True):
-        if not 0 <= size < np.inf:
-            raise InputError(f"found {size:g}; expected {unit}, 0 or more", None, option)
-    if seed < 0:
-        raise InputError(f"found {seed}; expected a whole number, 0 or more", None, "--seed")
 
 
 def _refuse_unguessed(problem: Problem) -> None:
@@ -159,10 +181,3 @@ def _tables(experiment: Experiment, place: Path) -> list[Path]:
     kinds += [("wrench", k) for k in range(sensors)]
     names = [f"{kind}_{k + 1}" if k else kind for kind, k in kinds]
     return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]
-
-
-def _write_frames(experiment: Experiment, trajectory: Trajectory, folder: Path) -> None:
-    body = experiment.body
-    write_frames(
-        folder, trajectory.t_s, trajectory.positions_m, body.cells, body.element, body.nodes_m
-    )

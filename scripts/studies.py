@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from collocation_sysid.problem import Problem
-from collocation_sysid.study import Limits, PlannedRun, RunStore, plan_comparison, run_all
+from collocation_sysid.study import Limits, PlannedRun, RunStore, Starts, plan_comparison, run_all
 from collocation_sysid.study.table import Row, Yardstick, run_row
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -84,9 +84,8 @@ def run_variants(
         overrides = variant.limited(time_s).overrides
         problem = Problem.read(path, overrides)
         count = max(1, round(starts * variant.share)) + 1 if starts else 1
-        runs = plan_comparison(
-            problem, [variant.method], overrides, count, spread, seed, truth=TRUTH
-        )
+        drawn = Starts(count, spread, seed)
+        runs = plan_comparison(problem, [variant.method], overrides, drawn, TRUTH)
         planned[variant.name] = runs[1:] if starts else runs
     remaining = [
         run

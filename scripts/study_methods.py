@@ -24,7 +24,7 @@ from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.study.table import Row, wilson_interval
-from collocation_sysid.synthesis import write_data
+from collocation_sysid.synthesis import Recipe, write_data
 
 WITHIN = 0.01
 RADIUS_M, HEIGHT_M = 0.04, 0.16
@@ -150,7 +150,7 @@ def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
     path.write_text(PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8")
     at_truth = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
     (folder / "swing_markers.csv").unlink(missing_ok=True)
-    write_data(Problem.read(path, at_truth, simulation=True), folder, "midpoint")
+    write_data(Problem.read(path, at_truth, simulation=True), folder, Recipe("midpoint"))
     return path
 
 

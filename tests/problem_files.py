@@ -19,7 +19,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.output import record
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import write_data
+from collocation_sysid.synthesis import Recipe, write_data
 
 SIZE_M, DIVISIONS = (0.06, 0.06, 0.09), (2, 2, 3)
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -77,7 +77,7 @@ def write_problem(folder: Path, steps: dict[str, int], validation: str = "") -> 
         text += added.replace("grasp", "validation = true\ngrasp") if name == validation else added
     file = folder / "problem.toml"
     file.write_text(text)
-    write_data(Problem.read(file, AT_TRUTH, simulation=True), folder, "midpoint")
+    write_data(Problem.read(file, AT_TRUTH, simulation=True), folder, Recipe("midpoint"))
     return file
 
 

@@ -17,7 +17,7 @@ from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.volume import Volume
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import write_data
+from collocation_sysid.synthesis import Recipe, write_data
 
 PROBLEM = """\
 title = "A driven box"
@@ -67,7 +67,7 @@ def made(tmp_path_factory) -> Path:
     file = folder / "problem.toml"
     file.write_text(PROBLEM)
     at_truth = [f"parameters.mu_pa.guess={TRUTH['mu_pa']}"]
-    write_data(Problem.read(file, at_truth, simulation=True), folder, "midpoint")
+    write_data(Problem.read(file, at_truth, simulation=True), folder, Recipe("midpoint"))
     return folder
 
 

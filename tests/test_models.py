@@ -36,7 +36,7 @@ from collocation_sysid.study.variants import (
     toml,
     variants,
 )
-from collocation_sysid.synthesis import write_data
+from collocation_sysid.synthesis import Recipe, write_data
 
 BOTH = ("neo-hookean", "yeoh")
 DAMPING = "gamma_r_s = 0.009, gamma_m_1_s = 1.0, lambda_pa = 120.0"
@@ -63,7 +63,7 @@ def soft_bar(folder: Path, material: str, steps: dict[str, int]) -> Path:
     file = folder / "problem.toml"
     file.write_text(text)
     truth = Problem.read(file, TRUTHS[material], simulation=True)
-    write_data(truth, folder, "midpoint", noise_m=5e-4, seed=1)
+    write_data(truth, folder, Recipe("midpoint", noise_m=5e-4, seed=1))
     return file
 
 

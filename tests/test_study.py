@@ -20,11 +20,11 @@ from collocation_sysid.study import (
     Limits,
     PlannedRun,
     RunStore,
+    Starts,
     plan_comparison,
     plan_sweep,
     process,
     run_all,
-    scheduler,
     worker,
 )
 from collocation_sysid.study.arguments import parse_methods, parse_over, read_truth
@@ -70,8 +70,17 @@ def stand_in(tmp_path, monkeypatch):
 
 @pytest.fixture
 def without_distributed(monkeypatch):
-    for module in (cluster, scheduler):
-        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(cluster, "find_spec", lambda name: None)
+
+
+@pytest.fixture
+def a_scheduler():
+    """The address of one."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=":0"
+    ) as there:
+        yield there.scheduler_address
 
 
 def planned_runs(count: int) -> list[PlannedRun]:
@@ -160,7 +169,7 @@ def test_a_truth_that_cannot_be_used_is_refused(given, message):
 
 def test_every_method_has_the_same_starts(tiny):
     problem = Problem.read("problem.toml")
-    planned = plan_comparison(problem, ["interior-point", "reduced-space"], starts=3, seed=4)
+    planned = plan_comparison(problem, ["interior-point", "reduced-space"], (), Starts(3, seed=4))
     assert [run.label for run in planned] == [
         f"{method}, start {start}"
         for start in range(3)
@@ -174,9 +183,9 @@ def test_every_method_has_the_same_starts(tiny):
 
 def test_more_starts_are_further_ones(tiny):
     problem = Problem.read("problem.toml")
-    few, many = (plan_comparison(problem, ["reduced-space"], starts=n) for n in (2, 5))
+    few, many = (plan_comparison(problem, ["reduced-space"], (), Starts(n)) for n in (2, 5))
     assert many[:2] == few
-    others = plan_comparison(problem, ["reduced-space"], starts=2, seed=1)
+    others = plan_comparison(problem, ["reduced-space"], (), Starts(2, seed=1))
     assert others[0] == few[0]
     assert others[1].guess != few[1].guess
 
@@ -184,7 +193,7 @@ def test_more_starts_are_further_ones(tiny):
 def test_starts_lie_around_the_truth_within_the_bounds(tiny):
     problem = Problem.read("problem.toml", ["parameters.mu_pa.upper=310"])
     overrides = ["parameters.mu_pa.upper=310"]
-    planned = plan_comparison(problem, ["reduced-space"], overrides, 40, spread=2.0, truth=TRUTH)
+    planned = plan_comparison(problem, ["reduced-space"], overrides, Starts(40, 2.0), TRUTH)
     guesses = np.array([list(run.guess.values()) for run in planned[1:]])
     ratios = guesses / np.array(list(TRUTH.values()))
     assert ratios.min() >= 0.5
@@ -195,14 +204,14 @@ def test_starts_lie_around_the_truth_within_the_bounds(tiny):
 
 def test_starts_lie_around_the_guess_where_the_truth_is_unknown(tiny):
     problem = Problem.read("problem.toml")
-    start = plan_comparison(problem, ["reduced-space"], starts=2, spread=1.0)[1]
+    start = plan_comparison(problem, ["reduced-space"], (), Starts(2, 1.0))[1]
     assert start.guess == pytest.approx({item.name: item.guess for item in problem.parameters.free})
 
 
 def test_fixed_parameters_stay(tiny):
     fixed = ["parameters.mu_pa={fixed = 300}"]
     problem = Problem.read("problem.toml", fixed)
-    start = plan_comparison(problem, ["reduced-space"], fixed, starts=2)[1]
+    start = plan_comparison(problem, ["reduced-space"], fixed, Starts(2))[1]
     assert list(start.guess) == ["lambda_pa", "gamma_r_s", "gamma_m_1_s"]
     assert not any("mu_pa.guess" in override for override in start.overrides)
 
@@ -262,9 +271,9 @@ def test_keys_are_shortened_while_they_differ():
     ("options", "where"),
     [({"starts": 0}, "--starts"), ({"spread": 0.5}, "--spread"), ({"seed": -1}, "--seed")],
 )
-def test_starts_that_cannot_be_are_refused(tiny, options, where):
+def test_starts_that_cannot_be_are_refused(options, where):
     with pytest.raises(InputError, match=f"^{where}: found"):
-        plan_comparison(Problem.read("problem.toml"), ["reduced-space"], **options)
+        Starts(**options)
 
 
 # One run's process --------------------------------------------------------------------------------
@@ -361,19 +370,9 @@ def test_runs_are_done_without_a_cluster(stand_in, without_distributed, tmp_path
     assert_all_runs_are_kept(tmp_path / "runs", Limits(workers=3))
 
 
-def test_runs_are_done_on_a_cluster_of_this_machine(stand_in, tmp_path):
-    pytest.importorskip("distributed")
+def test_runs_are_done_on_a_scheduler_by_its_address(stand_in, a_scheduler, tmp_path):
     stand_in("dies once")
-    assert_all_runs_are_kept(tmp_path / "runs", Limits(workers=3))
-
-
-def test_runs_are_done_on_a_scheduler_by_its_address(stand_in, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    stand_in("answers")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=":0"
-    ) as there:
-        assert_all_runs_are_kept(tmp_path / "runs", Limits(scheduler=there.scheduler_address))
+    assert_all_runs_are_kept(tmp_path / "runs", Limits(scheduler=a_scheduler))
 
 
 def test_a_scheduler_without_the_library_names_the_extra(without_distributed, tmp_path):
@@ -390,12 +389,9 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
         run_all(planned_runs(1), RunStore(tmp_path), Limits(scheduler="tcp://127.0.0.1:1"))
 
 
-@pytest.mark.parametrize("library", [True, False])
-def test_an_interrupted_study_keeps_what_is_finished(stand_in, tmp_path, monkeypatch, library):
-    if library:
-        pytest.importorskip("distributed")
-    else:
-        monkeypatch.setattr(scheduler, "find_spec", lambda name: None)
+@pytest.mark.parametrize("clustered", [True, False])
+def test_an_interrupted_study_keeps_what_is_finished(stand_in, tmp_path, request, clustered):
+    address = request.getfixturevalue("a_scheduler") if clustered else None
     stand_in("answers")
     store, runs = RunStore(tmp_path / "runs"), planned_runs(20)
 
@@ -403,7 +399,7 @@ def test_an_interrupted_study_keeps_what_is_finished(stand_in, tmp_path, monkeyp
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_all(runs, store, Limits(workers=1), interrupt)
+        run_all(runs, store, Limits(None if clustered else 1, address), interrupt)
     assert sum(store.load(run.key) is not None for run in runs) == 1
 
 

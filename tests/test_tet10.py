@@ -23,7 +23,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.output.writers import write_frames
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import write_data
+from collocation_sysid.synthesis import Recipe, write_data
 
 TET10 = element_named("tet10")
 LENGTH_M = 0.03  # a large change of a position
@@ -347,7 +347,7 @@ def test_a_problem_with_quadratic_elements_is_fitted(tiny):
     np.testing.assert_array_equal(held, np.flatnonzero(problem.bodies[0].nodes_m[:, 2] > 0.0899))
     assert len(held) == 25
     (tiny / "swing_markers.csv").unlink()  # of linear elements
-    write_data(problem, tiny, "midpoint")
+    write_data(problem, tiny, Recipe("midpoint"))
     outcome = run_command(
         "solve", "problem.toml", "--out", "run", *settings(*elements), "--method", "reduced-space"
     )

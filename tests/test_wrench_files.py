@@ -11,7 +11,7 @@ from problem_files import run_command
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Wrench, read_wrench, write_wrench_csv
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import write_data
+from collocation_sysid.synthesis import Recipe, write_data
 
 SENSOR = 'wrench = { file = "force.csv", sigma_n = 0.001, sigma_nm = 0.0001 }'
 HEADER = "t_s,fx_n,fy_n,fz_n,tx_nm,ty_nm,tz_nm"
@@ -157,7 +157,7 @@ def test_a_wrench_is_checked(changes: dict, words: str):
 def test_simulate_writes_wrenches_that_the_problem_reads(tiny: Path):
     file = with_sensor(tiny)
     problem = Problem.read(file, simulation=True)
-    written = write_data(problem, tiny / "data", noise_n=1e-3)
+    written = write_data(problem, tiny / "data", Recipe(noise_n=1e-3))
     assert tiny / "data" / "swing_wrench.csv" in written
     t_s, values = read_wrench(tiny / "data" / "swing_wrench.csv")
     (experiment,) = problem.experiments

@@ -44,12 +44,13 @@ class DesignOptions(Options):
     evaluations : int
         Motions that are simulated; ten times as many are tried to first order before.
     pairs : int
-        Pairs of draws of θ, on either side of the guess, that a motion is judged by besides it.
+        Pairs of draws from the prior, about the guesses.
     spread : float
-        By what factor a guess may be wrong, where a parameter has no prior.
+        By what factor guesses may be wrong, without a prior.
     waves : int
-        Waves of each coordinate.
+        Waves of each of the six coordinates.
     seed : int
+        Seed of the search and of the draws.
     """
 
     evaluations: AtLeastOne = 300

@@ -1,6 +1,6 @@
 """Many runs side by side: methods and starts compared, keys of the problem file swept."""
 
-from .plan import PlannedRun, plan_comparison, plan_models, plan_sweep
+from .plan import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
 from .scheduler import Limits, run_all
 from .store import RunStore
 
@@ -8,6 +8,7 @@ __all__ = [
     "Limits",
     "PlannedRun",
     "RunStore",
+    "Starts",
     "plan_comparison",
     "plan_models",
     "plan_sweep",

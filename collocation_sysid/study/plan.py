@@ -9,7 +9,8 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -81,13 +82,64 @@ def short_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, s
         yield key, next(alone, key)
 
 
+@dataclass(frozen=True)
+class Starts:
+    """Where runs start: first at the file's guess, then about the truth, or the guess without one.
+
+    A start depends on the seed and its number alone, so that more of them can be asked for later.
+
+    Attributes
+    ----------
+    starts : int
+        Starts; the first is the file's guess.
+    spread : float
+        Starts are within this factor.
+    seed : int
+        Seed of the starts.
+
+    Raises
+    ------
+    InputError
+        For a number, spread or seed that cannot be.
+    """
+
+    starts: int = 1
+    spread: float = 10.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.starts < 1:
+            raise InputError(f"found {self.starts}; expected 1 or more", None, "--starts")
+        require_few(self.starts, "--starts", "starts")
+        if not 1 <= self.spread < np.inf:
+            message = f"found {self.spread:g}; expected a factor of 1 or more"
+            raise InputError(message, None, "--spread")
+        if self.seed < 0:
+            message = f"found {self.seed}; expected a whole number, 0 or more"
+            raise InputError(message, None, "--seed")
+
+    def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
+        """Those of a start: log-uniform about truth or guess, and clipped to the bounds."""
+        free = problem.parameters.free if start else ()
+        exponents = np.random.default_rng([self.seed, start]).uniform(-1, 1, len(free))
+        for item, exponent in zip(free, exponents, strict=True):
+            centre = truth.get(item.name, item.guess)
+            if centre is None:
+                raise InputError(
+                    "has neither a guess nor a truth that starts could be spread about; expected "
+                    "one, or --starts 1",
+                    problem.path,
+                    f"parameters.{item.name}",
+                )
+            inside = float(np.clip(centre * self.spread**exponent, item.lower, item.upper))
+            yield f"parameters.{item.name}.guess={inside!r}"
+
+
 def plan_comparison(
     problem: Problem,
     methods: Sequence[str],
     overrides: Sequence[str] = (),
-    starts: int = 1,
-    spread: float = 10.0,
-    seed: int = 0,
+    starts: Starts | None = None,
     truth: Mapping[str, float] | None = None,
     allow_code: bool = False,
 ) -> list[PlannedRun]:
@@ -99,31 +151,31 @@ def plan_comparison(
         Read from its file with the same overrides.
     methods : sequence of str
     overrides : sequence of "key=value"
-    starts : int
-        Start 0 is the file's guess. The others are log-uniform within a factor `spread` of the
-        truth, or of the guess where there is none, and clipped to the bounds. A start depends on
-        the seed and its number alone, so that more of them can be asked for later.
-    spread : float
-    seed : int
+    starts : Starts, optional
+        The file's guess alone by default.
     truth : mapping of name to value, optional
     allow_code : bool
 
     Raises
     ------
     InputError
-        For a number of starts, spread or seed that cannot be, starts about a parameter that has
-        neither guess nor truth, and a problem without a file.
+        For starts about a parameter that has neither guess nor truth, and a problem without a file.
     """
-    _refuse_options(starts, spread, seed)
-    path = _path_of(problem)
+    starts = starts or Starts()
+    if problem.path is None:
+        raise InputError(
+            "this problem has no file, which a study's processes read; write one, and take "
+            "Problem.read"
+        )
     if problem.substeps == "auto":  # or each method would choose for itself
         overrides = [*overrides, f"transcription.substeps={problem.first_substeps}"]
     planned = []
-    for start in range(starts):
-        moved = list(overrides) + _start_overrides(problem, truth or {}, start, spread, seed)
-        file, _ = read_problem_file(path, moved)
-        planned += [_planned(path, file, method, moved, start) for method in methods]
-    return [replace(run, allow_code=allow_code) for run in planned]
+    for start in range(starts.starts):
+        moved = [*overrides, *starts.overrides(problem, truth or {}, start)]
+        file, _ = read_problem_file(problem.path, moved)
+        more = {"start": start, "allow_code": allow_code}
+        planned += [_planned(problem.path, file, method, moved, **more) for method in methods]
+    return planned
 
 
 def plan_sweep(
@@ -150,8 +202,9 @@ def plan_sweep(
         except InputError as error:
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, error.where) from error
-        planned.append(_planned(path, file, method or file.solver.method, moved, swept=swept))
-    return [replace(run, allow_code=allow_code) for run in planned]
+        more = {"swept": swept, "allow_code": allow_code}
+        planned.append(_planned(path, file, method, moved, **more))
+    return planned
 
 
 def plan_models(
@@ -171,62 +224,17 @@ def plan_models(
     for held_out in ("", *recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
-            solver, swept = method or file.solver.method, {"model": variant.label}
-            run = _planned(variant.path, file, solver, variant.overrides, 0, swept, held_out)
-            planned.append(replace(run, allow_code=allow_code))
+            more = {"swept": {"model": variant.label}, "held_out": held_out}
+            more |= {"allow_code": allow_code}
+            planned.append(_planned(variant.path, file, method, variant.overrides, **more))
     return planned
 
 
-def _path_of(problem: Problem) -> Path:
-    if problem.path is None:
-        raise InputError(
-            "this problem has no file, which a study's processes read; write one, and take "
-            "Problem.read"
-        )
-    return problem.path
-
-
-def _refuse_options(starts: int, spread: float, seed: int) -> None:
-    if starts < 1:
-        raise InputError(f"found {starts}; expected 1 or more", None, "--starts")
-    require_few(starts, "--starts", "starts")
-    if not 1 <= spread < np.inf:
-        raise InputError(f"found {spread:g}; expected a factor of 1 or more", None, "--spread")
-    if seed < 0:
-        raise InputError(f"found {seed}; expected a whole number, 0 or more", None, "--seed")
-
-
-def _start_overrides(
-    problem: Problem, truth: Mapping[str, float], start: int, spread: float, seed: int
-) -> list[str]:
-    if start == 0:
-        return []
-    free = problem.parameters.free
-    exponents = np.random.default_rng([seed, start]).uniform(-1, 1, len(free))
-    moved = []
-    for item, exponent in zip(free, exponents, strict=True):
-        centre = truth.get(item.name, item.guess)
-        if centre is None:
-            raise InputError(
-                "has neither a guess nor a truth that starts could be spread about; expected one, "
-                "or --starts 1",
-                problem.path,
-                f"parameters.{item.name}",
-            )
-        inside = float(np.clip(centre * spread**exponent, item.lower, item.upper))
-        moved.append(f"parameters.{item.name}.guess={inside!r}")
-    return moved
-
-
 def _planned(
-    path: Path,
-    file: ProblemFile,
-    method: str,
-    overrides: Sequence[str],
-    start: int = 0,
-    swept: Mapping[str, str] | None = None,
-    held_out: str | None = None,
+    path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
+    """A run of a file as its overrides make it, by its own method if there is no other."""
+    method, start = method or file.solver.method, more.get("start", 0)
     guess = {
         name: section.guess
         for name, section in file.parameters.items()
@@ -238,31 +246,24 @@ def _planned(
     solver = content.get("solver", {})
     content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
     content["solver"]["method"] = method
-    of_study = start if held_out is None else f"without {held_out}"
-    decisive = [content, of_study, _hashes_of_files(content, path.parent), _version()]
+    of_study = start if more.get("held_out") is None else f"without {more['held_out']}"
+    hashes = _hashes_of_files(content, path.parent)
+    decisive = [content, of_study, hashes, version("collocation-sysid")]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
-    whole = str(path.resolve())
-    changed, varied = tuple(overrides), dict(swept or {})
-    return PlannedRun(key, whole, method, start, changed, guess, varied, held_out=held_out)
-
-
-def _version() -> str:
-    return version("collocation-sysid")
+    return PlannedRun(
+        key, str(path.resolve()), method, overrides=tuple(overrides), guess=guess, **more
+    )
 
 
 def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
     """Hashes of the files that a problem names: other data is another run."""
-    found = {}
+    hashes = {}
     for text in _texts(content):
-        try:
-            if not (folder / text).is_file():
-                continue
-            data = (folder / text).read_bytes()
-        except (OSError, ValueError):  # a text that is no file's name
-            continue
-        found[text] = hashlib.sha256(data).hexdigest()
-    return found
+        with suppress(OSError, ValueError):  # a text that is no file's name
+            if (folder / text).is_file():
+                hashes[text] = hashlib.sha256((folder / text).read_bytes()).hexdigest()
+    return hashes
 
 
 def _texts(content: Any) -> Iterator[str]:

@@ -37,8 +37,8 @@ GRACE_S = 10.0
 def execute(
     planned: dict[str, Any],
     time_limit_s: float | None = None,
-    retries: int = 1,
     stopped: Callable[[], bool] = lambda: False,
+    retries: int = 1,
 ) -> Record:
     """Do a run in a process of its own and return its record, whatever happens to the process.
 
@@ -49,10 +49,10 @@ def execute(
     time_limit_s : float, optional
         The process is asked to end after this, loading included, and killed if it does not; the
         record has the best answer that it found, where there is one.
-    retries : int
-        Further tries when the process dies.
     stopped : callable
         Asked now and then; the process is killed once it says so.
+    retries : int
+        Further tries when the process dies.
     """
     attempts, record = 0, {}
     while attempts <= retries:

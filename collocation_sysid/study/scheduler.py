@@ -6,14 +6,12 @@ limit or a segmentation fault costs that run alone.
 
 from __future__ import annotations
 
-import logging
 import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any
 
 from ..cluster import connected, distributed
@@ -30,20 +28,17 @@ class Limits:
 
     Attributes
     ----------
-    workers : int or None
-        Runs at once on this machine; as many as there are cores by default.
-    scheduler : str or None
-        Address of a dask.distributed scheduler, whose workers see the same files.
-    time_limit_s : float or None
-        Of a run, loading included.
-    retries : int
-        Further tries of a run whose process dies.
+    workers : int
+        Runs at once; as many as there are cores by default.
+    scheduler : ADDRESS
+        A dask.distributed scheduler to run on; its workers see the same files.
+    time_limit_s : --time-limit SECONDS
+        A run is ended after this, loading included; it counts as a failure.
     """
 
     workers: int | None = None
     scheduler: str | None = None
     time_limit_s: float | None = None
-    retries: int = 1
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
@@ -103,7 +98,7 @@ def run_all(
     """
     if not planned:
         return
-    with _pool(limits) as pool:
+    with (_cluster if limits.scheduler else _threads)(limits) as pool:
         futures = {pool.submit(run): run for run in planned}
         try:
             for future in as_completed(futures):
@@ -134,65 +129,30 @@ def _record_of(future: Future, planned: PlannedRun, limits: Limits) -> Record:
 
 
 @contextmanager
-def _pool(limits: Limits) -> Iterator[Pool]:
-    if limits.scheduler is None and find_spec("distributed") is None:
-        with _threads(limits) as pool:
-            yield pool
-    else:
-        with _dask(limits) as pool:
-            yield pool
-
-
-@contextmanager
 def _threads(limits: Limits) -> Iterator[Pool]:
     """Threads that wait for processes: all that one machine needs."""
-    slots = limits.workers or available_threads()
-    stop = threading.Event()
+    slots, stop = limits.workers or available_threads(), threading.Event()
     with ThreadPoolExecutor(slots) as executor:
-        yield Pool(
-            lambda run: executor.submit(
-                execute, run.as_dict(), limits.time_limit_s, limits.retries, stop.is_set
-            ),
-            slots,
-            stop.set,
-        )
+
+        def submit(run: PlannedRun) -> Future:
+            return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
+
+        yield Pool(submit, slots, stop.set)
 
 
 @contextmanager
-def _dask(limits: Limits) -> Iterator[Pool]:
-    """An existing scheduler by address, else a cluster on this machine."""
-    dask = distributed()
-    cluster = None
-    if limits.scheduler is None:
-        slots = limits.workers or available_threads()
-        # Its workers are threads, for each run is a process anyhow.
-        cluster = dask.LocalCluster(
-            n_workers=1,
-            threads_per_worker=slots,
-            processes=False,
-            protocol="tcp",
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.ERROR,
-        )
+def _cluster(limits: Limits) -> Iterator[Pool]:
+    """The workers of a scheduler that is there."""
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
-    try:
-        with connected(cluster or limits.scheduler) as client:
-            stop = dask.Event(flag, client=client)
-            with client.get_executor(pure=False) as executor:
-                yield Pool(
-                    lambda run: executor.submit(
-                        _execute_on_worker, run.as_dict(), limits.time_limit_s, limits.retries, flag
-                    ),
-                    max(1, sum(client.nthreads().values())),
-                    stop.set,
-                )
-    finally:
-        if cluster is not None:
-            cluster.close()
+    with connected(limits.scheduler) as client:
+        stop = distributed().Event(flag, client=client)
+        with client.get_executor(pure=False) as executor:
+
+            def submit(run: PlannedRun) -> Future:
+                return executor.submit(_on_worker, run.as_dict(), limits.time_limit_s, flag)
+
+            yield Pool(submit, max(1, sum(client.nthreads().values())), stop.set)
 
 
-def _execute_on_worker(
-    planned: dict[str, Any], time_limit_s: float | None, retries: int, flag: str
-) -> Record:
-    return execute(planned, time_limit_s, retries, distributed().Event(flag).is_set)
+def _on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
+    return execute(planned, time_limit_s, distributed().Event(flag).is_set)

@@ -1,0 +1,122 @@
+"""Commands made from dataclasses: an option is a field, and stands nowhere else.
+
+What it is stands under "Attributes" in the docstring, as of the options of a method. In place of
+its type may stand how it is written: names other than the field's, as -v, and what help shows for
+its value, as FILE. Options that many commands share are annotated instead, in `common`. Own options
+are told before those of the bases.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import typer
+from typer.models import OptionInfo, ParameterInfo
+
+from ..methods.options import attributes
+from ..problem import Problem
+from .common import AllowCode, AsJson, Overrides, ProblemPath, Quiet, examples
+
+T = TypeVar("T")
+
+
+def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[T], None]], Any]:
+    """A function of a dataclass of options becomes a command, with examples below its help."""
+
+    def registered(function: Callable[[T], None]) -> Callable[[T], None]:
+        (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
+        parameters = [*_parameters(kind)]
+
+        def called(**values: Any) -> None:
+            function(_built(kind, values))
+
+        called.__name__, called.__doc__ = function.__name__, function.__doc__
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {each.name: each.annotation for each in parameters}
+        group.command(epilog=examples(*shown))(called)
+        return function
+
+    return registered
+
+
+def _parameters(kind: type) -> Iterator[inspect.Parameter]:
+    """What typer makes options of; a field that is a dataclass of options has several."""
+    said = attributes(kind)
+    for name, default, hint, marks in _typed_fields(kind):
+        if is_dataclass(hint):
+            yield from _parameters(hint)  # type: ignore[arg-type]
+            continue
+        infos = (copy(mark) for mark in marks if isinstance(mark, ParameterInfo))
+        info = next(infos, None) or typer.Option()
+        if info.help is None:
+            written, info.help = said[name]
+            info.metavar = next(
+                (w for w in written.split() if w[0].isupper() or w[0].isdigit()), None
+            )
+            if isinstance(info, OptionInfo):
+                info.param_decls = _names(name, default, written)
+        yield inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if default is MISSING else default,
+            annotation=Annotated[hint, info],
+        )
+
+
+def _names(field: str, default: Any, written: str) -> list[str]:
+    """How an option is given; what is off by default can only be put on."""
+    option = field.strip("_").replace("_", "-")
+    names = [word for word in written.split() if word.startswith("-")]
+    if not any(word.startswith("--") for word in names):
+        names.insert(0, f"--{option}" + (default is True) * f"/--no-{option}")
+    return names
+
+
+def _built(kind: type[T], values: Mapping[str, Any]) -> T:
+    """The options from their values by name, those of fields that are options themselves too."""
+    return kind(
+        **{
+            name: _built(hint, values) if is_dataclass(hint) else values[name]  # type: ignore
+            for name, _, hint, _ in _typed_fields(kind)
+        }
+    )
+
+
+@cache
+def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
+    """Name, default, type and annotations of each field, those of a class before its bases'."""
+    hints = get_type_hints(kind, include_extras=True)
+    defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
+    order = (name for base in kind.__mro__ for name in inspect.get_annotations(base))
+    listed = []
+    for name in dict.fromkeys(name for name in order if name in defaults):
+        annotated = get_origin(hints[name]) is Annotated
+        hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
+        listed.append((name, defaults[name], hint, tuple(marks)))
+    return listed
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfProblem:
+    """A problem's file, as the command line changes it."""
+
+    problem: ProblemPath
+    set_: Overrides = None
+    allow_code: AllowCode = False
+
+    def read(self, simulation: bool = False) -> Problem:
+        """The problem."""
+        return Problem.read(self.problem, self.set_ or (), self.allow_code, simulation=simulation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """How a result and what leads to it are told."""
+
+    as_json: AsJson = False
+    quiet: Quiet = False
