@@ -6,23 +6,21 @@ Every warning is one sentence that ends with the remedy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ..arrays import Array
 from ..experiment.turning import turning_warnings
-from ..methods.method import Method
 from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import SOFT_PA, started, usual_parameters
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
 from ..nlp.explicit import Explicit, made_explicit
-from ..nlp.factorisation import Choice
 from ..nlp.overstress import Overstress
 from ..nlp.reaction_rows import Reactions
 from ..nlp.schemes import as_scheme
-from ..nlp.stability import instabilities
+from ..nlp.stability import Instability, instabilities
 from ..nlp.wrench_rows import WrenchRows
 from ..problem import Problem
 from ..statistics.concern import Concern, as_said
@@ -133,8 +131,13 @@ class Findings:
     hessian_error: float
     holds: tuple[Hold, ...]
     causes: tuple[Hypothesis, ...]
-    notes: tuple[str, ...]
-    concerns: tuple[Concern, ...]
+    notes: tuple[str, ...] = ()
+    concerns: tuple[Concern, ...] = ()
+
+    @property
+    def chosen_cost(self) -> Cost | None:
+        """That of the chosen method."""
+        return next((cost for cost in self.costs if cost.method == self.method), None)
 
     @property
     def derivatives_agree(self) -> bool:
@@ -182,115 +185,145 @@ def check_problem(
         Where no start is found.
     """
     say = say or (lambda _: None)
-    collocation, scan = problem.collocation(), None
+    collocation, notes = problem.collocation(), []
     if problem.parameters.unguessed:
         say("looking for a start, as there is no guess")
         collocation, scan = started(collocation)
         problem = replace(problem, parameters=collocation.parameters)
-    guesses = problem.parameters.guesses
+        notes = [scan.sentence] if scan else []
     say("simulating the first samples at the guess")
-    began, short = time.perf_counter(), shortened(problem).collocation()
-    first_z, start_notes = initial_variables(short)
-    whole_s = (time.perf_counter() - began) * _rows(collocation) / _rows(short)
+    began, first = time.perf_counter(), shortened(problem).collocation()
+    first_z, start_notes = initial_variables(first)
+    whole_s = (time.perf_counter() - began) * _rows(collocation) / _rows(first)
     say("comparing derivatives with differences")
-    jacobian_error, hessian_error = derivative_errors(short, first_z)
+    jacobian_error, hessian_error = derivative_errors(first, first_z)
     say("estimating what methods take")
-    whole = made_explicit(collocation)
-    jacobian, hessian = nonzeros(problem, whole)
-    method, choice = _name(problem.method), _factorisation(problem)
-    found_costs = costs(collocation, short, first_z, jacobian + hessian, choice)
-    chosen = next((cost for cost in found_costs if cost.method == method), None)
-
-    simulated, z = short, first_z
+    program = _program(problem, collocation, first, first_z)
+    simulated, z = first, first_z
     if full or whole_s <= PATIENCE_S:
         say(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
         simulated, (z, start_notes) = collocation, initial_variables(collocation)
-    bodies = _bodies(problem)
-    recordings = _recordings(problem, simulated, z)
     say("looking at modes and at the description")
-    scheme = as_scheme(collocation.scheme)
-    motions = tuple(
-        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
-        for s in collocation.segments
-        if not s.experiment.static
+    findings = Findings(
+        **_measured(problem, simulated, z),
+        timesteps=_rows(collocation),
+        rms_at_guess_m=None if simulated is first else collocation.rms_m(z),
+        motions=_motions(problem, collocation),
+        **program,
+        jacobian_error=jacobian_error,
+        hessian_error=hessian_error,
+        causes=description_causes(problem),
     )
-    causes, holds = description_causes(problem), _holds(problem, bodies)
-    still = stillness_notes(problem.experiments, problem.parameters)
-    scale = scale_notes(problem.experiments, problem.parameters)
-    concerns = as_said("description/doubt", (cause.sentence for cause in causes))
-    concerns += as_said("information/still", still) + as_said("scale/unknown", scale)
-    concerns += as_said("mesh/elements", _body_warnings(bodies))
-    for hold in holds:
-        concerns += as_said("description/grasp", hold_warnings(hold))
-    for motion in motions:
-        concerns += motion_warnings(motion)
-    concerns += stability_concerns(instabilities(simulated, z))
-    for experiment in problem.experiments:
-        turns = turning_warnings(experiment, problem.first_substeps)
-        concerns += as_said("scheme/turn", turns)
-    for recording in recordings:
-        body = next(each for each in bodies if recording.experiment in each.experiments)
-        seen = recording_warnings(recording, body.edges_m[1], body.diagonal_m)
-        concerns += as_said("markers/recording", seen)
-    concerns += as_said("memory/short", cost_warnings(chosen, found_costs) if chosen else [])
-    said = {*still, *scale, *(cause.sentence for cause in causes)}
-    known = [note for note in problem.notes if note not in said]
-    notes = [*known, *([scan.sentence] if scan else []), *start_notes]
-    for motion in motions:
-        notes += motion_notes(motion)
-    notes += cost_notes(chosen, found_costs) if chosen else []
-    if simulated is short:
+    concerns = _concerns(problem, findings, instabilities(simulated, z))
+    notes += [*start_notes, *_notes(findings)]
+    if simulated is first:
         notes.append(
             f"the recordings were not simulated at the guess but for their first samples: it would "
             f"take about {whole_s:.2g} s; check --full does it"
         )
-    notes += [CHOSEN] * (problem.substeps == "auto" and bool(motions))
-    return Findings(
-        bodies=bodies,
-        experiments=len(problem.experiments),
-        timesteps=sum(segment.grid_rows for segment in collocation.segments),
-        samples=sum(recording.samples for recording in recordings),
-        missing=sum(recording.missing for recording in recordings),
-        largest_marker_distance_m=max(
-            (r.farthest.distance_m for r in recordings if r.markers), default=0.0
-        ),
-        rms_at_guess_m=None if simulated is short else collocation.rms_m(z),
-        recordings=recordings,
-        motions=motions,
-        variables=collocation.variables,
-        constraints=collocation.constraints,
-        overstresses=whole.added(Overstress) if isinstance(whole, Explicit) else 0,
-        wrenches=whole.added(Reactions, WrenchRows) if isinstance(whole, Explicit) else 0,
-        jacobian_nonzeros=jacobian,
-        hessian_nonzeros=hessian,
-        method=method,
-        memory_mb=chosen.memory_mb if chosen else None,
-        costs=found_costs,
-        jacobian_error=jacobian_error,
-        hessian_error=hessian_error,
-        holds=holds,
-        causes=causes,
-        notes=tuple(notes),
-        concerns=tuple(concerns),
+    notes += [CHOSEN] * (problem.substeps == "auto" and bool(findings.motions))
+    findings = replace(findings, concerns=concerns)
+    known = [note for note in problem.notes if note not in findings.warnings]
+    return replace(findings, notes=(*known, *notes))
+
+
+def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
+    """Bodies, recordings and grasps; the program may be of the first samples."""
+    positions_m = {}
+    for part in collocation.parts(z):
+        at_samples = part.x[part.segment.markers.grid_rows]
+        positions_m[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
+    bodies = _bodies(problem)
+    recordings = [recording_of(e, positions_m.get(e.name)) for e in problem.experiments]
+    distances_m = [r.farthest.distance_m for r in recordings if r.markers]
+    return {
+        "bodies": bodies,
+        "experiments": len(recordings),
+        "samples": sum(recording.samples for recording in recordings),
+        "missing": sum(recording.missing for recording in recordings),
+        "largest_marker_distance_m": max(distances_m, default=0.0),
+        "recordings": tuple(recordings),
+        "holds": _holds(problem, bodies),
+    }
+
+
+def _rows(collocation: Collocation) -> int:
+    return sum(segment.grid_rows for segment in collocation.segments)
+
+
+def _program(
+    problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
+) -> dict[str, Any]:
+    """How large the program is, and what methods take for it: fields of `Findings`."""
+    whole = made_explicit(collocation)
+    jacobian, hessian = nonzeros(problem, whole)
+    # Reduced space as the file has it, whichever method is chosen.
+    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
+    reduced = next(each for each in named if isinstance(each, ReducedSpace))
+    method = problem.method
+    name = method if isinstance(method, str) else getattr(method, "name", repr(method))
+    counted = costs(collocation, first, first_z, jacobian + hessian, reduced.factorisation)
+    explicit = isinstance(whole, Explicit)
+    return {
+        "variables": collocation.variables,
+        "constraints": collocation.constraints,
+        "overstresses": whole.added(Overstress) if explicit else 0,
+        "wrenches": whole.added(Reactions, WrenchRows) if explicit else 0,
+        "jacobian_nonzeros": jacobian,
+        "hessian_nonzeros": hessian,
+        "method": name,
+        "memory_mb": next((cost.memory_mb for cost in counted if cost.method == name), None),
+        "costs": counted,
+    }
+
+
+def _motions(problem: Problem, collocation: Collocation) -> tuple[Motion, ...]:
+    scheme, guesses = as_scheme(collocation.scheme), problem.parameters.guesses
+    return tuple(
+        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
+        for s in collocation.segments
+        if not s.experiment.static
     )
 
 
-def _name(method: str | Method) -> str:
-    return method if isinstance(method, str) else getattr(method, "name", repr(method))
+def _concerns(
+    problem: Problem, findings: Findings, unstable: Sequence[Instability]
+) -> tuple[Concern, ...]:
+    """What will go wrong, the likeliest mistakes first."""
+    experiments, parameters = problem.experiments, problem.parameters
+    bodies, chosen = findings.bodies, findings.chosen_cost
+    body_of = {name: body for body in bodies for name in body.experiments}
+    holds = (warning for hold in findings.holds for warning in hold_warnings(hold))
+    turns = (w for e in experiments for w in turning_warnings(e, problem.first_substeps))
+    seen = (w for r in findings.recordings for w in recording_warnings(r, body_of[r.experiment]))
+    costly = cost_warnings(chosen, findings.costs) if chosen else []
+    return (
+        *as_said("description/doubt", (cause.sentence for cause in findings.causes)),
+        *as_said("information/still", stillness_notes(experiments, parameters)),
+        *as_said("scale/unknown", scale_notes(experiments, parameters)),
+        *as_said("mesh/elements", _body_warnings(bodies)),
+        *as_said("description/grasp", holds),
+        *(concern for motion in findings.motions for concern in motion_warnings(motion)),
+        *stability_concerns(unstable),
+        *as_said("scheme/turn", turns),
+        *as_said("markers/recording", seen),
+        *as_said("memory/short", costly),
+    )
 
 
-def _factorisation(problem: Problem) -> Choice:
-    """That of reduced space, whichever method is chosen."""
-    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
-    return next(each.factorisation for each in named if isinstance(each, ReducedSpace))
+def _notes(findings: Findings) -> list[str]:
+    """What is worth knowing of the motions, and of the method."""
+    chosen = findings.chosen_cost
+    notes = [note for motion in findings.motions for note in motion_notes(motion)]
+    return notes + (cost_notes(chosen, findings.costs) if chosen else [])
 
 
 def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
-    found = []
-    for body in problem.bodies:
-        names = tuple(e.name for e in problem.experiments if e.body is body)
-        found.append(body_finding(body, body.theta(problem.parameters.guesses), names))
-    return tuple(found)
+    """Each body, with the names of the experiments that it is in."""
+    guesses = problem.parameters.guesses
+    names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
+    pairs = zip(problem.bodies, names, strict=True)
+    return tuple(body_finding(body, body.theta(guesses), own) for body, own in pairs)
 
 
 def _holds(problem: Problem, bodies: tuple[BodyFinding, ...]) -> tuple[Hold, ...]:
@@ -306,16 +339,3 @@ def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
         for body in bodies
         for warning in body.warnings
     ]
-
-
-def _recordings(problem: Problem, collocation: Collocation, z: Array) -> tuple[Recording, ...]:
-    """What was recorded; `collocation` may be of the first samples."""
-    simulated = {}
-    for part in collocation.parts(z):
-        at_samples = part.x[part.segment.markers.grid_rows]
-        simulated[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
-    return tuple(recording_of(e, simulated.get(e.name)) for e in problem.experiments)
-
-
-def _rows(collocation: Collocation) -> int:
-    return sum(segment.grid_rows for segment in collocation.segments)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..experiment.experiment import Experiment
+from .shape import BodyFinding
 
 # Of the mean edge length: beyond this, a marker's place is mostly extrapolation.
 FAR = 0.5
@@ -102,13 +103,13 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     )
 
 
-def recording_warnings(recording: Recording, mean_edge_m: float, diagonal_m: float) -> list[str]:
+def recording_warnings(recording: Recording, body: BodyFinding) -> list[str]:
     """What is wrong with the measurements, one sentence each; the worst marker stands for all."""
     if not recording.markers:
         return []
     warnings = []
     name, far, lost = recording.experiment, recording.farthest, recording.least_seen
-    if far.distance_m > FAR * mean_edge_m:
+    if far.distance_m > FAR * body.edges_m[1]:
         warnings.append(
             f"marker '{far.name}' of '{name}' lies {1e3 * far.distance_m:.3g} mm from its place on "
             "the body and is extrapolated: give its reference_m, or check the frame and unit"
@@ -120,7 +121,7 @@ def recording_warnings(recording: Recording, mean_edge_m: float, diagonal_m: flo
             f"marker '{lost.name}' of '{name}' is missing in {lost.missing} of {recording.frames} "
             "samples: shorten window_s to where it is seen, or leave it out of names"
         )
-    astray = [m for m in recording.markers if (m.start_miss_m or 0.0) > ASTRAY * diagonal_m]
+    astray = [m for m in recording.markers if (m.start_miss_m or 0.0) > ASTRAY * body.diagonal_m]
     if astray:
         worst = max(astray, key=lambda marker: marker.start_miss_m or 0.0)
         warnings.append(
