@@ -42,6 +42,7 @@ from ..experiment.experiment import Experiment
 from ..fem.body import Linearisation
 from .channel import Motion
 from .charts import Chart
+from .entries import Entries
 from .parameters import Parameters
 from .schemes import Scheme
 from .segment import First, Segment, Weights
@@ -359,7 +360,7 @@ class Collocation:
         segments = _read_alike(self.segments, charts)
         by_name = {s.experiment.name: s.chart for s in segments}
         vars(other).update(charts=by_name, segments=segments)
-        for stale in ("hessian_structure", "hessian_diagonals", "_hessian_of_phi"):
+        for stale in ("_hessian", "hessian_diagonals"):
             vars(other).pop(stale, None)
         return other, moved
 
@@ -416,34 +417,26 @@ class Collocation:
             [part.segment.constraint_values(part.x, part.setting) for part in self.parts(z)]
         )
 
-    @cached_property
+    @property
     def jacobian_structure(self) -> tuple[Index, Index]:
         """Column pointers and row indices of ∂g/∂z by compressed columns."""
-        dense = np.arange(self.nq + 1) * self.constraints
-        indptr, indices = [dense], [np.tile(np.arange(self.constraints), self.nq)]
-        used = int(dense[-1])
-        for segment in self.segments:
-            indptr.append(used + segment.jacobian.indptr[1:])
-            indices.append(segment.first.row + segment.jacobian.indices)
-            used += segment.jacobian.nnz
-        rows, counts, _ = self._jacobian_of_phi
-        return np.concatenate([*indptr, used + np.cumsum(counts)]), np.concatenate([*indices, rows])
+        return self._jacobian.structure
 
     @cached_property
-    def _jacobian_of_phi(self) -> tuple[Index, Index, Index | slice]:
-        """Rows of the entries in the columns of φ, how many each has, and their order."""
-        rows, columns = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    def _jacobian(self) -> Entries:
+        """The columns of q and x, and of each experiment those of its φ."""
+        dense = np.arange(self.nq + 1) * self.constraints
+        indptr, indices = [dense], [np.tile(np.arange(self.constraints), self.nq)]
+        of_phi = []
         for segment in self.segments:
+            indptr.append(indptr[-1][-1] + segment.jacobian.indptr[1:])
+            indices.append(segment.first.row + segment.jacobian.indices)
             moving = segment.local.places[segment.nuisance.moving] - self.nq
-            own = segment.first.row + np.arange(segment.constraints)
-            rows.append(np.tile(own, len(moving)))
-            columns.append(np.repeat(moving, segment.constraints))
-        row, column = np.concatenate(rows), np.concatenate(columns)
-        counts = np.bincount(column, minlength=self.nphi)
-        if np.all(column[1:] >= column[:-1]):
-            return row, counts, slice(None)
-        order = np.lexsort((row, column))
-        return row[order], counts, order
+            rows = segment.first.row + np.arange(segment.constraints)
+            columns = self.of_phi.start + np.repeat(moving, len(rows))
+            of_phi.append((np.tile(rows, len(moving)), columns))
+        structure = np.concatenate(indptr), np.concatenate(indices)
+        return Entries.of(structure, (self.constraints, self.variables), of_phi)
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_structure`."""
@@ -455,18 +448,19 @@ class Collocation:
 
     def linearised(self, parts: Sequence[Part], out: Array | None = None) -> tuple[Array, Array]:
         """The same where the experiments are, at the memory as it is."""
-        values = np.empty(len(self.jacobian_structure[1])) if out is None else out
-        columns = values[: self.nq * self.constraints].reshape(self.nq, self.constraints)
+        count = self.nq * self.constraints + sum(s.jacobian.nnz for s in self.segments)
+        values, own = self._jacobian.values(out, count)
+        columns = own[: self.nq * self.constraints].reshape(self.nq, self.constraints)
         rows, by_phi = np.empty(self.constraints), []
         used = columns.size
         for part in parts:
             segment = part.segment
-            here = values[used : used + segment.jacobian.nnz]
+            here = own[used : used + segment.jacobian.nnz]
             found, by_p = segment.constraints_and_jacobian(part.x, part.setting, part.forces, here)
             rows[segment.rows], columns[:, segment.rows] = found, by_p[:, : self.nq].T
             by_phi.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
-        values[used:] = np.concatenate(by_phi)[self._jacobian_of_phi[2]]
+        self._jacobian.fill(values, own, by_phi)
         return rows, values
 
     def jacobian(self, z: Array) -> sp.csc_array:
@@ -493,54 +487,34 @@ class Collocation:
 
     # Lagrangian -------------------------------------------------------------------------------
 
-    @cached_property
+    @property
     def hessian_structure(self) -> tuple[Index, Index]:
         """The same of the upper triangle of ∇²_z (w L + yᵀ g)."""
-        counts = np.arange(self.nq + 1)
-        indptr = [counts * (counts + 1) // 2]
-        indices = [np.concatenate([np.arange(k) for k in counts])]
-        used = int(indptr[0][-1])
-        for segment in self.segments:
-            layout = segment.hessian_layout
-            indptr.append(used + layout.x_indptr[1:])
-            shift = np.where(layout.x_indices < self.nq, 0, segment.first.x - self.nq)
-            indices.append(layout.x_indices + shift)
-            used += layout.x_entries
-        codes, _ = self._hessian_of_phi
-        columns = np.searchsorted(codes, np.arange(1, self.nphi + 1) * self.variables)
-        return np.concatenate([*indptr, used + columns]), np.concatenate(
-            [*indices, codes % self.variables]
-        )
+        return self._hessian.structure
 
     @cached_property
-    def _hessian_of_phi(self) -> tuple[Index, list[Index]]:
-        """Entries in the columns of φ, as column · variables + row; where each experiment's are.
-
-        In z all φ stand after all x. Experiments that share a φ share entries.
-        """
-        codes = []
+    def _hessian(self) -> Entries:
+        """The columns of q, those of x as the motion has them, and what else experiments have."""
+        counts, further = np.arange(self.nq + 1), []
+        indptr = [counts * (counts + 1) // 2]
+        indices = [np.concatenate([np.arange(k) for k in counts])]
         for segment in self.segments:
-            layout, first = segment.hessian_layout, segment.first
-            in_z = self.of_phi.start - self.nq + segment.local.places
-            whole = np.concatenate(
-                [np.arange(self.nq), first.x + np.arange(segment.variables), in_z]
-            )
-            row = whole[layout.phi_indices]
-            column = np.repeat(in_z, np.diff(layout.phi_indptr))
-            row, column = np.minimum(row, column), np.maximum(row, column)
-            codes.append((column - self.of_phi.start) * self.variables + row)
-        found, places = np.unique(np.concatenate(codes), return_inverse=True)
-        return found, np.split(places, np.cumsum([len(each) for each in codes])[:-1])
+            indptr.append(indptr[-1][-1] + segment.hessian.indptr[1:])
+            shift = np.where(segment.hessian.indices < self.nq, 0, segment.first.x - self.nq)
+            indices.append(segment.hessian.indices + shift)
+            further += segment.further_entries(self.of_phi.start)
+        structure = np.concatenate(indptr), np.concatenate(indices)
+        return Entries.of(structure, (self.variables, self.variables), further)
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
         """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        of_q, of_x = np.cumsum(np.arange(1, self.nq + 1)) - 1, []
         used = self.nq * (self.nq + 1) // 2
-        of_x = []
         for segment in self.segments:
-            of_x.append(used + segment.hessian_layout.diagonal)
-            used += segment.hessian_layout.x_entries
-        return np.cumsum(np.arange(1, self.nq + 1)) - 1, np.concatenate(of_x)
+            of_x.append(used + segment.hessian_diagonal)
+            used += segment.hessian.nnz
+        return of_q, self._hessian.places_of(np.concatenate(of_x))
 
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
@@ -572,44 +546,29 @@ class Collocation:
 
         With weights of the memory's equations, by the number of the experiment, see `Segment`.
         """
-        values = np.empty(len(self.hessian_structure[1])) if out is None else out
-        used, (codes, places) = self.nq * (self.nq + 1) // 2, self._hessian_of_phi
-        of_phi = np.zeros(len(codes))
-        by_q = np.zeros((self.nq, self.nq))
+        used = self.nq * (self.nq + 1) // 2
+        count = used + sum(segment.hessian.nnz for segment in self.segments)
+        values, own = self._hessian.values(out, count)
+        by_q, further = np.zeros((self.nq, self.nq)), list[Array]()
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
             segment = part.segment
-            of_x = segment.hessian_layout.x_entries
-            alone = len(places[number]) == 0
-            here = values[used : used + of_x] if alone else np.empty(of_x + len(places[number]))
-            by_q += segment.hessian_values(
-                part.x,
-                part.phi,
-                part.setting,
-                weights[number],
-                weight,
-                here,
-                (memory_weights or {}).get(number, ()),
-                part.bent,
-            )
-            if not alone:
-                values[used : used + of_x] = here[:of_x]
-                of_phi[places[number]] += here[of_x:]
-            used += of_x
-        values[used:] = of_phi
+            here = own[used : used + segment.hessian.nnz]
+            of_memory = (memory_weights or {}).get(number, ())
+            at = part.x, part.phi, part.setting, weights[number], weight
+            found, more = segment.hessian_values(*at, here, of_memory, part.bent)
+            by_q, further, used = by_q + found, further + more, used + len(here)
         _, slopes = self.parameters.prior(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
         order = np.lexsort((rows, columns))
-        values[: len(rows)] = by_q[rows[order], columns[order]]
+        own[: len(rows)] = by_q[rows[order], columns[order]]
+        self._hessian.fill(values, own, further)
         return values
 
     def hessian_phi(self, number: int) -> Index:
         """Places in the values of the Hessian of an experiment's φ by φ, `np.triu_indices`."""
-        codes, places = self._hessian_of_phi
-        layout = self.segments[number].hessian_layout
-        first = len(self.hessian_structure[1]) - len(codes)
-        return first + places[number][layout.phi - layout.x_entries]
+        return self._hessian.places[4 * number + 3]
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Largest violation of the first-order conditions of the whole NLP, in its scaling.

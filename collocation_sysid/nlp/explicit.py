@@ -19,10 +19,10 @@ import numpy as np
 from ..arrays import Array, Index
 from .addition import Addition, Places
 from .collocation import Collocation, Part
+from .entries import Entries
 from .overstress import Overstress
 from .reaction_rows import Reactions
 from .segment import Segment, Weights
-from .widened import Widened
 from .wrench_channel import GraspWrench
 from .wrench_rows import WrenchRows
 
@@ -139,39 +139,25 @@ class Explicit(Collocation):
     # Matrices -----------------------------------------------------------------------------------
 
     @cached_property
-    def _jacobian(self) -> Widened:
-        entries = [each.jacobian_entries() for each in self.additions]
-        return self._with(self.plain.jacobian_structure, entries)
+    def _jacobian(self) -> Entries:
+        further = [each.jacobian_entries() for each in self.additions]
+        shape = self.constraints, self.variables
+        return Entries.of(self.plain.jacobian_structure, shape, further)
 
     @cached_property
-    def _hessian(self) -> Widened:
-        entries = [each.hessian_entries() for each in self.additions]
-        return self._with(self.plain.hessian_structure, entries)
-
-    def _with(
-        self, structure: tuple[Index, Index], entries: Sequence[tuple[Index, Index]]
-    ) -> Widened:
-        rows, columns = (np.concatenate(each) for each in zip(*entries, strict=True))
-        return Widened.of(structure, self.variables, rows, columns)
-
-    @cached_property
-    def jacobian_structure(self) -> tuple[Index, Index]:
-        """Column pointers and row indices of ∂g/∂z by compressed columns."""
-        return self._jacobian.indptr, self._jacobian.indices
+    def _hessian(self) -> Entries:
+        further = [each.hessian_entries() for each in self.additions]
+        shape = self.variables, self.variables
+        return Entries.of(self.plain.hessian_structure, shape, further)
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
-        values = np.empty(len(self._jacobian.indices)) if out is None else out
+        values, own = self._jacobian.values(out, len(self.plain.jacobian_structure[1]))
         parts = self.parts(z)
-        rows, plain = self.plain.linearised(parts)
+        rows, _ = self.plain.linearised(parts, own)
         found = [each.jacobian_values(parts[each.number], z) for each in self.additions]
-        self._jacobian.fill(values, plain, np.concatenate([further for _, further in found]))
-        return np.concatenate([rows, *(own for own, _ in found)]), values
-
-    @cached_property
-    def hessian_structure(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of ∇²_z (w L + yᵀ g)."""
-        return self._hessian.indptr, self._hessian.indices
+        self._jacobian.fill(values, own, [further for _, further in found])
+        return np.concatenate([rows, *(equations for equations, _ in found)]), values
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
@@ -182,7 +168,6 @@ class Explicit(Collocation):
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
         """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
-        values = np.empty(len(self._hessian.indices)) if out is None else out
         parts, multipliers = self.bending(z, multipliers)
         weights = self._weights(multipliers)
         of_memory = {
@@ -190,17 +175,16 @@ class Explicit(Collocation):
             for each in self.additions
             if isinstance(each, Overstress)
         }
-        plain = self.plain.curved(parts, loss_weight, weights, memory_weights=of_memory)
-        scaled, further = loss_weight * self.loss_scale, [np.zeros(0)]
+        values, own = self._hessian.values(out, len(self.plain.hessian_structure[1]))
+        self.plain.curved(parts, loss_weight, weights, own, of_memory)
+        scaled, further = loss_weight * self.loss_scale, []
         for each in self.additions:
             here = parts[each.number], z, scaled, multipliers
             further.append(each.hessian_values(*here, weights[each.number]))
-            of_phi = np.triu_indices(each.segment.nuisance.size)
-            curvature = np.broadcast_to(
-                each.phi_curvature(*here), (len(parts[each.number].phi),) * 2
-            )
-            plain[self.plain.hessian_phi(each.number)] += curvature[of_phi]
-        self._hessian.fill(values, plain, np.concatenate(further))
+            size = len(parts[each.number].phi)
+            curvature = np.broadcast_to(each.phi_curvature(*here), (size, size))
+            own[self.plain.hessian_phi(each.number)] += curvature[np.triu_indices(size)]
+        self._hessian.fill(values, own, further)
         return values
 
     def _weights(self, multipliers: Array) -> list[Weights]:

@@ -24,7 +24,6 @@ from .channel import Points
 from .charts import Chart
 from .dynamics import Dynamics
 from .held import Grasping, Held
-from .hessian_layout import HessianLayout
 from .inputs import Inputs
 from .local_loss import LocalLoss
 from .markers import MarkerReading
@@ -43,7 +42,7 @@ from .wrench_channel import Grid
 
 T = TypeVar("T", bound=np.generic)
 
-CHARTED = ("markers", "readings", "local_loss", "hessian_layout")
+CHARTED = ("markers", "readings", "local_loss")
 
 
 @dataclass(frozen=True)
@@ -586,12 +585,12 @@ class Segment:
         values: Array,
         memory_weights: Sequence[Array] = (),
         bent: bool = True,
-    ) -> Array:
-        """Write the columns of x, then of φ, of ∇²(loss_weight · L + weights · c).
+    ) -> tuple[Array, list[Array]]:
+        """Second derivatives of loss_weight · L + weights · c.
 
         Parameters
         ----------
-        values : (hessian_layout.entries,) out
+        values : (hessian.nnz,) out, of the dynamics in the columns of x
         bent : whether readings are, see `LocalLoss.hessian`
         memory_weights : μ (N, …) of each branch
             Where the memory is given, Σ μ_k (d_k m_{k−1} + a_k S_k) is added; see `memory`.
@@ -599,30 +598,22 @@ class Segment:
         Returns
         -------
         by_q : (nq, nq) second derivatives by q
+        further : list of the values of `further_entries`
         """
         dynamics, band = setting.dynamics, self.hessian
         curvature = self._curvature(x, setting, weights.forces, memory_weights)
-        layout = self.hessian_layout
-        of_band = values[: band.nnz] if layout.band is None else np.empty(band.nnz)
         band.fill(
-            of_band, curvature.position_position, curvature.position_velocity, self.body.threads
+            values, curvature.position_position, curvature.position_velocity, self.body.threads
         )
         if curvature.velocity_velocity.size:
             rates = curvature.velocity_velocity
-            self._rate_hessian.fill(of_band, rates, rates, self.body.threads)
+            self._rate_hessian.fill(values, rates, rates, self.body.threads)
         skew = skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
-            self._skew_hessian.fill(of_band, skew, skew, self.body.threads)
+            self._skew_hessian.fill(values, skew, skew, self.body.threads)
         by_x, twice = setting.curvature(x, curvature, weights.rows)
         of_q = self.length_m * by_x[..., : self.nq]
-        of_band[band.top_positions] = of_q.reshape(band.top_positions.shape)
-        if layout.band is not None:
-            values[: layout.x_entries] = 0
-            values[layout.band] = of_band
-        values[layout.x_entries :] = 0
-        values[layout.loss] += loss_weight * layout.scale * self.local_loss.hessian(x, phi, bent)
-        values[layout.by_x] += self.length_m * by_x[..., self.by_state].ravel()
-        values[layout.by_q] += twice[: self.nq, self.nq :].ravel()
+        values[band.top_positions] = of_q.reshape(band.top_positions.shape)
         by_phi = np.diag(2 * loss_weight * self.local.counted)  # the prior
         of_motion = twice[self.nq :, self.nq :]
         if setting.held.moves:
@@ -633,8 +624,11 @@ class Segment:
             of_goals = np.where(grasped, of_goals[:, setting.held.dofs], 0.0)
             of_motion = of_motion + self.grasping.curvature(phi, of_goals)
         by_phi[np.ix_(self.nuisance.moving, self.nuisance.moving)] += of_motion
-        values[layout.phi] += by_phi[np.triu_indices(self.nuisance.size)]
-        return twice[: self.nq, : self.nq]
+        of_loss = loss_weight * self._loss_scale * self.local_loss.hessian(x, phi, bent)
+        of_states = self.length_m * by_x[..., self.by_state].ravel()
+        of_pairs = by_phi[np.triu_indices(len(by_phi))]
+        further = [of_loss, twice[: self.nq, self.nq :].ravel(), of_states, of_pairs]
+        return twice[: self.nq, : self.nq], further
 
     def _curvature(
         self, x: Array, setting: Setting, weights: Array, memory_weights: Sequence[Array]
@@ -661,21 +655,38 @@ class Segment:
     def _curvature_rows(self) -> Array:
         return np.zeros((self.grid_rows, self.dynamics.forces.curvature_width))
 
-    @cached_property
-    def hessian_layout(self) -> HessianLayout:
-        """Structure of the columns that `hessian_values` writes."""
+    @property
+    def hessian_diagonal(self) -> Index:
+        """Positions of the diagonal of x in the values of `hessian`."""
         dofs = np.arange(self.dofs)
-        diagonal = self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
+        return self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
+
+    def further_entries(self, first_phi: int) -> list[tuple[Index, Index]]:
+        """Rows and columns in z of what its Hessian has besides `hessian`, upper triangle.
+
+        Those of the loss by x and φ; of the motion by q and φ, and by x and φ; of φ by φ.
+
+        Parameters
+        ----------
+        first_phi : where in z the φ of all experiments begin
+        """
+        of_x = self.first.x + np.arange(self.variables)
+        of_phi = first_phi - self.nq + self.local.places
+        in_z, moving = np.concatenate([of_x, of_phi]), of_phi[self.nuisance.moving]
+        states, pairs = moving[self.by_state - self.nq], np.triu_indices(len(of_phi))
         rows, columns = self.local_loss.structure
-        return HessianLayout.of(
-            self.hessian,
-            diagonal,
-            self.variables,
-            self.nq,
-            rows,
-            columns,
-            self.nuisance.size,
-            self.length_m,
-            self.nuisance.moving,
-            self.nuisance.moving[self.by_state - self.nq],
-        )
+        found = [
+            (in_z[rows], in_z[columns]),
+            (np.repeat(np.arange(self.nq), len(moving)), np.tile(moving, self.nq)),
+            (np.repeat(of_x, len(states)), np.tile(states, len(of_x))),
+            (of_phi[pairs[0]], of_phi[pairs[1]]),
+        ]
+        # Experiments that share a φ need not have them in the same order.
+        return [(np.minimum(*each), np.maximum(*each)) for each in found]
+
+    @property
+    def _loss_scale(self) -> Array:
+        """Of each entry of the loss, its factor in scaled variables."""
+        rows, columns = self.local_loss.structure
+        powers = (rows < self.variables).astype(float) + (columns < self.variables)
+        return self.length_m**powers
