@@ -188,6 +188,8 @@ class Points:
     def _by_place(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
         """(R, estimated, 3, k) slopes by their own places."""
         (nodes, functions), here = shape, self.chart.estimated
+        if not len(here):
+            return np.zeros((len(self.rows), 0, 3, self.places.shape[1]))
         return self._combined(x, nodes[here], functions.slopes[here])
 
     def values(self, motion: Motion, phi: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -100,19 +101,28 @@ class Generated:
         sizes = [function.size_out(k) for k in range(function.n_out())]
         if not count:
             return [np.zeros((*size, *shape)) for size in sizes]
+        key = function.name(), count
+        if key not in self._mappings:
+            self._mappings[key] = function.map(count)
+        # Through buffers, as CasADi's own matrices take ten times as long.
+        buffer, evaluate = self._mappings[key].buffer()
+        # CasADi declares no type for what it takes.
+        take: Any = buffer.set_arg
+        give: Any = buffer.set_res
         given = [np.ascontiguousarray(x.reshape(len(x), count).T, float) for x in (u, *others)]
         found = [np.empty((count, columns, rows)) for rows, columns in sizes]
-        # Through buffers, as CasADi's own matrices take ten times as long.
-        buffer, evaluate = function.map(count).buffer()
         for place, each in enumerate(given):
             if each.size:
-                buffer.set_arg(place, memoryview(each))
+                take(place, each.data)
         for place, each in enumerate(found):
-            buffer.set_res(place, memoryview(each))
+            give(place, each.data)
         evaluate()
-        return [
-            np.moveaxis(each.reshape(*shape, *each.shape[1:]), (-1, -2), (0, 1)) for each in found
-        ]
+        axes = len(shape) + 1, len(shape), *range(len(shape))
+        return [each.reshape(*shape, *each.shape[1:]).transpose(axes) for each in found]
+
+    @cached_property
+    def _mappings(self) -> dict[tuple[str, int], ca.Function]:
+        return {}
 
 
 CSE = {"cse": True}

@@ -121,7 +121,7 @@ class MarkerReading(Reading):
     @cached_property
     def _window(self) -> Window:
         count = len(self.markers.names)
-        place = np.stack([1.0 * (self._times - self._first_neighbour), self.t_s])
+        place = np.array([self._times - self._first_neighbour, self.t_s], dtype=np.float64)
         places = self._around[:, None] * count + np.arange(count)[:, None]
         return Window(places, np.repeat(place[..., None], count, axis=2))
 

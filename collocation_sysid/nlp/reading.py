@@ -234,12 +234,12 @@ class Reading(ABC):
         measured, weight = (part[:, :samples] for part in self._compared)
         there = self.covered(len(values))[:samples, None]
         data = np.concatenate([window.data, measured, weight * there])
-        u = np.concatenate([np.moveaxis(around, 2, 0), own])
+        u = np.concatenate([around.transpose(2, 0, 1), own])
         return self.instrument(vectors, len(window.data)), window, u, data
 
     def _grouped(self, values: Array) -> Array:
         """(s, G, 3) from (m, s, E)."""
-        return np.moveaxis(values, 0, 2).reshape(values.shape[1], len(self.names), GROUP)
+        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), GROUP)
 
     # All samples ------------------------------------------------------------------------------
 
@@ -265,8 +265,8 @@ class Reading(ABC):
         instrument, window, u, data = self._at(values, phi)
         residual, by_u = instrument.residual.slopes(u, data)
         samples, each, vectors = window.places.shape
-        by_u = np.moveaxis(by_u, (0, 1), (2, 3))
-        by_looked, by_own = np.split(by_u, [GROUP * vectors], axis=3)
+        by_u = by_u.transpose(2, 3, 0, 1)
+        by_looked, by_own = by_u[..., : GROUP * vectors], by_u[..., GROUP * vectors :]
         found, first = np.zeros((*by_u.shape[:3], size)), size - len(phi)
         found[..., slopes.columns] = by_looked @ _around(slopes.by, window.places)
         if len(slopes.entities):
@@ -372,7 +372,7 @@ def _around(by: Array, places: Index) -> Array:
 
 def _add(slope: Array, entities: Index, columns: Index, values: Array) -> None:
     """Add (s, e, m, k) to columns (e, k) of (s, E, m, size), in place."""
-    slope[:, entities[:, None], :, columns] += np.moveaxis(values, (1, 3), (0, 1))
+    slope[:, entities[:, None], :, columns] += values.transpose(1, 3, 0, 2)
 
 
 def _product(slopes: sp.csr_array, blocks: Array) -> Entries:
