@@ -15,7 +15,9 @@ from .errors import InputError, SimulationError
 from .experiment import (
     Experiment,
     Force,
+    Gauge,
     Grasp,
+    Look,
     Markers,
     Nuisance,
     NuisanceRow,
@@ -46,7 +48,7 @@ from .methods.solution import Iteration, Solution, Status
 from .nlp.collocation import Collocation
 from .nlp.parameters import Parameter, Parameters, Tied, Unknown
 from .nlp.schemes import Scheme, Stencil
-from .nlp.simulation import Trajectory, simulate, with_markers, with_wrenches
+from .nlp.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
 from .problem import Problem, RolloutOptions, UncertaintyOptions
 from .refine import refine
 from .run import Run, run, solve
@@ -65,11 +67,13 @@ __all__ = [
     "Continuation",
     "Experiment",
     "Force",
+    "Gauge",
     "Grasp",
     "Indices",
     "InputError",
     "InteriorPoint",
     "Iteration",
+    "Look",
     "Markers",
     "Material",
     "Named",
@@ -113,5 +117,6 @@ __all__ = [
     "simulate",
     "solve",
     "with_markers",
+    "with_readings",
     "with_wrenches",
 ]

@@ -147,12 +147,30 @@ def step_error(
         for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             apart.append(way.reshape(-1, 2, 3))
+        apart += _of_gauges(solution, segment, rollout.trajectory, share)
     change = changes_towards(fit, apart)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     moduli = Derived.of((s.constants for s in collocation.segments), q).values
     halved = {**moduli, **collocation.parameters.values(q)}
     linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
     return Refinement(numerical_errors(estimates, [halved], [], order, linear))
+
+
+def _of_gauges(
+    solution: Solution, segment: Segment, trajectory: Trajectory, share: float
+) -> list[Array]:
+    """A share of the way of the readings of one's own to a roll-out, of each (S, G, 3)."""
+    if not segment.gauges:
+        return []
+    (part,) = (p for p in solution.collocation.parts(solution.z) if p.segment is segment)
+    samples, found = part.x[segment.markers.grid_rows], []
+    for gauge in segment.gauges:
+        fitted, rolled = (
+            gauge.of_samples(x.reshape(len(x), -1, 3), segment.experiment.t_s, part.phi)
+            for x in (samples, trajectory.positions_m)
+        )
+        found.append(share * (rolled - fitted) / gauge.sigmas[:, None])
+    return found
 
 
 def _share(problem: Problem, segment: Segment) -> float | None:

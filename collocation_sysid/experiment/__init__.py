@@ -4,6 +4,7 @@ from .alignment import Aligned, align
 from .clock import sample_interval_s
 from .experiment import Experiment
 from .force_files import read_forces, read_pressure, read_tension
+from .gauge import Gauge, Look
 from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
@@ -22,7 +23,9 @@ __all__ = [
     "Aligned",
     "Experiment",
     "Force",
+    "Gauge",
     "Grasp",
+    "Look",
     "MarkerTable",
     "Markers",
     "Nuisance",

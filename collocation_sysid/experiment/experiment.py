@@ -16,6 +16,7 @@ from .actuator import Actuator
 from .arrays import read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
 from .freedom import free_motions
+from .gauge import Gauge
 from .grasp import Grasp, held_dofs
 from .loads import Change, Force, PointMass, ramp
 from .markers import Markers
@@ -51,7 +52,7 @@ class Experiment:
         body, and poses given as matrices are those at `t_s`.
     markers : Markers, optional
         Tracks at the times `t_s`, at least one sample present. Those given by their places are put
-        on the body, see `place_markers`. None are needed where a wrench is measured.
+        on the body, see `place_markers`. None are needed where wrenches or `readings` are measured.
     gravity_m_s2 : (3,) array
         Acceleration of gravity.
     name : str
@@ -78,6 +79,8 @@ class Experiment:
         Put on the body by their points.
     pressures : sequence of Pressure
         On faces of the body's boundary.
+    readings : sequence of Gauge
+        Instruments of one's own.
     nuisance : Nuisance
         What else is to be estimated about this recording alone: by default what a careful
         laboratory does not know better; `Nuisance.none` for ideal data.
@@ -105,6 +108,7 @@ class Experiment:
     forces: tuple[Force, ...]
     tendons: tuple[Tendon, ...]
     pressures: tuple[Pressure, ...]
+    readings: tuple[Gauge, ...]
     nuisance: Nuisance
 
     def __init__(
@@ -127,6 +131,7 @@ class Experiment:
         forces: Iterable[Force] = (),
         tendons: Iterable[Tendon] = (),
         pressures: Iterable[Pressure] = (),
+        readings: Iterable[Gauge] = (),
         nuisance: Nuisance = AS_IN_A_LABORATORY,
     ) -> None:
         n = len(body.nodes_m)
@@ -150,6 +155,7 @@ class Experiment:
                 forces=tuple(force.on(body) for force in forces),
                 tendons=tuple(tendon.on(body) for tendon in tendons),
                 pressures=tuple(pressure.on(body) for pressure in pressures),
+                readings=tuple(readings),
                 nuisance=nuisance,
             )
             self._check_kind()
@@ -376,9 +382,11 @@ class Experiment:
             grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
             if grasp.wrench is not None:
                 within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
+        for gauge in self.readings:
+            within(gauge.times, self.t_s, f"the reading '{gauge.name}'", self.static)
 
     def _refuse_unmeasured(self) -> None:
-        if any(grasp.wrench is not None for grasp in self.grasps):
+        if self.readings or any(grasp.wrench is not None for grasp in self.grasps):
             return
         if not self.markers.names:
             raise InputError(

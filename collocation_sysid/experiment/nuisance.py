@@ -22,7 +22,9 @@ FREELY = 1e3
 # A place may move this many edges of the mesh in a step, the time of a load this many samples.
 EDGES_A_STEP = SAMPLES_A_STEP = 2.0
 
-Of = Literal["recording", "place", "marker", "grasp", "tendon", "pressure", "load", "sensor"]
+Of = Literal[
+    "recording", "place", "marker", "grasp", "tendon", "pressure", "load", "sensor", "gauge"
+]
 Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives"]
 # What recordings say that share something, besides "recording" for those that do not.
 SCOPE, SCOPES = r"shared( \S+)?", '"shared", or "shared" and a word for each of several groups'
@@ -248,6 +250,9 @@ TOOL_CENTRE = NuisanceRow("tool_m", "m", None, key="tool", of="sensor", axes="x 
     label="centre of the tool{which}, {axis}", told="its centre off by {size}",
     said="its centre about the sensor's point; in the world's frame that of the grasped nodes")
 # fmt: on
+
+# What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
+GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
 
 # In the order of φ; neighbours of one component stand together.
 ROWS = (

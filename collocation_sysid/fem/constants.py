@@ -15,6 +15,7 @@ Scale = Literal["log", "linear"]
 # Units by the ending of a name, longest first.
 _UNITS = {
     "_kg_m3": "kg/m³",
+    "_m_s2": "m/s²",
     "_1_s": "1/s",
     "_pa": "Pa",
     "_kg": "kg",
@@ -133,7 +134,7 @@ def unit_of(name: str) -> str:
 def symbol_of(name: str) -> str:
     """How a constant is written: its symbol, and its region behind."""
     region, _, own = name.rpartition(".")
-    symbol = KNOWN[own].symbol if own in KNOWN else _without_unit(own)
+    symbol = KNOWN[own].symbol if own in KNOWN else without_unit(own)
     return f"{symbol} {region}".strip()
 
 
@@ -177,5 +178,6 @@ def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | Non
     return shear * shares.get(bare(name), 1.0)
 
 
-def _without_unit(name: str) -> str:
+def without_unit(name: str) -> str:
+    """A name without the unit that it ends with."""
     return next((name.removesuffix(e) for e in _UNITS if name.endswith(e)), name)

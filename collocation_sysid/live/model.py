@@ -312,6 +312,7 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
         t_s=t_s,
         grasps=[replace(g, wrench=None) for g in _held_at(experiment, _first_poses(experiment))],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
+        readings=(),
     )
 
 

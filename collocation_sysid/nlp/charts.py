@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
-from ..experiment.placement import Shape
+from ..experiment.placement import Placement, Shape
 from ..fem.body import Body
 
 # A place leaves its element when another holds it better by this, in barycentric coordinates: so
@@ -93,6 +93,25 @@ class Chart:
             np.zeros(len(points), dtype=np.int64),
         )
         return chart.about(points)
+
+    @classmethod
+    def exact(cls, body: Body, placement: Placement, points_m: Array) -> Chart:
+        """The chart of places that are not estimated."""
+        count = len(points_m)
+        none = np.zeros(count, dtype=np.int64)
+        return cls(
+            body=body,
+            sigma_m=np.zeros(count),
+            given_m=points_m,
+            on_surface=False,
+            nodes=placement.nodes,
+            weights=placement.weights,
+            cells=none,
+            points_m=points_m,
+            axes=np.zeros((count, 3, 3)),
+            crossed=np.full((count, 2, 3), np.nan),
+            again=none,
+        )
 
     def suits(self, experiment: Experiment) -> bool:
         """Whether it is of this body, and of places known as well as the experiment's."""

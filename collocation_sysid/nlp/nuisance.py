@@ -30,6 +30,7 @@ from ..experiment.experiment import Experiment
 from ..experiment.grasp import Grasp, held_nodes
 from ..experiment.loads import Change, Force, PointMass
 from ..experiment.nuisance import (
+    GAUGE,
     GRASP_SHIFT,
     GRASP_TURN,
     JOINING,
@@ -46,6 +47,7 @@ from ..experiment.nuisance import (
     rotation,
 )
 from ..experiment.wrench import COMPONENTS, UNITS, Wrench
+from ..fem.constants import unit_of, without_unit
 from ..files import reason
 from .generated import Generated
 
@@ -382,6 +384,10 @@ def _entries(experiment: Experiment) -> Iterator[Entry]:
                 for axis, name, unit, sigma in _axes(experiment, row, number):
                     label = row.label.format(which=which, axis=name)
                     yield Entry(row, number, axis, f"{label} [{unit}]", sigma)
+    for number, gauge in enumerate(experiment.readings):
+        for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
+            label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
+            yield Entry(GAUGE, number, axis, label, sigma)
 
 
 def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:

@@ -23,6 +23,7 @@ from .block_band import Block, BlockBand, Term
 from .channel import Points
 from .charts import Chart
 from .dynamics import Dynamics
+from .gauge import GaugeReading, gauge_readings
 from .held import Grasping, Held
 from .inputs import Inputs
 from .local_loss import LocalLoss
@@ -147,9 +148,14 @@ class Segment:
         return wrench_readings(self.experiment, Grid.of(self.dynamics), self.nuisance, self.huber)
 
     @cached_property
+    def gauges(self) -> tuple[GaugeReading, ...]:
+        """Those of one's own."""
+        return gauge_readings(self.experiment, self.dynamics.t_s, self.nuisance, self.huber)
+
+    @cached_property
     def readings(self) -> tuple[Reading, ...]:
         """All that is measured, the markers first."""
-        return self.markers, *self.sensors
+        return self.markers, *self.sensors, *self.gauges
 
     @cached_property
     def local_loss(self) -> LocalLoss:

@@ -14,6 +14,7 @@ from ..experiment.experiment import Experiment
 from ..experiment.nuisance import Nuisance
 from .channel import Forced
 from .dynamics import Dynamics
+from .gauge import gauge_readings
 from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
@@ -40,6 +41,8 @@ class Trajectory:
     wrenches : tuple of (S, 6)
         What the sensors of the grasps read at their times, [N] and [N m], NaN where that is not
         known.
+    readings : tuple of (S, m)
+        What the experiment's readings of one's own read, of the positions at its samples.
     """
 
     t_s: Array
@@ -48,6 +51,7 @@ class Trajectory:
     markers_m: Array
     reactions: tuple[Grid, Forced]
     wrenches: tuple[Array, ...]
+    readings: tuple[Array, ...] = ()
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
@@ -130,7 +134,25 @@ def simulate(
         sensor.of_forced(forced, np.zeros(ideal.size))
         for sensor in wrench_readings(experiment, at, ideal)
     )
-    return Trajectory(experiment.t_s, positions, v.reshape(shape), markers, (at, forced), wrenches)
+    return Trajectory(
+        experiment.t_s,
+        positions,
+        v.reshape(shape),
+        markers,
+        (at, forced),
+        wrenches,
+        _gauged(experiment, positions, ideal),
+    )
+
+
+def _gauged(experiment: Experiment, positions_m: Array, ideal: NuisanceMap) -> tuple[Array, ...]:
+    """What its gauges read of the body's positions at the samples, nothing of them unknown."""
+    none, found = np.zeros(ideal.size), []
+    for reading in gauge_readings(experiment, experiment.t_s, ideal):
+        read = reading.of_samples(positions_m, experiment.t_s, none)
+        shape = len(read), -1
+        found.append(read.reshape(shape)[:, : reading.gauge.measured.shape[1]])
+    return tuple(found)
 
 
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
@@ -140,6 +162,12 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
         sensor = grasp.wrench and replace(grasp.wrench, values=next(found))
         grasps.append(replace(grasp, wrench=sensor))
     return replace(experiment, grasps=grasps)
+
+
+def with_readings(experiment: Experiment, readings: Sequence[ArrayLike]) -> Experiment:
+    """The same experiment with other values (S, m) of its readings of one's own."""
+    pairs = zip(experiment.readings, readings, strict=True)
+    return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:

@@ -1,0 +1,166 @@
+"""Readings of one's own: an accelerometer in the body, a strain gauge between two points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems_small import GUESS, IDEAL, TRUTH, hung_cube
+from test_collocation import assert_derivatives
+from test_static import HANGING, block
+from test_wrench import assert_slopes
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.experiment import Experiment, Gauge, Look, Markers
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.explicit import made_explicit
+from collocation_sysid.nlp.simulation import simulate, with_markers, with_readings
+from collocation_sysid.problem import Problem
+from collocation_sysid.run import run
+
+LOW_M = [[0.05, 0.05, 0.01]]
+ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
+
+
+def specific_force(at: Look, bias_m_s2):
+    """Three axes of the world, its bias along z not known."""
+    return at.acceleration_m_s2[:, 0] + ca.vertcat(0, 0, 9.81 + bias_m_s2)
+
+
+def strain(at: Look, scale):
+    """Of the way between two points, with a factor that is not known."""
+    way = at.position_m[:, 1] - at.position_m[:, 0]
+    return (1 + scale) * (ca.norm_2(way) / 0.06 - 1)
+
+
+def accelerometer(t_s: np.ndarray, **changes) -> Gauge:
+    given = {"sigma": 0.05, "points_m": LOW_M, "unknowns": {"bias_m_s2": 0.5}} | changes
+    return Gauge("accelerometer", specific_force, t_s, np.zeros((len(t_s), 3)), **given)
+
+
+def strain_gauge(t_s: np.ndarray) -> Gauge:
+    return Gauge("foil", strain, t_s, np.zeros(len(t_s)), 1e-4, ENDS_M, {"scale": 0.05})
+
+
+def instrumented(experiment: Experiment, *gauges: Gauge) -> Experiment:
+    return replace(experiment, readings=gauges)
+
+
+def swung(steps: int = 24) -> Experiment:
+    """The cube in a hand, with an accelerometer of its own clock and a foil; no marker sees it."""
+    cube = replace(hung_cube(steps), nuisance=IDEAL)
+    inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
+    gauges = accelerometer(inner), strain_gauge(cube.t_s[::2])
+    made = replace(cube, markers=Markers.none(cube.t_s), readings=gauges)
+    accelerations, strains = simulate(made, TRUTH, "midpoint").readings
+    return with_readings(made, [accelerations + np.array([0, 0, 0.3]), 1.04 * strains])
+
+
+def noisy(experiment: Experiment) -> Experiment:
+    rng = np.random.default_rng(0)
+    read = [
+        np.where(rng.random(g.measured.shape) < 0.1, np.nan, 3 * g.sigma * rng.normal(size=(1,)))
+        + g.measured
+        for g in experiment.readings
+    ]
+    return with_readings(experiment, read)
+
+
+def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
+    cube = replace(hung_cube(20), nuisance=IDEAL)
+    top = cube.grasps[0].nodes[0]
+    at_top = accelerometer(cube.t_s, points_m=cube.body.nodes_m[[top]])
+    (found,) = simulate(instrumented(cube, at_top), TRUTH, "midpoint").readings
+    carried = cube.grasps[0].carry(cube.body.nodes_m, np.linspace(0, cube.t_s[-1], 2001))[:, 0]
+    expected = np.gradient(np.gradient(carried, axis=0), axis=0)[::100] / (cube.t_s[-1] / 2000) ** 2
+    inside = slice(3, -3)
+    error = np.abs(found - expected - [0, 0, 9.81])[inside].max()
+    assert error < 0.05 * np.abs(expected[inside]).max()
+
+
+@pytest.mark.parametrize("huber", [None, 1e3])
+def test_derivatives_of_a_program_with_readings_of_ones_own(huber: float | None, rng):
+    made = with_markers(hung_cube(7, (1, 1, 2)), hung_cube(7, (1, 1, 2)).markers.positions_m)
+    made = instrumented(made, accelerometer(made.t_s[2:]), strain_gauge(made.t_s))
+    # So that what is known of the markers is not drowned.
+    blunt = [replace(gauge, sigma=100 * gauge.sigma) for gauge in noisy(made).readings]
+    collocation = Collocation([replace(made, readings=blunt)], GUESS, huber=huber)
+    assert made_explicit(collocation) is collocation
+    assert_derivatives(collocation, rng)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "huber"), [("midpoint", None), ("bdf2", None), ("midpoint", 2.0)]
+)
+def test_slopes_of_them_forward_and_backward(scheme: str, huber: float | None):
+    assert_slopes(Collocation([noisy(swung(12))], GUESS, scheme, huber=huber))
+
+
+@pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
+def test_the_truth_is_found_from_an_accelerometer_and_a_foil_alone(method):
+    solution = method(Collocation([swung()], GUESS))
+    (part,) = solution.collocation.parts(solution.z)
+    found = part.phi * part.segment.nuisance.scales
+    np.testing.assert_allclose(found, [0.3, 0.04], atol=0.02)
+    for name in ("lambda_pa", "mu_pa"):
+        assert solution.parameters[name] == pytest.approx(TRUTH[name], rel=0.05)
+
+
+def test_a_static_experiment_is_read_too():
+    static = replace(block("xyz", gravity_m_s2=HANGING), nuisance=IDEAL)
+    low, high = static.body.nodes_m.min(axis=0), static.body.nodes_m.max(axis=0)
+    ends = [(low + high) / 2, [*((low + high) / 2)[:2], high[2]]]
+    foil = replace(strain_gauge(static.t_s), points_m=ends)
+    (found,) = simulate(instrumented(static, foil), TRUTH).readings
+    positions = simulate(static, TRUTH).positions_m
+    assert np.ptp(found) > 0
+    assert len(found) == len(positions)
+
+
+def test_error_bars_and_verdict_know_them():
+    made = noisy(swung())
+    finished = run(Problem([made], GUESS), seek_causes=False)
+    assert finished.uncertainty is not None
+    names = list(finished.uncertainty.nuisance)
+    assert names == [
+        f"{made.name}: bias of accelerometer [m/s²]",
+        f"{made.name}: scale of foil [1]",
+    ]
+    assert 0 < finished.uncertainty.nuisance[names[0]] < 1
+    assert finished.trust is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sigma": 0.0}, "sigma of the reading 'accelerometer' is 0; expected more than 0"),
+        ({"unknowns": {"bias_m_s2": -1.0}}, "bias_m_s2 of the reading 'accelerometer' is -1"),
+        ({"points_m": [[0.0, 0.0]]}, "points_m of the reading 'accelerometer'"),
+        ({"values": np.full((9, 3), np.nan)}, "has no sample"),
+        ({"t_s": np.zeros(9)}, "of the reading 'accelerometer'"),
+    ],
+)
+def test_what_a_reading_lacks_is_said(changes: dict, words: str):
+    good = accelerometer(0.01 * np.arange(9))
+    with pytest.raises(InputError, match=words):
+        replace(good, **changes)
+
+
+def test_an_expression_of_another_length_than_the_values_is_refused():
+    cube = replace(hung_cube(9), nuisance=IDEAL)
+    wrong = replace(accelerometer(cube.t_s), values=np.zeros((len(cube.t_s), 2)))
+    with pytest.raises(InputError, match="gives 3 numbers; expected 2"):
+        simulate(instrumented(cube, wrong), TRUTH, "midpoint")
+
+
+def test_a_reading_of_another_time_or_place_is_refused():
+    cube = hung_cube(9)
+    with pytest.raises(InputError, match="accelerometer"):
+        instrumented(cube, accelerometer(cube.t_s + 100))
+    far = instrumented(cube, accelerometer(cube.t_s, points_m=[[1.0, 0, 0]]))
+    with pytest.raises(InputError, match="accelerometer 1"):
+        simulate(far, TRUTH, "midpoint")
