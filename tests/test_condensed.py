@@ -19,7 +19,6 @@ from collocation_sysid.methods.condensed import Condensed, condensed
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import made_explicit
 from collocation_sysid.nlp.parameters import Parameters
 
 DEFAULT, ON_TIME = Nuisance(), Nuisance(time_shift_s=None)
@@ -61,7 +60,7 @@ CASES: dict[str, Callable[[Nuisance], tuple[list[Experiment], Parameters]]] = {
 def made(name: str, nuisance: Nuisance) -> tuple[Collocation, Collocation, Condensed]:
     """A collocation, all that follows as variables, and without held dofs."""
     collocation = Collocation(*CASES[name](nuisance))
-    whole = made_explicit(collocation)
+    whole = collocation.made_explicit()
     program = condensed(whole)
     assert isinstance(program, Condensed)
     return collocation, whole, program

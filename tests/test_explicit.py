@@ -19,12 +19,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import (
-    Explicit,
-    carried_over,
-    made_explicit,
-)
+from collocation_sysid.nlp.collocation import Collocation, carried_over
 
 KINDS = {
     "relaxed": ("hung-cube", {}),
@@ -71,13 +66,13 @@ def fitted(branches: int, steps: int, noise_m: float = 0.0) -> Collocation:
     return Collocation([with_markers(experiment, tracks + noise)], guesses(truth(branches), 1.2))
 
 
-def explicit(collocation: Collocation) -> Explicit:
-    found = made_explicit(collocation)
-    assert isinstance(found, Explicit)
+def explicit(collocation: Collocation) -> Collocation:
+    found = collocation.made_explicit()
+    assert found.explicit
     return found
 
 
-def some_point(program: Explicit, rng: np.random.Generator) -> np.ndarray:
+def some_point(program: Collocation, rng: np.random.Generator) -> np.ndarray:
     """Variables that satisfy nothing, the recursion of the memory neither."""
     positions = []
     for segment in program.segments:
@@ -89,12 +84,12 @@ def some_point(program: Explicit, rng: np.random.Generator) -> np.ndarray:
     lags = np.array(["lag of" in name for name in program.names])
     p[lags] = np.abs(p[lags]) + 0.1
     z = program.pack(p, positions)
-    for memory in program.additions:
+    for memory in program.carried:
         z[memory.variables] += 0.01 * rng.normal(size=memory.count)
     return z
 
 
-def assert_derivatives(program: Explicit, rng: np.random.Generator) -> None:
+def assert_derivatives(program: Collocation, rng: np.random.Generator) -> None:
     z, y = some_point(program, rng), rng.normal(size=program.constraints)
 
     def slope(at: np.ndarray) -> np.ndarray:
@@ -103,7 +98,7 @@ def assert_derivatives(program: Explicit, rng: np.random.Generator) -> None:
     jacobian, hessian = program.jacobian(z), program.hessian(z, 1.3, y)
     of_m, of_q = np.zeros(len(z)), np.zeros(len(z))
     of_q[: program.nq] = 0.1
-    for memory in program.additions:
+    for memory in program.carried:
         of_m[memory.variables] = 0.1
     for scale in (0.1, of_q, of_m):  # some columns would drown among the others
         values = program.constraint_values
@@ -139,7 +134,7 @@ def test_the_recursion_holds_where_the_memory_follows_from_the_motion():
         rows[: collocation.constraints], collocation.constraint_values(given), atol=1e-12
     )
     np.testing.assert_allclose(carried_over(z, program, collocation), given, rtol=1e-14)
-    assert made_explicit(Collocation([hung_cube(3)], GUESS)).variables < len(z)
+    assert Collocation([hung_cube(3)], GUESS).made_explicit().variables < len(z)
 
 
 # What methods find ------------------------------------------------------------------------------

@@ -21,8 +21,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import carried_over
+from collocation_sysid.nlp.collocation import Collocation, carried_over
 from collocation_sysid.nlp.parameters import Parameters, Unknown
 from collocation_sysid.nlp.reaction_rows import Reactions
 from collocation_sysid.nlp.simulation import simulate, with_markers

@@ -19,7 +19,6 @@ from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.fem.refinement import refined
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import made_explicit
 from collocation_sysid.nlp.forces import Forces
 from collocation_sysid.nlp.simulation import simulate, with_markers
 
@@ -75,7 +74,7 @@ def test_so_have_those_of_a_body_with_memory(rng):
     experiment = in_fluid(4, law=smooth_drag, prony=["prony_1"])
     memory = cs.Parameters.of({"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)})
     known = cs.Parameters((*parameters(DRAG).items, *memory.items))
-    program = made_explicit(Collocation([experiment], known))
+    program = Collocation([experiment], known).made_explicit()
     z = program.plain.pack(program.guess_p, [seen_rows(s) for s in program.segments])
     z = program.pack(*program.plain.unpack(z))
     y = rng.normal(size=program.constraints)

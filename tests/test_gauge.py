@@ -17,7 +17,6 @@ from collocation_sysid.experiment import Experiment, Gauge, Look, Markers
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import made_explicit
 from collocation_sysid.nlp.simulation import simulate, with_markers, with_readings
 from collocation_sysid.problem import Problem
 from collocation_sysid.run import run
@@ -89,7 +88,7 @@ def test_derivatives_of_a_program_with_readings_of_ones_own(huber: float | None,
     # So that what is known of the markers is not drowned.
     blunt = [replace(gauge, sigma=100 * gauge.sigma) for gauge in noisy(made).readings]
     collocation = Collocation([replace(made, readings=blunt)], GUESS, huber=huber)
-    assert made_explicit(collocation) is collocation
+    assert collocation.made_explicit() is collocation
     assert_derivatives(collocation, rng)
 
 

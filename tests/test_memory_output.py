@@ -16,7 +16,6 @@ from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import Explicit, made_explicit
 from collocation_sysid.nlp.overstress import Overstress
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.estimates import Estimate
@@ -119,8 +118,8 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     MEMORY(tiny)
     problem = Problem.read(tiny / "problem.toml", [GUESSED])
     findings = check_problem(problem)
-    program = made_explicit(problem.collocation())
-    assert isinstance(program, Explicit)
+    program = problem.collocation().made_explicit()
+    assert program.explicit
     assert findings.overstresses == program.added(Overstress)
     assert findings.variables + findings.overstresses == program.variables
     assert findings.constraints + findings.overstresses == program.constraints

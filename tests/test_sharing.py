@@ -29,7 +29,6 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Markers, Nuisance
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import made_explicit
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.problem import Problem
 from collocation_sysid.run import solve
@@ -73,7 +72,7 @@ def test_derivatives_with_wrenches_and_sensors_that_are_shared(rng):
     one = wristed_cube(4, nuisance)
     names = "tare", "sensor_time_s", "sensor_lag_s", "tool_kg", "tool_m", "gravity_rad"
     pair = [sharing(each, *names) for each in (one, swung_again(one, "second"))]
-    program = made_explicit(Collocation(pair, GUESS))
+    program = Collocation(pair, GUESS).made_explicit()
     assert len({name for name in program.names if "tare" in name}) == 6
     test_explicit.assert_derivatives(program, rng)
 

@@ -23,7 +23,6 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.explicit import made_explicit
 from collocation_sysid.nlp.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -169,7 +168,7 @@ def test_check_compares_the_slopes_of_wrenches():
 def test_check_tells_the_variables_that_a_wrench_brings():
     problem = Problem([swung(steps=12)], UNKNOWN)
     collocation = problem.collocation()
-    findings, program = check_problem(problem), made_explicit(collocation)
+    findings, program = check_problem(problem), collocation.made_explicit()
     assert findings.wrenches == program.variables - collocation.variables > 0
     assert findings.hessian_nonzeros == len(program.hessian_structure[1])
 

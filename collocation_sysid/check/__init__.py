@@ -16,7 +16,6 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import SOFT_PA, started, usual_parameters
 from ..methods.start import initial_variables
 from ..nlp.collocation import Collocation
-from ..nlp.explicit import Explicit, made_explicit
 from ..nlp.overstress import Overstress
 from ..nlp.reaction_rows import Reactions
 from ..nlp.schemes import as_scheme
@@ -255,7 +254,7 @@ def _program(
     problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
 ) -> dict[str, Any]:
     """How large the program is, and what methods take for it: fields of `Findings`."""
-    whole = made_explicit(collocation)
+    whole = collocation.made_explicit()
     jacobian, hessian = nonzeros(problem, whole)
     # Reduced space as the file has it, whichever method is chosen.
     named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
@@ -263,12 +262,11 @@ def _program(
     method = problem.method
     name = method if isinstance(method, str) else getattr(method, "name", repr(method))
     counted = costs(collocation, first, first_z, jacobian + hessian, reduced.factorisation)
-    explicit = isinstance(whole, Explicit)
     return {
         "variables": collocation.variables,
         "constraints": collocation.constraints,
-        "overstresses": whole.added(Overstress) if explicit else 0,
-        "wrenches": whole.added(Reactions, WrenchRows) if explicit else 0,
+        "overstresses": whole.added(Overstress),
+        "wrenches": whole.added(Reactions, WrenchRows),
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,

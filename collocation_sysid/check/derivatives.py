@@ -10,8 +10,7 @@ from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..experiment.wrench import Wrench
 from ..experiment.wrench_files import FEWEST
-from ..nlp.collocation import Collocation
-from ..nlp.explicit import Explicit, carried_over, made_explicit
+from ..nlp.collocation import Collocation, carried_over
 from ..problem import Problem
 
 # All kinds of rows are among these samples, those of equilibria among fewer; derivatives do not
@@ -59,12 +58,12 @@ def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Largest relative deviations of J and H along a random direction at a disturbed start."""
     rng, of_given = np.random.default_rng(0), 0.0
-    program = made_explicit(collocation)
-    if isinstance(program, Explicit):
+    program = collocation.made_explicit()
+    if program.explicit:
         of_given = _gradient_error(collocation, z, rng)
         if collocation.remembers:
             of_given = max(of_given, _slopes_error(collocation, z, rng))
-        if sum(program.further_nonzeros) > LAID_OUT:
+        if sum(program.carried_nonzeros) > LAID_OUT:
             return of_given, 0.0
         collocation, z = program, carried_over(z, collocation, program)
     point = z + 1e-3 * rng.normal(size=len(z))

@@ -15,7 +15,6 @@ from ..errors import InputError
 from ..methods.interior_point import InteriorPoint
 from ..methods.reduced_space import ReducedSpace, memory_mb
 from ..nlp.collocation import Collocation
-from ..nlp.explicit import Explicit, made_explicit
 from ..problem import Problem
 from .derivatives import few, first_samples, shortened
 
@@ -42,7 +41,7 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
     if there_mb is None or collocation.variables < SMALL:
         return
     if isinstance(method, InteriorPoint):
-        needed_mb = interior_point_mb(sum(nonzeros(problem, made_explicit(collocation))))
+        needed_mb = interior_point_mb(sum(nonzeros(problem, collocation.made_explicit())))
         fits = memory_mb(collocation) < there_mb
         remedy = 'method = "reduced-space"' if fits else "a coarser mesh or a shorter window_s"
     elif isinstance(method, ReducedSpace):
@@ -88,7 +87,7 @@ def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
 
     `whole` is the problem's program as interior point has it.
     """
-    further = whole.further_nonzeros if isinstance(whole, Explicit) else (0, 0)
+    further = whole.carried_nonzeros
     short = shortened(problem)
     total = least = _counted(short)
     for k, experiment in enumerate(problem.experiments):

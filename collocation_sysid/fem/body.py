@@ -30,7 +30,7 @@ from ..arrays import Array
 from .damping import Damping
 from .discretisation import Discretisation
 from .materials import Energy, Material
-from .memory import Carried
+from .memory import Past
 from .mesh import TetMesh
 from .model import Model, Theta
 from .node_force import NodeForce, PlacedForce
@@ -292,7 +292,7 @@ class Body(Discretisation):
         velocities: ArrayLike,
         theta: Theta,
         tied_kg: Array | None = None,
-        carried: Carried | None = None,
+        carried: Past | None = None,
     ) -> Array:
         """Internal force f(x, v; θ), (T, 3n) [N].
 
@@ -302,7 +302,7 @@ class Body(Discretisation):
         theta : (k,) in the order of `constants`
         tied_kg : (3n,) or (T, 3n), optional
             What γ_m damps besides the body's own mass.
-        carried : Carried, optional
+        carried : Past, optional
             What the states of a body with memory bring from the past; nothing by default.
         """
         x, v = self._states(positions, velocities)
@@ -316,7 +316,7 @@ class Body(Discretisation):
         theta: Theta,
         out: Array | None = None,
         tied_kg: Array | None = None,
-        carried: Carried | None = None,
+        carried: Past | None = None,
     ) -> Linearisation:
         """Internal force and first derivatives at T states, see `Linearisation` and `force`.
 
@@ -342,7 +342,7 @@ class Body(Discretisation):
         self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew)
 
-    def _spread_stiffening(self, by_theta: Array, carried: Carried | None) -> None:
+    def _spread_stiffening(self, by_theta: Array, carried: Past | None) -> None:
         """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""
         for first, columns in self._memory_columns:
             if carried is None:
@@ -366,7 +366,7 @@ class Body(Discretisation):
         theta: Theta,
         out: Array | None = None,
         tied_kg: Array | None = None,
-        carried: Carried | None = None,
+        carried: Past | None = None,
         stress_weights: Array | None = None,
     ) -> Curvature:
         """Second derivatives of wᵀ f + σ·S at T states, see `Curvature` and `force`.

@@ -14,7 +14,7 @@ from ..errors import InputError
 from .batched import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
-from .memory import Carried, PointLayout
+from .memory import Past, PointLayout
 from .mesh import TetMesh
 from .model import Model, Theta
 from .node_force import NodeForce
@@ -185,7 +185,7 @@ class Discretisation(Model):
         fields: Sequence[Array],
         theta: Theta,
         out: Array | None = None,
-        carried: Carried | None = None,
+        carried: Past | None = None,
     ) -> Array:
         if len(theta) != len(self.constants):
             raise InputError(

@@ -31,7 +31,7 @@ from .regions import Part
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class Past:
     """What the points of a body bring from the past into T states.
 
     Attributes
@@ -129,11 +129,11 @@ class PointLayout:
                 own = here.stop
         return found
 
-    def nothing(self, states: int) -> Carried:
+    def nothing(self, states: int) -> Past:
         """What points that have relaxed bring into some states."""
         count = self.constants
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)
-        return Carried(*(np.zeros((states, *size)) for size in sizes))
+        return Past(*(np.zeros((states, *size)) for size in sizes))
 
 
 def fading(share: float, tau_s: float, spacing_s: float) -> tuple[float, float]:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation
-from ..nlp.explicit import carried_over
+from ..nlp.collocation import Collocation, carried_over
 from .recorder import Recorder
 
 HessianValues = Callable[[Array, float, Array, Array], None]

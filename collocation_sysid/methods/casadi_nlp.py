@@ -26,7 +26,6 @@ import numpy as np
 from ..arrays import Array
 from ..checked import Count, Positive
 from ..nlp.collocation import Collocation
-from ..nlp.explicit import made_explicit
 from . import nlpsol
 from .callbacks import HessianValues, NlpFunctions
 from .method import Watch
@@ -87,7 +86,7 @@ class CasadiSolver(Options):
         recorder = Recorder(self.name, collocation, watch, self.max_time_s)
         plugin = self.name.removeprefix(PREFIX)
         with recorder.stopwatch.building():
-            program = made_explicit(collocation)
+            program = collocation.made_explicit()
         settings = _curvature(program, self.hessian), self._settings, self.statuses
         found = nlpsol.solve(recorder, program, start, plugin, *settings)
         status = _judged(found.status, collocation, found.z, found.multipliers)

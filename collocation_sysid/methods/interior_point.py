@@ -12,7 +12,6 @@ from pydantic import BeforeValidator
 from ..arrays import Array
 from ..checked import Count, Finite, NotNegative, Positive, Text, Whole
 from ..nlp.collocation import Collocation
-from ..nlp.explicit import made_explicit
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .condensed import condensed
@@ -124,7 +123,7 @@ class InteriorPoint(Options):
         """
         recorder = Recorder(self.name, collocation, watch)
         with recorder.stopwatch.building():
-            program = condensed(made_explicit(collocation))
+            program = condensed(collocation.made_explicit())
             hessian = _DampedHessian(program, self)
         settings = hessian, self._settings, IPOPT_STATUS
         found = nlpsol.solve(recorder, program, start, "ipopt", *settings)

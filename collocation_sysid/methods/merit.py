@@ -15,8 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..arrays import Array, Index
-from ..nlp.collocation import Collocation
-from ..nlp.explicit import carried_over, made_explicit
+from ..nlp.collocation import Collocation, carried_over
 from ..nlp.stopwatch import Stopwatch
 
 
@@ -44,7 +43,7 @@ class Unconstrained:
         with self.stopwatch.building():
             explicit = collocation.explicit_grasps
             grasped = collocation if explicit else replace(collocation, explicit_grasps=True)
-            self.nlp = made_explicit(grasped)
+            self.nlp = grasped.made_explicit()
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraints, self.nlp.variables)
             self._entries = np.zeros(len(indices))

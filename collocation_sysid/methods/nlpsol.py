@@ -17,8 +17,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..nlp.collocation import Collocation
-from ..nlp.explicit import carried_over
+from ..nlp.collocation import Collocation, carried_over
 from ..starting import LEFT
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .condensed import whole_multipliers

@@ -13,7 +13,8 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
                    experiment, what several share with the first of them, see `nlp.sharing`
 =================  =========================================================================
 
-The memory of bodies follows from them, or is among them, see `nlp.explicit`.
+What bodies carry and what grasps give follows from these, or stands behind them with equations
+behind all others, see `Collocation.explicit`.
 
 Constraints g, in this order:
 
@@ -39,16 +40,20 @@ import scipy.sparse as sp
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..experiment.experiment import Experiment
-from ..fem.body import Linearisation
-from .channel import Motion
+from .carried import Carried, Places
 from .charts import Chart
 from .entries import Entries
+from .explicit import carried_by
 from .parameters import Parameters
+from .part import Part
 from .schemes import Scheme
 from .segment import First, Segment, Weights
-from .sensing import Sensing
-from .setting import Setting
 from .sharing import locals_of, shared_charts
+
+
+def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
+    """Variables of a program as the same one has them that is explicit, or is not."""
+    return z if of.variables == to.variables else to.pack(*of.unpack(z))
 
 
 @dataclass(frozen=True)
@@ -66,100 +71,6 @@ class Violation:
             f"{self.experiment}: t = {self.time_s:.4g} s, node {self.node}, {self.axis}: "
             f"{self.newtons:+.3g} N"
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """One experiment at a point of the NLP.
-
-    Attributes
-    ----------
-    segment : Segment
-    q : (nq,) shared parameters
-    phi : (k,) its nuisance parameters
-    x : (N, 3n) positions [m], or its first rows
-    brought : (N, …) or None
-        What the evaluations bring from the past, where it is given; see `Dynamics`.
-    given : mapping
-        Of readings, by their numbers, what they look at where that does not follow from x.
-    bent : bool
-        Whether readings are, or taken as linear in second derivatives.
-    """
-
-    segment: Segment
-    q: Array
-    phi: Array
-    x: Array
-    brought: Array | None = None
-    given: Mapping[int, Array] = field(default_factory=dict)
-    bent: bool = True
-
-    @cached_property
-    def setting(self) -> Setting:
-        """The physical parameters."""
-        found = self.segment.setting(self.q, self.phi)
-        if self.brought is None:
-            return found
-        return replace(found, dynamics=replace(found.dynamics, brought=self.brought))
-
-    @cached_property
-    def sensing(self) -> Sensing:
-        """What is looked at."""
-        return Sensing(self.segment, self.setting, self.phi)
-
-    @cached_property
-    def motion(self) -> Motion:
-        """What channels look at."""
-        return self.sensing.motion(self.x)
-
-    @cached_property
-    def looked(self) -> list[Array]:
-        """Of each reading what it looks at (n, e, 3)."""
-        return [
-            self.given[k] if k in self.given else reading.channel.values(self.motion, self.phi)
-            for k, reading in enumerate(self.segment.readings)
-        ]
-
-    @property
-    def loss(self) -> float:
-        """Of all readings, without priors."""
-        pairs = zip(self.segment.readings, self.looked, strict=True)
-        return sum(reading.loss(looked, self.phi) for reading, looked in pairs)
-
-    @cached_property
-    def loss_slopes(self) -> list[tuple[Array, Array]]:
-        """Of each reading ∂loss by what it looks at (n, e, 3), and by its φ (k,)."""
-        pairs = zip(self.segment.readings, self.looked, strict=True)
-        return [reading.loss_slopes(looked, self.phi) for reading, looked in pairs]
-
-    def gradient(self) -> tuple[Array, Array]:
-        """∂loss/∂x (N, 3n) and ∂loss/∂(q, φ) (nq + k,), at what is given."""
-        nq, phi = self.segment.nq, self.phi
-        by_x, by_p, by_reaction = np.zeros_like(self.x), np.zeros(nq + len(phi)), None
-        pairs = zip(self.segment.readings, self.loss_slopes, strict=True)
-        for k, (reading, (by_looked, by_phi)) in enumerate(pairs):
-            by_p[nq:] += by_phi
-            if k not in self.given:
-                pulled = reading.channel.pulled(self.motion, phi, by_looked)
-                by_x, by_p[nq:] = by_x + pulled.by_x, by_p[nq:] + pulled.by_phi
-                if pulled.by_reaction is not None:
-                    by_reaction = pulled.by_reaction + (0.0 if by_reaction is None else by_reaction)
-        if by_reaction is not None:
-            through_x, through_p = self.sensing.pulled(self.x, by_reaction)
-            by_x += through_x
-            by_p[self.segment.moving] += through_p
-        return by_x, by_p
-
-    @cached_property
-    def forces(self) -> Linearisation:
-        """Those of the evaluations with their slopes, valid until others are formed."""
-        rows = self.segment.linearisation_rows
-        return self.setting.dynamics.linearise(self.x, self.setting.theta, rows)
-
-    @property
-    def residual_n(self) -> Array:
-        """(N, free dofs) violation of the equations of motion in newtons."""
-        return self.segment.residual_n(self.x, self.setting)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +92,12 @@ class Collocation:
     charts : mapping of experiment name to Chart
         Where recordings are read, see `charts`; where their markers start by default, and where
         one is not of the experiment's body and places.
+    explicit : bool, default False
+        Whether what follows row by row are variables with equations of their own, see `carried`:
+        the memory of bodies, without which ∂g/∂z would be filled below the diagonal, and measured
+        wrenches, without which the loss would be one of all that moves around grasps. Matrices are
+        sparse then, and exact; eliminating it all leads back, with the same optimum and the same
+        multipliers of the other rows.
 
     Raises
     ------
@@ -195,6 +112,7 @@ class Collocation:
     explicit_grasps: bool = False
     huber: float | None = None
     charts: Mapping[str, Chart] = field(default_factory=dict)
+    explicit: bool = False
 
     def __post_init__(self) -> None:
         if all(experiment.validation for experiment in self.experiments):
@@ -222,6 +140,22 @@ class Collocation:
             found.append(Segment(experiment, self.parameters, *grid, *options, *here))
         return _read_alike(found, [segment.chart for segment in found])
 
+    @cached_property
+    def carried(self) -> tuple[Carried, ...]:
+        """What is among the variables behind all others, experiment by experiment."""
+        if not self.explicit:
+            return ()
+        last = self.segments[-1].after
+        return carried_by(self.segments, self.of_phi.start, Places(self.of_phi.stop, last.row))
+
+    def made_explicit(self) -> Collocation:
+        """The same program with `explicit`; itself where nothing is carried or measured so."""
+        if self.explicit or not (self.remembers or any(s.sensors for s in self.segments)):
+            return self
+        other = replace(self, explicit=True)
+        vars(other)["segments"] = self.segments
+        return other
+
     @property
     def nq(self) -> int:
         """Number of the shared parameters q."""
@@ -235,12 +169,22 @@ class Collocation:
     @property
     def variables(self) -> int:
         """Length of z."""
-        return self.segments[-1].after.x + self.nphi
+        return self.of_phi.stop + self.added(Carried)
 
     @property
     def constraints(self) -> int:
         """Length of g."""
-        return self.segments[-1].after.row
+        return self.segments[-1].after.row + self.added(Carried)
+
+    def added(self, *kinds: type[Carried]) -> int:
+        """Number of the variables of some kinds of what is carried, and of their equations."""
+        return sum(each.count for each in self.carried if isinstance(each, kinds))
+
+    @property
+    def carried_nonzeros(self) -> tuple[int, int]:
+        """Entries that Jacobian and Hessian have for what is carried."""
+        both = [each.nonzeros for each in self.carried]
+        return sum(each for each, _ in both), sum(each for _, each in both)
 
     @property
     def measurements(self) -> int:
@@ -258,8 +202,14 @@ class Collocation:
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         """Variables z from p = (q, φ_1, φ_2, …) and each experiment's positions (N, 3n) [m]."""
-        parts = self.parts_at(p, positions)
-        scaled = [np.ravel(part.x) / part.segment.length_m for part in parts]
+        parts = self.parts_at(p, positions) if self.carried else []
+        following = [each.following(parts[each.number]) for each in self.carried]
+        return np.concatenate([self._packed(p, positions), *following])
+
+    def _packed(self, p: Array, positions: Sequence[Array]) -> Array:
+        """Without what is carried."""
+        pairs = zip(self.segments, positions, strict=True)
+        scaled = [np.ravel(x) / segment.length_m for segment, x in pairs]
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
@@ -281,7 +231,10 @@ class Collocation:
 
     def parts(self, z: Array) -> list[Part]:
         """Every experiment at z."""
-        return self.parts_at(*self.unpack(z))
+        parts = self.parts_at(*self.unpack(z))
+        for each in self.carried:
+            parts[each.number] = each.given(parts[each.number], z)
+        return parts
 
     @cached_property
     def places(self) -> list[Index]:
@@ -360,7 +313,7 @@ class Collocation:
         segments = _read_alike(self.segments, charts)
         by_name = {s.experiment.name: s.chart for s in segments}
         vars(other).update(charts=by_name, segments=segments)
-        for stale in ("_hessian", "hessian_diagonals"):
+        for stale in ("_hessian", "hessian_diagonals", "carried"):
             vars(other).pop(stale, None)
         return other, moved
 
@@ -385,7 +338,11 @@ class Collocation:
         """Lower and upper bounds of z; equal for what is given."""
         lower, upper = self.bounds_p
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        return self.pack(lower, lows), self.pack(upper, highs)
+        free = np.full(self.added(Carried), np.inf)
+        return (
+            np.concatenate([self._packed(lower, lows), -free]),
+            np.concatenate([self._packed(upper, highs), free]),
+        )
 
     # Objective --------------------------------------------------------------------------------
 
@@ -397,25 +354,24 @@ class Collocation:
 
     def gradient(self, z: Array) -> Array:
         """∂objective/∂z."""
-        return self.gradient_of(self.parts(z), self.parameters_of(z))
-
-    def gradient_of(self, parts: Sequence[Part], p: Array) -> Array:
-        """The same where the experiments are."""
-        residuals, slopes = self.prior(p)
+        parts = self.parts(z)
+        residuals, slopes = self.prior(self.parameters_of(z))
         by_p, by_x = 2 * residuals * slopes, []
         for part in parts:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
             by_p[part.segment.places] += of_p
-        return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :]])
+        further = [each.gradient(parts[each.number]) for each in self.carried]
+        return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :], *further])
 
     # Constraints ------------------------------------------------------------------------------
 
     def constraint_values(self, z: Array) -> Array:
         """g, scaled."""
-        return np.concatenate(
-            [part.segment.constraint_values(part.x, part.setting) for part in self.parts(z)]
-        )
+        parts = self.parts(z)
+        rows = [part.segment.constraint_values(part.x, part.setting) for part in parts]
+        further = [each.values(parts[each.number], z) for each in self.carried]
+        return np.concatenate([*rows, *further])
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
@@ -424,9 +380,9 @@ class Collocation:
 
     @cached_property
     def _jacobian(self) -> Entries:
-        """The columns of q and x, and of each experiment those of its φ."""
-        dense = np.arange(self.nq + 1) * self.constraints
-        indptr, indices = [dense], [np.tile(np.arange(self.constraints), self.nq)]
+        """The columns of q and x, of each experiment those of its φ, and what is carried."""
+        own = self.segments[-1].after.row
+        indptr, indices = [np.arange(self.nq + 1) * own], [np.tile(np.arange(own), self.nq)]
         of_phi = []
         for segment in self.segments:
             indptr.append(indptr[-1][-1] + segment.jacobian.indptr[1:])
@@ -436,7 +392,8 @@ class Collocation:
             columns = self.of_phi.start + np.repeat(moving, len(rows))
             of_phi.append((np.tile(rows, len(moving)), columns))
         structure = np.concatenate(indptr), np.concatenate(indices)
-        return Entries.of(structure, (self.constraints, self.variables), of_phi)
+        further = [each.jacobian_entries() for each in self.carried]
+        return Entries.of(structure, (self.constraints, self.variables), of_phi + further)
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_structure`."""
@@ -444,24 +401,21 @@ class Collocation:
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
-        return self.linearised(self.parts(z), out)
-
-    def linearised(self, parts: Sequence[Part], out: Array | None = None) -> tuple[Array, Array]:
-        """The same where the experiments are, at the memory as it is."""
-        count = self.nq * self.constraints + sum(s.jacobian.nnz for s in self.segments)
+        parts, height = self.parts(z), self.segments[-1].after.row
+        count = self.nq * height + sum(s.jacobian.nnz for s in self.segments)
         values, own = self._jacobian.values(out, count)
-        columns = own[: self.nq * self.constraints].reshape(self.nq, self.constraints)
-        rows, by_phi = np.empty(self.constraints), []
-        used = columns.size
+        columns = own[: self.nq * height].reshape(self.nq, height)
+        rows, further, used = np.empty(height), [], columns.size
         for part in parts:
             segment = part.segment
             here = own[used : used + segment.jacobian.nnz]
             found, by_p = segment.constraints_and_jacobian(part.x, part.setting, part.forces, here)
             rows[segment.rows], columns[:, segment.rows] = found, by_p[:, : self.nq].T
-            by_phi.append(by_p[:, self.nq :].T.ravel())
+            further.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
-        self._jacobian.fill(values, own, by_phi)
-        return rows, values
+        added = [each.jacobian_values(parts[each.number], z) for each in self.carried]
+        self._jacobian.fill(values, own, further + [entries for _, entries in added])
+        return np.concatenate([rows, *(equations for equations, _ in added)]), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
         """∂g/∂z as a sparse matrix; of bodies with memory, at the memory as it is."""
@@ -471,8 +425,8 @@ class Collocation:
 
     @property
     def remembers(self) -> bool:
-        """Whether any body has a memory: then ∂g/∂z has more than `jacobian` holds."""
-        return any(segment.body.remembers for segment in self.segments)
+        """Whether a memory is not in z: then ∂g/∂z has more than `jacobian` holds."""
+        return not self.explicit and any(segment.body.remembers for segment in self.segments)
 
     def pulled_back(self, z: Array, multipliers: Array) -> Array:
         """(∂g/∂z)ᵀ multipliers, through the memory of bodies too."""
@@ -503,6 +457,7 @@ class Collocation:
             shift = np.where(segment.hessian.indices < self.nq, 0, segment.first.x - self.nq)
             indices.append(segment.hessian.indices + shift)
             further += segment.further_entries(self.of_phi.start)
+        further += [each.hessian_entries() for each in self.carried]
         structure = np.concatenate(indptr), np.concatenate(indices)
         return Entries.of(structure, (self.variables, self.variables), further)
 
@@ -524,40 +479,27 @@ class Collocation:
         Without multipliers Gauss–Newton's: readings and constraints count as linear. That is
         convex, which the loss itself is not where residuals are large: places and motions multiply.
         """
-        parts, multipliers = self.bending(z, multipliers)
-        weights = [segment.weights(multipliers[segment.rows]) for segment in self.segments]
-        return self.curved(parts, loss_weight, weights, out)
-
-    def bending(self, z: Array, multipliers: Array | None) -> tuple[list[Part], Array]:
-        """The experiments and multipliers of `hessian_values`."""
         bent = multipliers is not None
         parts = [replace(part, bent=bent) for part in self.parts(z)]
-        return parts, multipliers if multipliers is not None else np.zeros(self.constraints)
-
-    def curved(
-        self,
-        parts: Sequence[Part],
-        loss_weight: float,
-        weights: Sequence[Weights],
-        out: Array | None = None,
-        memory_weights: Mapping[int, Sequence[Array]] | None = None,
-    ) -> Array:
-        """The same where the experiments are, at the memory as it is.
-
-        With weights of the memory's equations, by the number of the experiment, see `Segment`.
-        """
+        multipliers = np.zeros(self.constraints) if multipliers is None else multipliers
         used = self.nq * (self.nq + 1) // 2
         count = used + sum(segment.hessian.nnz for segment in self.segments)
         values, own = self._hessian.values(out, count)
-        by_q, further = np.zeros((self.nq, self.nq)), list[Array]()
+        by_q, further, weights = np.zeros((self.nq, self.nq)), list[Array](), list[Weights]()
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
             segment = part.segment
             here = own[used : used + segment.hessian.nnz]
-            of_memory = (memory_weights or {}).get(number, ())
+            mine = [each for each in self.carried if each.number == number]
+            of_rows = sum((each.row_weights(multipliers) for each in mine), start=0.0)
+            weights.append(segment.weights(multipliers[segment.rows], of_rows))
+            of_memory = [mu for each in mine for mu in each.memory_weights(multipliers)]
             at = part.x, part.phi, part.setting, weights[number], weight
-            found, more = segment.hessian_values(*at, here, of_memory, part.bent)
+            found, more = segment.hessian_values(*at, here, of_memory, bent)
             by_q, further, used = by_q + found, further + more, used + len(here)
+        for each in self.carried:
+            at = parts[each.number], z, weight, multipliers, weights[each.number]
+            further.append(each.hessian_values(*at))
         _, slopes = self.parameters.prior(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
@@ -565,10 +507,6 @@ class Collocation:
         own[: len(rows)] = by_q[rows[order], columns[order]]
         self._hessian.fill(values, own, further)
         return values
-
-    def hessian_phi(self, number: int) -> Index:
-        """Places in the values of the Hessian of an experiment's φ by φ, `np.triu_indices`."""
-        return self._hessian.places[4 * number + 3]
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Largest violation of the first-order conditions of the whole NLP, in its scaling.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Linearisation
-from ..fem.memory import Carried
+from ..fem.memory import Past
 from ..fem.pattern import SymmetricPattern
 from .forces import Forces
 from .memory import History, Recursion, recursions_of
@@ -202,7 +202,7 @@ class Dynamics:
         """How each branch of the memory fades over all evaluations."""
         return recursions_of(self.body, theta, self.until_next_s, self.loaded_since_s)
 
-    def carried(self, history: History | None, rows: slice | None = None) -> Carried | None:
+    def carried(self, history: History | None, rows: slice | None = None) -> Past | None:
         """What rows `first_row`…, or some, bring from the past."""
         rows = slice(self.first_row, self.rows) if rows is None else rows
         return None if history is None else history.carried(rows)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, Index
 from ..experiment.experiment import Experiment
 from ..fem.body import Body, Curvature, Linearisation
-from ..fem.memory import Carried
+from ..fem.memory import Past
 from ..fem.model import Theta
 from ..fem.pattern import Joined, SymmetricPattern
 from .force_term import ForceTerm, Places, States
@@ -134,7 +134,7 @@ class Forces:
         """(T, 3n) those that do not depend on the state: weight, and forces on nodes."""
         return self.weight.force(States(np.zeros(0), np.zeros(0), np.asarray(theta)))
 
-    def total(self, xi: Array, nu: Array, theta: Theta, carried: Carried | None = None) -> Array:
+    def total(self, xi: Array, nu: Array, theta: Theta, carried: Past | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
         found = self.body.force(xi, nu, theta, self.mass.tied, carried)
         states = self._states(xi, nu, theta)
@@ -148,7 +148,7 @@ class Forces:
         nu: Array,
         theta: Theta,
         out: Array | None = None,
-        carried: Carried | None = None,
+        carried: Past | None = None,
     ) -> Linearisation:
         """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
         at = self.body.linearise(xi, nu, theta, out, self.mass.tied, carried)
@@ -178,7 +178,7 @@ class Forces:
         weights: Array,
         theta: Theta,
         out: Array | None = None,
-        carried: Carried | None = None,
+        carried: Past | None = None,
         stress_weights: Array | None = None,
     ) -> Curvature:
         """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""

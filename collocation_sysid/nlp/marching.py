@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..experiment.experiment import Experiment
-from ..fem.memory import Carried
+from ..fem.memory import Past
 from .dynamics import Dynamics
 from .lapack import one_blas_thread
 from .newton import (
@@ -149,7 +149,7 @@ class RowEquations:
         x: Array,
         forces: Array,
         t: int,
-        carried: Carried | None = None,
+        carried: Past | None = None,
     ) -> None:
         self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t, theta)
         self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..fem.body import Body, Curvature
-from ..fem.memory import Branch, Carried, fading
+from ..fem.memory import Branch, Past, fading
 from .generated import Generated
 
 # Stress slopes of so many evaluations are kept at a time.
@@ -145,7 +145,7 @@ class History:
             brought.append(m)
         return cls(body, theta, xi, stress, tuple(recursions), tuple(brought))
 
-    def carried(self, rows: slice) -> Carried:
+    def carried(self, rows: slice) -> Past:
         """What some of the evaluations bring from the past."""
         found = self.body.memory.nothing(len(self.xi[rows]))
         for r, m in zip(self.recursions, self.brought, strict=True):
@@ -269,14 +269,14 @@ class Remembered:
         return History.of(body, x[None], theta, np.ones(1), loaded_s).last
 
     @property
-    def now(self) -> Carried:
+    def now(self) -> Past:
         """What this very state bears beside S."""
         found = self.body.memory.nothing(1)
         for branch, overstress in zip(self.branches, self.overstress, strict=True):
             found.overstress[0, branch.points] += overstress
         return found
 
-    def ahead(self, interval_s: float) -> Carried:
+    def ahead(self, interval_s: float) -> Past:
         """What a state after an interval brings from this one."""
         found = self.body.memory.nothing(1)
         for branch, overstress in zip(self.branches, self.overstress, strict=True):
@@ -299,7 +299,7 @@ class Remembered:
         return fading(self.theta[branch.share], self.theta[branch.tau], interval_s)
 
 
-def start_carried(body: Body, theta: Array, loaded_s: float) -> Carried | None:
+def start_carried(body: Body, theta: Array, loaded_s: float) -> Past | None:
     """What the start shape bears beside S, where a load has not been there for long."""
     if not body.remembers or np.isinf(loaded_s):
         return None

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..fem.memory import Branch
-from .addition import Addition
-from .collocation import Part
+from .carried import Carried
 from .memory import CHUNK, History
+from .part import Part
 from .reaction_rows import Reactions
 from .segment import Weights
 from .setting import Setting
@@ -61,7 +61,7 @@ class _Moved:
 
 
 @dataclass(frozen=True, eq=False)
-class Overstress(Addition):
+class Overstress(Carried):
     """The m of one experiment, of a body with memory.
 
     Attributes
@@ -120,7 +120,7 @@ class Overstress(Addition):
         """(count,) r at the m of the setting."""
         return (self._history(part).gaps / self.unit_pa).ravel()
 
-    def weights(self, multipliers: Array) -> list[Array]:
+    def memory_weights(self, multipliers: Array) -> list[Array]:
         """μ (N, …) of each branch such that multipliers · r has −Σ μ_k (m_k − d_k m_{k−1} − …)."""
         mu = np.zeros((self.segment.grid_rows, self.width))
         mu[:-1] = -multipliers[self.rows].reshape(self.shape) / self.unit_pa
@@ -305,7 +305,7 @@ class Overstress(Addition):
         theta_q = setting.theta_q
         by_q = np.zeros((segment.nq, *self.shape))
         recursions = setting.dynamics.recursions(setting.theta)
-        for r, mu in zip(recursions, self.weights(multipliers), strict=True):
+        for r, mu in zip(recursions, self.memory_weights(multipliers), strict=True):
             fading = theta_q[[r.branch.share, r.branch.tau]].T @ r.by[1][:, 1:]
             by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", fading, mu[1:])
         place, own, _, _ = self._slopes

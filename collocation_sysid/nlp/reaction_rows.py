@@ -14,13 +14,13 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, Index
-from .addition import Addition
-from .collocation import Part
+from .carried import Carried
 from .motion_rows import MotionRows
+from .part import Part
 from .reaction import reactions
 
 
-class Reactions(Addition):
+class Reactions(Carried):
     """R of one experiment."""
 
     @property
@@ -50,7 +50,7 @@ class Reactions(Addition):
         found[self.segment.dynamics.first_row :] = own * self.segment.force_n
         return found
 
-    def weights(self, multipliers: Array) -> Array:
+    def row_weights(self, multipliers: Array) -> Array:
         """(N, 3n) derivative of multipliers · g by what c has in newtons."""
         found = np.zeros((self.segment.grid_rows, self.segment.dofs))
         by_row = multipliers[self.rows].reshape(self.shape) / self.segment.force_n

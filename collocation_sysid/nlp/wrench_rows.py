@@ -18,9 +18,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..arrays import Array, Index
-from .addition import Addition
+from .carried import Carried
 from .channel import Forced
-from .collocation import Part
+from .part import Part
 from .reaction_rows import Reactions
 from .reading import Reading
 from .segment import Weights
@@ -28,7 +28,7 @@ from .wrench_channel import GraspWrench, smoothed, stepped
 
 
 @dataclass(frozen=True, eq=False)
-class WrenchRows(Addition):
+class WrenchRows(Carried):
     """W and Y of one sensor.
 
     Attributes
@@ -207,7 +207,8 @@ class WrenchRows(Addition):
         pairs.append((both[rows[here]], both[columns[here]]))
         if len(self._lag):
             pairs += [(phi[self._lag], given[:-1]), (phi[self._lag], own)]
-        return _sorted(*_all(pairs))
+        i, j = np.triu_indices(len(phi))
+        return _sorted(*_all([*pairs, (phi[i], phi[j])]))
 
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: Weights
@@ -226,6 +227,8 @@ class WrenchRows(Addition):
             of_wrench[1:] -= b * mu[1:]
             of_wrench[:-1] -= a * mu[1:]
             found += [-e * mu[1:], of_wrench]
+        of_phi = self._phi_curvature(part, z, loss_weight, of_rows)
+        found.append(of_phi[np.triu_indices(len(of_phi))])
         return np.concatenate([each.ravel() for each in found])
 
     def _loss_values(self, part: Part) -> Array:
@@ -243,11 +246,11 @@ class WrenchRows(Addition):
         by_row = multipliers[self.rows].reshape(-1, len(self._times), 6) / self._row_unit
         return [*by_row]
 
-    def phi_curvature(
-        self, part: Part, z: Array, loss_weight: float, multipliers: Array
-    ) -> Array | float:
+    def _phi_curvature(
+        self, part: Part, z: Array, loss_weight: float, of_rows: list[Array]
+    ) -> Array:
         """Second derivatives (k, k) by φ of loss_weight · loss + multipliers · g."""
-        found, of_rows = np.zeros((len(part.phi),) * 2), self._of_rows(multipliers)
+        found = np.zeros((len(part.phi),) * 2)
         if len(self._tool):
             at = self.channel.tool_at(part.phi, len(self._times))
             bent = self.channel.tool.curvature(*at, of_rows[0].T)

@@ -6,25 +6,26 @@ The equations come after all rows of the program given, the variables after all 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Array, Index
-from .collocation import Part
+from .part import Part
 from .segment import Segment, Weights
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where in z and g the variables and the equations of an addition begin."""
+    """Where in z and g the variables and the equations of what is carried begin."""
 
     variable: int
     row: int
 
 
 @dataclass(frozen=True, eq=False)
-class Addition(ABC):
+class Carried(ABC):
     """Variables of one experiment and as many equations.
 
     Attributes
@@ -97,19 +98,23 @@ class Addition(ABC):
         """The values of these entries; multipliers are those of all of g."""
         return np.zeros(0)
 
-    @property
-    def nonzeros(self) -> tuple[int, int]:
-        """How many further entries Jacobian and Hessian have."""
-        return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
-
     # What the loss has of the variables ---------------------------------------------------------
 
     def gradient(self, part: Part) -> Array:
         """∂loss by them (count,)."""
         return np.zeros(self.count)
 
-    def phi_curvature(
-        self, part: Part, z: Array, loss_weight: float, multipliers: Array
-    ) -> Array | float:
-        """Second derivatives (k, k) by φ of loss_weight · loss + multipliers · g."""
+    # What multipliers weigh ---------------------------------------------------------------------
+
+    def row_weights(self, multipliers: Array) -> Array | float:
+        """(N, 3n) derivative of multipliers · its equations by what c has in newtons."""
         return 0.0
+
+    def memory_weights(self, multipliers: Array) -> Sequence[Array]:
+        """μ (N, …) of each branch of a memory such that multipliers · g has Σ μ (d m + a S)."""
+        return ()
+
+    @property
+    def nonzeros(self) -> tuple[int, int]:
+        """How many further entries Jacobian and Hessian have."""
+        return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
