@@ -1,14 +1,11 @@
-"""The methods, and the options of one of them, as tables for a terminal."""
+"""The methods, and the options of one of them, as tables."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
-
+from .display import Shown, Table
 from .methods import METHODS
 from .methods.described import options_schema, summary
 from .problem.solver_schema import heading
@@ -16,22 +13,18 @@ from .problem.solver_schema import heading
 KINDS = {"number": "number", "integer": "whole number", "string": "text", "object": "table"}
 
 
-def methods_table() -> RenderableType:
+def methods_table() -> Table:
     """The methods by name, with a line on each."""
-    table = _table("method", "")
-    for name in METHODS:
-        table.add_row(name, Text(summary(name)))
-    return table
+    return Table("", ("method", ""), tuple((name, summary(name)) for name in METHODS), texts=1)
 
 
-def options_table(method: str) -> RenderableType:
+def options_table(method: str) -> list[Shown]:
     """A method's options: defaults, what they can be, and what they do."""
-    table = _table("option", "default", "")
+    rows = []
     for name, option in options_schema(method)["properties"].items():
-        told = Text(_values(option), style="dim").append(f"\n{option['description']}", "not dim")
-        table.add_row(name, Text(_default(option)), told)
-    where = f"In the problem file, under {heading(method)}:"
-    return Group(Text(summary(method)), Text(""), Text(where), Text(""), table)
+        rows.append((name, _default(option), f"{_values(option)}\n{option['description']}"))
+    table = Table("", ("option", "default", ""), tuple(rows), names=2, texts=1)
+    return [summary(method), "", f"In the problem file, under {heading(method)}:", "", table]
 
 
 def _default(option: Mapping[str, Any]) -> str:
@@ -50,10 +43,3 @@ def _values(option: Mapping[str, Any]) -> str:
     limits = {"exclusiveMinimum": "above", "minimum": "of at least"}
     ranges = [f" {word} {option[key]:g}" for key, word in limits.items() if key in option]
     return KINDS[option["type"]] + "".join(ranges)
-
-
-def _table(*heads: str) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for place, head in enumerate(heads):
-        table.add_column(head, no_wrap=place == 0)
-    return table

@@ -44,7 +44,8 @@ class Run(Answer):
 
     def table(self) -> str:
         """Parameters, intervals, what these hold, and the verdict, as the terminal shows them."""
-        from .terminal import answer, plain_text  # how it looks is no part of a run
+        from .display import plain_text
+        from .terminal import answer  # how it looks is no part of a run
 
         return plain_text(answer(self))
 

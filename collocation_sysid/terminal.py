@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from io import StringIO
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.table import Table
+from rich.console import Console, Group
 from rich.text import Text
 
 from .answer import Answer
 from .arrays import Array, root_mean
 from .check import BodyFinding, Findings, Glance, Recording
 from .check.hold import hold_sentence
-from .console import PlainConsole
+from .console import Watched
+from .display import Line, Shown, Table, labelled, on_terminal
 from .errors import listed
 from .experiment.nuisance import JOINING, PLACE, in_unit_for_people
 from .export.target import Comparison
-from .fem.constants import GAMMA_R, symbol_of, unit_of
+from .fem.constants import GAMMA_R, symbol_of, unit_of, with_unit
 from .heartbeat import Heartbeat
 from .methods.solution import Iteration
 from .nlp.collocation import Part
@@ -36,14 +33,12 @@ from .statistics.places import Place
 from .statistics.scale import relative_sentence
 from .statistics.uncertainty import Estimate
 
-COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
-WIDE = 200
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
-class Progress:
+class Progress(Watched):
     """A live table of iterations on a terminal; elsewhere a line now and then, or all if asked."""
 
     def __init__(
@@ -53,182 +48,142 @@ class Progress:
         verbose: bool = False,
         quiet: bool = False,
     ) -> None:
-        self.console = console
+        super().__init__(console, quiet, live=not verbose)
         self.verbose = verbose
-        self.quiet = quiet
         self._notes = problem.notes if problem else ()
-        live = console.is_terminal and not quiet and not verbose
-        self._live = Live(console=console, refresh_per_second=8, transient=True) if live else None
         self._lines: list[Iteration] = []
         self._doing = "finding a start"
         silent = not (console.is_terminal or quiet)
-        self._heartbeat = Heartbeat(self._state, self._line) if silent else None
+        self._heartbeat = Heartbeat(self._state, self.line) if silent else None
 
     def __enter__(self) -> Progress:
-        if not self.quiet:
-            for note in self._notes:
-                self._line(f"note: {note}")
-        for shown in (self._live, self._heartbeat):
-            if shown is not None:
-                shown.start()
+        for note in self._notes:
+            self.line(f"note: {note}")
+        super().__enter__()
+        if self._heartbeat is not None:
+            self._heartbeat.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for shown in (self._live, self._heartbeat):
-            if shown is not None:
-                shown.stop()
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
 
     def iteration(self, line: Iteration) -> None:
         """Show an iterate."""
         self._lines.append(line)
-        self._doing = "solving"
-        if self.verbose:
-            self._line("  ".join(_cells(line)))
-        self._refresh()
+        self._told("solving", "  ".join(_cells(line)))
 
     def say(self, what: str) -> None:
         """Show what is being done now."""
-        self._doing = what
-        if self.verbose:
-            self._line(what)
-        self._refresh()
+        self._told(what, what)
 
     def share(self, done: float) -> None:
         """Show the share of a simulation that is done."""
-        self._doing = f"simulating: {done:.0%}"
-        self._refresh()
+        self._told(f"simulating: {done:.0%}")
+
+    def _told(self, doing: str, line: str = "") -> None:
+        self._doing = doing
+        if self.verbose and line:
+            self.console.print(Text(line), soft_wrap=True)
+        table = on_terminal(_iterations(self._lines))
+        self.update(Group(table, Text(self._doing, style="dim")))
 
     def _state(self) -> str:
         done = f", {len(self._lines)} iterations" if self._lines else ""
         return f"{self._doing}{done}"
 
-    def _line(self, said: str) -> None:
-        self.console.print(Text(said), soft_wrap=True)
 
-    def _refresh(self) -> None:
-        if self._live is not None:
-            self._live.update(Group(_iterations(self._lines), Text(self._doing, style="dim")))
-
-
-def _iterations(lines: list[Iteration]) -> RenderableType:
+def _iterations(lines: list[Iteration]) -> Shown:
     if not lines:
-        return Text("")
-    heads = ["", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s"]
-    table = Table(*heads, box=None, pad_edge=False)
-    for column in table.columns:
-        column.justify = "right"
-    for line in lines[-SHOWN_ITERATIONS:]:
-        table.add_row(*_cells(line))
-    return table
+        return ""
+    heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
+    return Table("", heads, tuple(map(_cells, lines[-SHOWN_ITERATIONS:])), names=0)
 
 
-def _cells(line: Iteration) -> list[str]:
-    return [
-        str(line.number),
-        f"{line.rms_m * 1e3:.4f}",
-        f"{line.violation_n:.1e}",
-        *(f"{value:.4g}" for value in line.parameters.values()),
-        f"{line.time_s:.1f}",
-    ]
+def _cells(line: Iteration) -> tuple[str, ...]:
+    values = (f"{value:.4g}" for value in line.parameters.values())
+    rms_mm, violation = f"{line.rms_m * 1e3:.4f}", f"{line.violation_n:.1e}"
+    return str(line.number), rms_mm, violation, *values, f"{line.time_s:.1f}"
 
 
-def summary(finished: Answer, folder: Path) -> RenderableType:
+def summary(finished: Answer, folder: Path) -> list[Shown]:
     """The answer of a run on one screen."""
     solution = finished.solution
-    parts: list[RenderableType] = [Text(solution.message, style=COLOURS[finished.trust.verdict])]
+    parts: list[Shown] = [Line(solution.message, finished.trust.verdict)]
     if not solution.status.converged:
-        parts.append(Text("Largest violations of the equations of motion:"))
-        parts += [Text(f"  {violation}") for violation in solution.largest_violations]
-    parts += [answer(finished), *_damping(finished), *_scale(finished)]
+        parts.append("Largest violations of the equations of motion:")
+        parts += [f"  {violation}" for violation in solution.largest_violations]
+    parts += [*answer(finished), *_damping(finished), *_scale(finished)]
     parts += [*_fit(finished), *_nuisance(finished)]
-    parts += [Text(f"note: {note}") for note in (*solution.notes, *finished.all_notes)]
-    parts += _residuals(finished)
-    parts.append(Text(f"written to {folder}"))
-    return Group(*parts)
+    parts += [f"note: {note}" for note in (*solution.notes, *finished.all_notes)]
+    # What the largest residuals suggest.
+    largest = sorted(finished.diagnoses, key=lambda d: -d.rms_m)[:SHOWN_DIAGNOSES]
+    parts += [f"residuals: {diagnosis.sentence}" for diagnosis in largest]
+    return [*parts, f"written to {folder}"]
 
 
-def answer(finished: Answer) -> RenderableType:
+def answer(finished: Answer) -> list[Shown]:
     """Verdict, values, intervals and what these hold."""
     trust = finished.trust
-    style = COLOURS[trust.verdict]
-    return Group(
-        Text(f"Verdict: {trust.verdict}", style=f"bold {style}"),
-        *(Text(f"  {reason}", style=style) for reason in trust.reasons),
+    return [
+        Line(f"Verdict: {trust.verdict}", f"strong {trust.verdict}"),
+        *(Line(f"  {reason}", trust.verdict) for reason in trust.reasons),
         *_how_to(trust.concerns),
         parameter_table(finished),
         *_numerical(finished),
-    )
+    ]
 
 
-def _how_to(concerns: Sequence[Concern]) -> list[Text]:
+def _how_to(concerns: Sequence[Concern]) -> list[Shown]:
     """The pages that say how to cure what gives concern."""
     remedies = remedies_for(concerns).values()
     pages = dict.fromkeys(f"docs/howto/{each.page}.md" for each in remedies)
-    return [Text(f"what to do: {', '.join(pages)}", style="dim")] if pages else []
-
-
-def plain_text(shown: RenderableType) -> str:
-    """What a terminal would show, without colours and as wide as it needs."""
-    file = StringIO()
-    PlainConsole(file=file, width=WIDE).print(shown)
-    return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+    return [Line(f"what to do: {', '.join(pages)}", "quiet")] if pages else []
 
 
 def parameter_table(finished: Answer) -> Table:
     """Parameters and derived moduli with their error bars."""
-    table = Table("", "value", "±", "95 % interval", "guess", box=None, pad_edge=False)
-    for column in table.columns[1:]:
-        column.justify = "right"
     guesses = {item.name: _guess(item) for item in finished.started_from.items}
-    for name, estimate in finished.estimates.items():
-        table.add_row(*_estimate_cells(name, estimate), guesses.get(name, ""))
-    return table
+    rows = tuple(
+        (*_estimate_cells(name, estimate), guesses.get(name, ""))
+        for name, estimate in finished.estimates.items()
+    )
+    return Table("", ("", "value", "±", "95 % interval", "guess"), rows)
 
 
 def refinement_table(found: Refinement) -> Table:
     """What step and mesh change, and intervals for noise and discretisation."""
-    heads = (
-        "",
-        "half the step",
-        "order",
-        "half the edges",
-        "order",
-        "limit",
-        "95 % interval",
-    )
-    table = Table(*heads, box=None, pad_edge=False)
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for name, error in found.errors.items():
-        interval = "" if error.ci95 is None else "{:.5g} … {:.5g}".format(*error.ci95)
-        table.add_row(
-            f"{symbol_of(name)} {unit_of(name)}".strip(),
+    halved = ("half the step", "order", "half the edges", "order")
+    rows = tuple(
+        (
+            with_unit(name),
             *(_change(error.step), _order(error.step_order)),
             *(_change(error.mesh), _order(error.mesh_order)),
             f"{error.extrapolated:.5g}",
-            interval,
+            _interval(error.ci95),
         )
-    return table
+        for name, error in found.errors.items()
+    )
+    return Table("", ("", *halved, "limit", "95 % interval"), rows)
 
 
-def export_notes(warnings: Sequence[str], limits: Sequence[str]) -> Text:
+def export_notes(warnings: Sequence[str], limits: Sequence[str]) -> list[Shown]:
     """What to know of an export, a line each."""
-    lines = [f"warning: {each}" for each in warnings]
-    return Text("\n".join([*lines, *(f"not expressed: {each}" for each in limits)]))
+    return [*(f"warning: {w}" for w in warnings), *(f"not expressed: {each}" for each in limits)]
 
 
 def comparison_table(name: str, found: Sequence[Comparison]) -> Table:
     """What a simulator predicts beside what we do."""
-    table = Table("", name, "ours", "difference", "", box=None, pad_edge=False)
+    rows = []
     for each in found:
         values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
-        table.add_row(each.what, *values, f"{each.relative:+.2%}", each.remark)
-    return table
+        rows.append((each.what, *values, f"{each.relative:+.2%}", each.remark))
+    return Table("", ("", name, "ours", "difference", ""), tuple(rows), names=5)
+
+
+def _interval(found: tuple[float, float] | None) -> str:
+    return "" if found is None else "{:.5g} … {:.5g}".format(*found)
 
 
 def _change(change: float | None) -> str:
@@ -239,7 +194,7 @@ def _order(order: float | None) -> str:
     return "" if order is None else f"{order:.1f}"
 
 
-def _numerical(finished: Answer) -> list[RenderableType]:
+def _numerical(finished: Answer) -> list[Shown]:
     """What the intervals hold, and what is known of the numerical error."""
     found, holds = finished.refinement, finished.interval_holds
     if not holds:
@@ -250,30 +205,30 @@ def _numerical(finished: Answer) -> list[RenderableType]:
     said = f"intervals hold {listed(f'the {kind}' for kind in holds)}"
     said += f", not {listed(left)}: see refine" if left else ""
     if found is None:
-        return [Text(said)]
+        return [said]
     if found.levels:
-        return [Text(said), refinement_table(found)]
+        return [said, refinement_table(found)]
     known = ((name, finished.estimates[name]) for name in found.errors)
     moved = [
         f"{symbol_of(name)} {100 * (1 - found.errors[name].extrapolated / each.value):+.2g} %"
         for name, each in known
         if each.value and each.std_error is not None
     ]
-    return [Text(said), Text(f"the step moves, to first order: {', '.join(moved)}")]
+    return [said, f"the step moves, to first order: {', '.join(moved)}"]
 
 
-def _damping(finished: Answer) -> list[Text]:
+def _damping(finished: Answer) -> list[str]:
     """The law that γ_r belongs to."""
     parts = [part for body in finished.problem.bodies for part in body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     said = [law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws]
-    return [Text(f"{GAMMA_R.symbol} is that of damping = {' and '.join(said)}")] if laws else []
+    return [f"{GAMMA_R.symbol} is that of damping = {' and '.join(said)}"] if laws else []
 
 
-def _scale(finished: Answer) -> list[Text]:
+def _scale(finished: Answer) -> list[str]:
     """What the moduli rest on, where nothing else sets their scale."""
     said = relative_sentence(finished.problem.experiments, finished.problem.parameters)
-    return [] if said is None else [Text(said)]
+    return [] if said is None else [said]
 
 
 def _guess(item: Parameter) -> str:
@@ -282,25 +237,24 @@ def _guess(item: Parameter) -> str:
     return "fixed" if item.fixed else f"{item.guess:.5g}"
 
 
-def _estimate_cells(name: str, estimate: Estimate) -> list[str]:
-    symbol, unit = symbol_of(name), unit_of(name)
-    interval = "" if estimate.ci95 is None else "{:.5g} … {:.5g}".format(*estimate.ci95)
+def _estimate_cells(name: str, estimate: Estimate) -> tuple[str, ...]:
+    interval = _interval(estimate.ci95)
     if estimate.at_bound:
         interval = "at its bound"
     elif estimate.reason:
         interval = "not determined" if estimate.ci95 is None else "not identifiable"
     spread = "" if estimate.std_error is None else f"{estimate.std_error:.2g}"
-    return [f"{symbol} {unit}".strip(), f"{estimate.value:.5g}", spread, interval]
+    return with_unit(name), f"{estimate.value:.5g}", spread, interval
 
 
-def _nuisance(finished: Answer) -> list[Text]:
+def _nuisance(finished: Answer) -> list[str]:
     """One line for each experiment that has nuisance parameters, with their priors."""
     collocation, lines = finished.solution.collocation, []
     for part in collocation.parts(finished.solution.z):
         name = part.segment.experiment.name
         said = _places(finished.places[name]) + _of_rows(part, finished)
         if said:
-            lines.append(Text(f"estimated beside them of '{name}': {'; '.join(said)}"))
+            lines.append(f"estimated beside them of '{name}': {'; '.join(said)}")
     return lines
 
 
@@ -375,13 +329,7 @@ def _short(value: float) -> str:
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
-def _residuals(finished: Answer) -> list[Text]:
-    """What the largest residuals suggest."""
-    largest = sorted(finished.diagnoses, key=lambda d: -d.rms_m)[:SHOWN_DIAGNOSES]
-    return [Text(f"residuals: {diagnosis.sentence}") for diagnosis in largest]
-
-
-def _fit(finished: Answer) -> list[Text]:
+def _fit(finished: Answer) -> list[str]:
     """How well the markers and the equations are met, and how long that took."""
     solution = finished.solution
     violated = (
@@ -413,7 +361,7 @@ def _fit(finished: Answer) -> list[Text]:
         f"{solution.iterations} iterations in {timing.total:.1f} s "
         f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
     )
-    return [Text(line) for line in lines]
+    return lines
 
 
 def _wrench_sizes(rms: tuple[float | None, float | None]) -> str:
@@ -432,59 +380,48 @@ def _sigmas(segment: Segment) -> str:
     return f" (sigma {', '.join(said)})"
 
 
-def check_table(findings: Findings) -> RenderableType:
+def check_table(findings: Findings) -> list[Shown]:
     """The findings of a check on one screen, warnings last."""
-    return Group(glance_table(findings), closer_table(findings))
+    return [*glance_table(findings), *closer_table(findings)]
 
 
-def glance_table(found: Glance | Findings) -> RenderableType:
+def glance_table(found: Glance | Findings) -> list[Shown]:
     """What a check sees at once."""
-    return Group(*map(_body_section, found.bodies), _measurements_section(found))
+    return [*map(_body_section, found.bodies), _measurements_section(found)]
 
 
-def closer_table(findings: Findings) -> RenderableType:
+def closer_table(findings: Findings) -> list[Shown]:
     """What follows it, warnings last."""
-    return Group(
+    said = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
+    return [
         *_motion_section(findings),
         _solve_section(findings),
-        Text(""),
-        *_sentences("note", findings.notes, "default"),
-        *_sentences("warning", findings.warnings, "yellow"),
+        "",
+        *(
+            Table("", (), tuple((f"{kind}:", each) for each in sentences), texts=1, style=style)
+            for kind, (sentences, style) in said.items()
+            if sentences
+        ),
         *_how_to(findings.concerns),
         _check_verdict(findings),
-    )
+    ]
 
 
-def _check_verdict(findings: Findings) -> Text:
+def _check_verdict(findings: Findings) -> Line:
     if not findings.derivatives_agree:
-        return Text("The derivatives do not agree with differences at the guess.", style="red")
+        return Line("The derivatives do not agree with differences at the guess.", "doubtful")
     if findings.causes:
         likeliest = findings.causes[0].sentence
-        return Text(f"The derivatives agree, but the description looks wrong: {likeliest}", "red")
-    return Text("The problem is valid and the derivatives agree.", style="green")
+        said = f"The derivatives agree, but the description looks wrong: {likeliest}"
+        return Line(said, "doubtful")
+    return Line("The problem is valid and the derivatives agree.", "good")
 
 
-def _section(title: str, rows: dict[str, str]) -> RenderableType:
-    table = Table.grid(padding=(0, 2, 0, 0))
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows.items():
-        table.add_row(Text(f"  {name}"), Text(value))
-    return Group(Text(title, style="bold"), table)
-
-
-def _sentences(kind: str, sentences: tuple[str, ...], style: str) -> list[RenderableType]:
-    table = Table.grid(padding=(0, 1, 0, 0))
-    for sentence in sentences:
-        table.add_row(Text(f"{kind}:", style=style), Text(sentence, style=style))
-    return [table] if sentences else []
-
-
-def _body_section(body: BodyFinding) -> RenderableType:
+def _body_section(body: BodyFinding) -> Table:
     size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
     low, mean, high = (1e3 * x for x in body.edges_m)
     worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
-    return _section(
+    return labelled(
         "Body",
         {
             "object": f"{size} mm, {1e6 * body.volume_m3:.4g} cm³, {1e3 * body.mass_kg:.4g} g",
@@ -495,17 +432,14 @@ def _body_section(body: BodyFinding) -> RenderableType:
     )
 
 
-def _motion_section(findings: Findings) -> list[RenderableType]:
+def _motion_section(findings: Findings) -> list[Shown]:
     if not findings.motions:  # equilibria only
         return []
     motion, *others = findings.motions
     title = f"Modes of '{motion.experiment}' about its {motion.about} (they depend on the guess)"
     heads = ("  Hz", "samples/period", "steps/period", "damping", "scheme adds", "period error")
-    table = Table(*heads, box=None, pad_edge=False)
-    for column in table.columns:
-        column.justify = "right"
-    for mode in motion.modes[:SHOWN_MODES]:
-        table.add_row(
+    rows = tuple(
+        (
             f"{mode.frequency_hz:.3g}",
             f"{mode.samples_per_period:.1f}",
             f"{mode.steps_per_period:.1f}",
@@ -513,12 +447,14 @@ def _motion_section(findings: Findings) -> list[RenderableType]:
             f"{mode.numerical_damping_ratio:.2g}",
             f"{mode.period_error:+.1%}",
         )
+        for mode in motion.modes[:SHOWN_MODES]
+    )
     firsts = [f"'{m.experiment}' {m.first.frequency_hz:.3g} Hz" for m in others if m.first]
-    more = [Text(f"  first modes elsewhere: {_listed(firsts)}")] if firsts else []
-    return [Text(title, style="bold"), table, *more]
+    more = [f"  first modes elsewhere: {_listed(firsts)}"] if firsts else []
+    return [Table(title, heads, rows, names=0), *more]
 
 
-def _measurements_section(findings: Glance | Findings) -> RenderableType:
+def _measurements_section(findings: Glance | Findings) -> Table:
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
@@ -531,7 +467,7 @@ def _measurements_section(findings: Glance | Findings) -> RenderableType:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
     for hold in findings.holds[:SHOWN_RECORDINGS]:
         rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
-    return _section("Measurements", rows)
+    return labelled("Measurements", rows)
 
 
 def _markers_seen(recording: Recording) -> str:
@@ -549,7 +485,7 @@ def _markers_seen(recording: Recording) -> str:
     )
 
 
-def _solve_section(findings: Findings) -> RenderableType:
+def _solve_section(findings: Findings) -> Table:
     rows = {
         "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
             f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
@@ -580,7 +516,7 @@ def _solve_section(findings: Findings) -> RenderableType:
         f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
         f"{findings.hessian_error:.0e} of differences"
     )
-    return _section("Solve", rows)
+    return labelled("Solve", rows)
 
 
 def _duration(time_s: float | None) -> str:

@@ -18,13 +18,14 @@ from collocation_sysid.check.cost import Cost, cost_notes, cost_warnings
 from collocation_sysid.check.derivatives import shortened
 from collocation_sysid.check.elements import element_warnings, slenderness, worst_elements
 from collocation_sysid.check.motion import ModeFinding, Motion, motion_of, motion_warnings
+from collocation_sysid.display import plain_text
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.nlp.numerical_damping import numerical_mode
 from collocation_sysid.nlp.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
-from collocation_sysid.terminal import check_table, plain_text
+from collocation_sysid.terminal import check_table
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
 SILICONE = (

@@ -30,7 +30,6 @@ from problem_files import (
     write_problem,
 )
 from rich.console import Console
-from rich.text import Text
 
 import collocation_sysid as cs
 from collocation_sysid import terminal
@@ -553,7 +552,7 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
         file = io.StringIO()
         shown = Console(file=file, force_terminal=live, width=40, color_system=None)
         monkeypatch.setattr(common, "PlainConsole", lambda shown=shown, **_: shown)
-        common.show(Text(words))
+        common.show(words)
         found = file.getvalue().splitlines()
         assert len(found) == lines
         assert {word for line in found for word in line.split()} == {"misfit"}

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from problems_small import GUESS, IDEAL, TRUTH, bar_loaded, box, hung_cube, nodes_where
 
+from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.experiment.loads import ramp
@@ -23,7 +24,7 @@ from collocation_sysid.problem import Problem, RolloutOptions
 from collocation_sysid.run import run, solve
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_of
-from collocation_sysid.terminal import plain_text, summary
+from collocation_sysid.terminal import summary
 
 TIP = nodes_where(box(), 2, 0.0)
 DAMPING = ("gamma_r_s", "gamma_m_1_s")

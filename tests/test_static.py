@@ -25,6 +25,7 @@ from scipy.optimize import brentq
 import collocation_sysid as cs
 from collocation_sysid.check import check_problem
 from collocation_sysid.check.derivatives import derivative_errors
+from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import (
     Experiment,
@@ -49,7 +50,7 @@ from collocation_sysid.nlp.simulation import simulate, with_markers
 from collocation_sysid.rollout import Rollout
 from collocation_sysid.run import run
 from collocation_sysid.statistics.stillness import stillness_notes
-from collocation_sysid.terminal import check_table, plain_text, summary
+from collocation_sysid.terminal import check_table, summary
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])

@@ -14,6 +14,7 @@ from fits_small import PARAMETERS, autoregressive, problem
 from problem_files import run_command, settings, write_problem
 
 from collocation_sysid import Run, run
+from collocation_sysid.display import plain_text
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.output.record import result
 from collocation_sysid.output.remedies import REMEDIES
@@ -30,7 +31,7 @@ from collocation_sysid.statistics.trust import (
     scheme_concerns,
 )
 from collocation_sysid.statistics.uncertainty import uncertainty_of
-from collocation_sysid.terminal import plain_text, summary
+from collocation_sysid.terminal import summary
 from collocation_sysid.tree import as_json, content, read
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))

@@ -139,16 +139,17 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     assert "tare of fx [N]" in result["nuisance"]["hung cube"]
     with np.load(folder / "trajectory.npz") as stored:
         assert stored["wrench_1"].shape == (21, 19)
+    from collocation_sysid.display import plain_text
     from collocation_sysid.output.redraw import redraw
-    from collocation_sysid.output.report import run_page
-    from collocation_sysid.terminal import plain_text, summary
+    from collocation_sysid.output.report import as_page, run_report
+    from collocation_sysid.terminal import summary
 
     said = plain_text(summary(run, folder))
     assert "wrench of 'hung cube'" in said
     assert "tare up to" in said
     assert "sensor late by" in said
     assert folder / "wrench_hung_cube.png" in redraw(folder, folder)
-    assert "Wrench of a grasp" in run_page(folder)
+    assert "Wrench of a grasp" in as_page(run_report(folder))
 
 
 def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches():

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import RenderableType
 
 from ..console import PlainConsole
+from ..display import Shown, on_terminal
 
 errors = PlainConsole(stderr=True)
 
@@ -52,7 +53,7 @@ def examples(*commands: str) -> str:
     return f"\b\nExamples:{lines}"
 
 
-def show(content: RenderableType) -> None:
+def show(content: Shown | Iterable[Shown]) -> None:
     """Print on stdout: on a terminal wrapped between words, in files with lines kept whole."""
     console = PlainConsole()
-    console.print(content, soft_wrap=not console.is_terminal)
+    console.print(on_terminal(content), soft_wrap=not console.is_terminal)

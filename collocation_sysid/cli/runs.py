@@ -65,7 +65,7 @@ def refine(
     else:
         show(refinement_table(found))
         for reason in result.trust.reasons:
-            show(Text(f"{result.trust.verdict}: {reason}"))
+            show(f"{result.trust.verdict}: {reason}")
 
 
 @commands.command(
@@ -137,20 +137,21 @@ def report(
         Path, typer.Argument(metavar="FOLDER", help="A run folder, or one of compare or sweep.")
     ],
     to: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Where to write; report.html in the folder.")
+        Path | None,
+        typer.Option(metavar="FILE", help="An .html or .md; report.html in the folder by default."),
     ] = None,
 ) -> None:
-    """Write one HTML page about a run or a study.
+    """Write one HTML page about a run or a study, or a Markdown file.
 
-    Everything it found, pictures inside.
+    Everything it found; of a page the pictures are inside, in Markdown they are links.
     """
-    from ..output.report import comparison_page, run_page
+    from ..output.report import as_file, comparison_report, run_report
 
     file = to or folder / "report.html"
     study = (folder / "summary.json").is_file()
-    page = comparison_page(folder) if study else run_page(folder)
+    found = comparison_report(folder) if study else run_report(folder)
     require_possible(file.parent)
-    write_whole(file, page)
+    write_whole(file, as_file(found, file))
     typer.echo(file)
 
 

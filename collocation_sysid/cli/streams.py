@@ -116,6 +116,7 @@ def replay(
     """Stream a recording as if it were made now, and estimate from it live."""
     from rich.live import Live
 
+    from ..display import on_terminal
     from ..live import view
     from ..live.sources import as_json as json_line
     from ..live.sources import collected_before, paced, recorded
@@ -138,7 +139,7 @@ def replay(
             if as_json:
                 typer.echo(json_line(updates[-1]))
             elif watched:
-                shown.update(view.picture(updates))
+                shown.update(on_terminal(view.picture(updates)))
     settled = estimator.settle() or updates[-1]
     if as_json:
         typer.echo(json_line(settled))

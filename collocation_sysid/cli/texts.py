@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from ..console import PlainConsole
+from ..display import on_terminal
 from .common import AsJson, errors, examples
 
 commands = typer.Typer()
@@ -40,7 +41,8 @@ def methods(
         listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
-        PlainConsole().print(options_table(name) if name else methods_table())
+        parts = options_table(name) if name else methods_table()
+        PlainConsole().print(on_terminal(parts))
 
 
 @commands.command()

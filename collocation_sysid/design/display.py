@@ -5,81 +5,65 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.table import Table
+from rich.console import Console
 from rich.text import Text
 
-from ..fem.constants import symbol_of, unit_of
+from ..console import Watched
+from ..display import Line, Shown, Table
+from ..fem.constants import with_unit
 from .designing import FORBIDDEN, Design
 
 EVERY = 20
 
 
-class DesignProgress:
+class DesignProgress(Watched):
     """The search, live on a terminal; a line now and then elsewhere."""
 
     def __init__(self, console: Console, evaluations: int, quiet: bool = False) -> None:
-        self.console, self.evaluations, self.quiet = console, evaluations, quiet
-        live = console.is_terminal and not quiet
-        self._live = Live(console=console, refresh_per_second=4, transient=True) if live else None
-
-    def __enter__(self) -> DesignProgress:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
+        super().__init__(console, quiet)
+        self.evaluations = evaluations
 
     def tried(self, number: int, log_size: float) -> None:
         """Show the smallest error bar so far."""
         best = "none possible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
         line = f"{number} of {self.evaluations} motions tried, smallest error bar: {best}"
-        if self._live is not None:
-            self._live.update(Text(f"{line} (Ctrl-C keeps it)", style="dim"))
-        elif not self.quiet and (number % EVERY == 0 or number == self.evaluations):
-            self.console.print(line)
+        seldom = number % EVERY == 0 or number == self.evaluations
+        self.update(Text(f"{line} (Ctrl-C keeps it)", style="dim"), line if seldom else "")
 
     def say(self, what: str) -> None:
         """Show what is being done now."""
-        if self._live is not None:
-            self._live.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"))
-        elif not self.quiet:
-            self.console.print(what)
+        self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
 
 
-def design_summary(found: Design, folder: Path) -> RenderableType:
+def design_summary(found: Design, folder: Path) -> list[Shown]:
     """A design on one screen."""
-    parts: list[RenderableType] = []
     tried = len(found.found.history)
-    if found.found.interrupted:
-        parts.append(Text(f"interrupted: the best of {tried} motions", style="yellow"))
-    parts += [_table(found), Text(_meaning(found))]
-    reached = ", ".join(found.reached) or "none"
-    parts.append(Text(f"limits reached: {reached}"))
-    parts.append(Text(f"written to {folder}"))
-    return Group(*parts)
+    interrupted = Line(f"interrupted: the best of {tried} motions", "check")
+    return [
+        *[interrupted] * found.found.interrupted,
+        _table(found),
+        _meaning(found),
+        f"limits reached: {', '.join(found.reached) or 'none'}",
+        f"written to {folder}",
+    ]
 
 
 def _table(found: Design) -> Table:
     heads = ("", "value", "error before", "error after", "over the draws", "smaller by")
-    table = Table(*heads, box=None, pad_edge=False)
-    for column in table.columns[1:]:
-        column.justify = "right"
-    before, after = found.before, found.after
+    before, after, rows = found.before, found.after, []
     for name, relative in after.relative.items():
         earlier = before.relative[name] if before is not None else np.nan
-        table.add_row(
-            f"{symbol_of(name)} {unit_of(name)}".strip(),
-            f"{after.values[name]:.4g}",
-            _percent(earlier),
-            _percent(relative),
-            f"{_percent(after.lowest[name])} … {_percent(after.highest[name])}",
-            f"{earlier / relative:.2g}" if np.isfinite(earlier) else "",
+        rows.append(
+            (
+                with_unit(name),
+                f"{after.values[name]:.4g}",
+                _percent(earlier),
+                _percent(relative),
+                f"{_percent(after.lowest[name])} … {_percent(after.highest[name])}",
+                f"{earlier / relative:.2g}" if np.isfinite(earlier) else "",
+            )
         )
-    return table
+    return Table("", heads, tuple(rows))
 
 
 def _percent(share: float) -> str:

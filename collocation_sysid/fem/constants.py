@@ -138,6 +138,11 @@ def symbol_of(name: str) -> str:
     return f"{symbol} {region}".strip()
 
 
+def with_unit(name: str) -> str:
+    """Symbol and unit of a constant, as at the head of its row."""
+    return f"{symbol_of(name)} {unit_of(name)}".strip()
+
+
 def constant_named(name: str) -> Constant:
     """The known constant of this name, or one of which nothing but the name is known."""
     return KNOWN.get(bare(name), Constant(bare(name)))

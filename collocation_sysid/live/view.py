@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.animation import PillowWriter
 from matplotlib.figure import Figure
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 
 from ..arrays import Array
+from ..display import Line, Shown, Span, Table
 from ..errors import InputError
 from ..fem.constants import unit_of
 from ..files import whole_file
@@ -21,7 +19,6 @@ from .estimator import Update
 
 BARS = "▁▂▃▄▅▆▇█"
 COLUMNS = 40
-COLOURS = {"good": "green", "check": "yellow", "doubtful": "red"}
 WIDTH_MM, ROW_MM, DPI, FRAMES_A_SECOND = 160.0, 32.0, 100, 25
 
 
@@ -36,32 +33,31 @@ def bars(values: Sequence[float], columns: int = COLUMNS) -> str:
     return "".join(BARS[round(s * (len(BARS) - 1))] for s in share)
 
 
-def picture(updates: Sequence[Update]) -> RenderableType:
+def picture(updates: Sequence[Update]) -> list[Shown]:
     """What the last update knows, with the way there."""
     last = updates[-1]
-    table = Table(box=None, pad_edge=False)
-    for title in ("", "estimate", "±", "unit", "so far"):
-        table.add_column(title)
+    rows = []
     for name, estimate in last.estimates.items():
         error = "" if estimate.std_error is None else f"{estimate.std_error:.2g}"
         way = bars([update.estimates[name].value for update in updates[-COLUMNS:]])
-        table.add_row(name, f"{estimate.value:.5g}", error, unit_of(name), way)
-    trust = Text(last.trust.verdict, style=COLOURS[last.trust.verdict])
-    trust.append("".join(f"; {reason}" for reason in last.trust.reasons[:2]), style="default")
-    head = Text(
+        rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), way))
+    verdict = last.trust.verdict
+    reasons = "".join(f"; {reason}" for reason in last.trust.reasons[:2])
+    return [
         f"t = {last.t_s:.2f} s   markers missed by {1e3 * last.marker_rms_m:.2f} mm   "
-        f"{1e3 * last.latency_s:.1f} ms"
-    )
-    return Group(head, table, trust)
+        f"{1e3 * last.latency_s:.1f} ms",
+        Table("", ("", "estimate", "±", "unit", "so far"), tuple(rows), names=5),
+        Line((Span(verdict, verdict), Span(reasons))),
+    ]
 
 
-def summary(updates: Sequence[Update], settled: Update) -> RenderableType:
+def summary(updates: Sequence[Update], settled: Update) -> list[Shown]:
     """What the estimate has settled at, and how long frames took."""
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
     said = f"{len(updates)} frames, latency {median:.1f} ms in the median, {late:.1f} ms at 99 %; "
     said += f"settled {1e3 * settled.latency_s:.0f} ms after the last"
-    return Group(picture([*updates, settled]), Text(said))
+    return [*picture([*updates, settled]), said]
 
 
 def require_film(file: Path) -> None:

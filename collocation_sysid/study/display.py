@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.table import Table
+from rich.console import Console
 from rich.text import Text
 
+from ..console import Watched
+from ..display import Line, Shown, Table
 from .plan import PlannedRun
-from .report import SHOWN_FAILURES, Report, View
+from .report import SHOWN_FAILURES, Report
 from .store import Record
 
-# With more columns than these long heads are parted.
-MANY = 5
 
-
-class StudyProgress:
+class StudyProgress(Watched):
     """One live line on a terminal, a line for each run elsewhere.
 
     Parameters
@@ -33,27 +30,18 @@ class StudyProgress:
     def __init__(
         self, console: Console, remaining: Sequence[PlannedRun], total: int, quiet: bool = False
     ) -> None:
-        self.console = console
-        self.quiet = quiet
+        super().__init__(console, quiet)
         self.total = total
-        self._methods = {run.key: run.method for run in remaining}
-        self._waiting = dict(self._methods)
+        self._waiting = {run.key: run.method for run in remaining}
         self._walls: dict[str, list[float]] = {}
-        live = console.is_terminal and not quiet
-        self._live = Live(console=console, refresh_per_second=4, transient=True) if live else None
 
     def __enter__(self) -> StudyProgress:
         skipped = self.total - len(self._waiting)
-        if skipped and not self.quiet:
-            self.console.print(Text(f"{skipped} of {self.total} runs are finished already"))
-        if self._live is not None:
-            self._live.start()
-            self._live.update(Text(f"{skipped}/{self.total} runs", style="dim"), refresh=True)
+        if skipped:
+            self.line(f"{skipped} of {self.total} runs are finished already")
+        super().__enter__()
+        self.update(Text(f"{skipped}/{self.total} runs", style="dim"))
         return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
 
     def done(self, record: Record, slots: int) -> None:
         """Count a finished run."""
@@ -64,10 +52,7 @@ class StudyProgress:
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
         line = f"{count}: {label_of(record)} {status} in {wall:.1f} s{self._left(slots)}"
-        if self._live is not None:
-            self._live.update(Text(line, style="dim"), refresh=True)
-        elif not self.quiet:
-            self.console.print(Text(line), soft_wrap=True)
+        self.update(Text(line, style="dim"), line)
 
     def _left(self, slots: int) -> str:
         left_s = time_left_s(list(self._waiting.values()), self._walls, slots)
@@ -101,23 +86,21 @@ def duration(time_s: float) -> str:
     return f"{time_s:.0f} s"
 
 
-def study_tables(report: Report, folder: Path) -> RenderableType:
+def study_tables(report: Report, folder: Path) -> list[Shown]:
     """The tables of a study within 80 columns, and what went wrong."""
-    parts: list[RenderableType] = []
-    if report.kind == "models":  # what no line of the tables says
-        parts += [*map(Text, report.headline), Text("")]
-    for view in report.views:
-        parts += [Text(view.title, style="bold"), _table(view), Text("")]
-    parts += [Text(note) for note in report.notes]
+    # What no line of the tables says.
+    parts: list[Shown] = [*report.headline, ""] if report.kind == "models" else []
+    for table in report.views:
+        parts += [table, ""]
     failures = report.failures
-    parts += [Text(failure, style="red") for failure in failures[:SHOWN_FAILURES]]
+    parts += [*report.notes, *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
     if len(failures) > SHOWN_FAILURES:
-        parts.append(Text(f"and {len(failures) - SHOWN_FAILURES} more in summary.md", style="red"))
-    parts.append(Text(f"written to {folder}"))
-    return Group(*parts)
+        more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
+        parts.append(Line(more, "doubtful"))
+    return [*parts, f"written to {folder}"]
 
 
-def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> RenderableType:
+def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
     """The runs of a study, and which of them are done."""
     rows = tuple(
         (
@@ -128,18 +111,4 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Render
         )
         for number, run in enumerate(planned, start=1)
     )
-    return _table(View("", ("", "run", "guess", ""), rows, names=4))
-
-
-def _table(view: View) -> Table:
-    table = Table(box=None, pad_edge=False, show_edge=False)
-    for place, head in enumerate(view.heads):
-        if place < view.names:  # dotted keys may take two lines
-            table.add_column(head.replace(".", ".\n", 1), overflow="fold")
-        else:
-            # Names of materials in many columns are parted where they have a hyphen.
-            parted = head.replace("-", "-\n") if len(view.heads) > MANY else head
-            table.add_column(parted, justify="right", overflow="fold")
-    for row in view.rows:
-        table.add_row(*map(Text, row))
-    return table
+    return Table("", ("", "run", "guess", ""), rows, names=4)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import exp
 from pathlib import Path
 from typing import Any
 
-from ..fem.constants import symbol_of, unit_of
+from ..display import Items, Section, Table, as_markdown
+from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import SCHEMA, whole_file, write_whole
 from ..tree import as_json
 from .choice import advice, model_notes, model_rows, shown_in
@@ -48,16 +49,6 @@ UNITS = ("Pa", "s", "1/s", "kg/m³")
 MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answer."
 
 
-@dataclass(frozen=True)
-class View:
-    """A table of texts, the first columns to the left and the others to the right."""
-
-    title: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    names: int = 1
-
-
 @dataclass(frozen=True, eq=False)
 class Report:
     """A study's numbers, finished or not.
@@ -85,7 +76,7 @@ class Report:
         return [run_row(run, self.records.get(run.key), self.yardstick) for run in self.planned]
 
     @property
-    def views(self) -> list[View]:
+    def views(self) -> list[Table]:
         """The tables people look at, each within 80 columns."""
         if self.kind == "compare":
             return comparison_views(method_rows(self.rows))
@@ -103,7 +94,7 @@ class Report:
         return sweep_sentences(self.rows)
 
     @property
-    def tables(self) -> list[View]:
+    def tables(self) -> list[Table]:
         """The same with heads in words, and a comparison's runs: for pages, where there is room."""
         views = [replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.views]
         return [*views, run_view(self.rows)] if self.kind == "compare" else views
@@ -151,7 +142,7 @@ def write_report(report: Report, folder: Path) -> None:
     if report.kind == "compare":
         write_whole(folder / "summary.csv", as_csv(method_rows(rows)))
     write_whole(folder / "summary.json", as_json(report_json(report)) + "\n")
-    write_whole(folder / "summary.md", as_markdown(report))
+    write_whole(folder / "summary.md", as_markdown([report_section(report)]))
     if report.kind == "models":
         figures = {}
     elif report.kind == "compare":
@@ -175,7 +166,7 @@ def report_json(report: Report) -> dict[str, Any]:
         "runs": rows,
         "headline": report.headline,
         "notes": report.notes,
-        "tables": [asdict(view) for view in report.tables],
+        "tables": report.tables,
         "failures": report.failures,
     }
     if report.kind == "compare":
@@ -201,18 +192,12 @@ def as_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def as_markdown(report: Report) -> str:
+def report_section(report: Report) -> Section:
     """The views and the failures for a paper's appendix or an issue."""
-    parts = [f"# {report.title}", *report.headline, *report.notes]
-    for view in report.views:
-        numbers = len(view.heads) - view.names
-        lines = [view.heads, ("---",) * view.names + ("---:",) * numbers, *view.rows]
-        table = "\n".join("| " + " | ".join(map(_escaped, line)) + " |" for line in lines)
-        parts.append(f"## {view.title}\n\n{table}")
-    if report.failures:
-        listed = "\n".join(f"- {failure}" for failure in report.failures)
-        parts.append(f"## Runs without an answer\n\n{listed}")
-    return "\n\n".join(parts) + "\n"
+    failures = (Items(tuple(report.failures)),) if report.failures else ()
+    without = tuple(Section("Runs without an answer", (each,)) for each in failures)
+    parts = (*report.headline, *report.notes, *report.views, *without)
+    return Section(report.title, parts, level=1)
 
 
 def _in_words(head: str) -> str:
@@ -222,16 +207,12 @@ def _in_words(head: str) -> str:
     return WORDS.get(head, f"{symbol} [{unit}]" if space and unit in UNITS else head)
 
 
-def _escaped(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
 # Views --------------------------------------------------------------------------------------------
 
 Cell = Callable[[Row], str]
 
 
-def comparison_views(summaries: Sequence[Row]) -> list[View]:
+def comparison_views(summaries: Sequence[Row]) -> list[Table]:
     """Success, quality and cost of every method."""
     errors = [name for name in summaries[0] if name.startswith("error_")]
     success: dict[str, Cell] = {
@@ -266,7 +247,7 @@ def comparison_views(summaries: Sequence[Row]) -> list[View]:
     ]
 
 
-def run_view(rows: Sequence[Row]) -> View:
+def run_view(rows: Sequence[Row]) -> Table:
     """Every run of a comparison."""
     names = {"start": _text("start"), "method": _text("method")}
     cells: dict[str, Cell] = {
@@ -311,13 +292,12 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
     return said
 
 
-def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:
+def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
     """Estimates and quality against the swept values."""
     places = {short: _swept(key) for key, short in short_keys(swept)}
     estimates: dict[str, Cell] = {}
     for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
-        symbol, unit = symbol_of(name), unit_of(name)
-        estimates[f"{symbol} {unit}".strip()] = _estimate(name)
+        estimates[with_unit(name)] = _estimate(name)
     quality = {
         "status": _text("status"),
         "markers mm": _number("rms_m", 1e3),
@@ -331,7 +311,7 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[View]:
     ]
 
 
-def model_views(rows: Sequence[Row]) -> list[View]:
+def model_views(rows: Sequence[Row]) -> list[Table]:
     """Fit and prediction of every model, and what its small-strain moduli are."""
     factor, unit = shown_in(rows[0]["unit"])
     numbers: dict[str, Cell] = {
@@ -345,8 +325,7 @@ def model_views(rows: Sequence[Row]) -> list[View]:
     moduli: dict[str, Cell] = {}
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
-        text = f"{symbol_of(name)} {unit_of(name)}".strip()
-        moduli[text] = lambda row, name=name: _value(row["parameters"].get(name))
+        moduli[with_unit(name)] = lambda row, name=name: _value(row["parameters"].get(name))
     model = {"": lambda row: "→" if row["chosen"] else "", "model": _text("model")}
     views = [_view("Models", model, numbers, rows)]
     held = {
@@ -360,11 +339,11 @@ def model_views(rows: Sequence[Row]) -> list[View]:
 
 def _turned(
     title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
-) -> View:
+) -> Table:
     """A view with a line for each cell and a column for each row."""
     (name,) = names.values()
     lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
-    return View(title, ("", *(name(row) for row in rows)), lines)
+    return Table(title, ("", *(name(row) for row in rows)), lines)
 
 
 def _held_out(name: str, factor: float) -> Cell:
@@ -383,10 +362,10 @@ def _value(value: float | None, factor: float = 1.0, form: str = ".4g") -> str:
 
 def _view(
     title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
-) -> View:
+) -> Table:
     columns = {**names, **numbers}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
-    return View(title, tuple(columns), cells, len(names))
+    return Table(title, tuple(columns), cells, len(names))
 
 
 def _text(name: str) -> Cell:

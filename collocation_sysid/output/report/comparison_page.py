@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...display import Items, Line, Picture, Section, Table
 from ...files import damage_refused, read_json
-from .page import own_pictures, picture, rendered
+from ...tree import read
+from .page import own_pictures
 
 SUMMARY_FILE = "summary.json"
 CAPTIONS = {
@@ -18,8 +22,21 @@ CAPTIONS = {
 }
 
 
-def comparison_page(folder: str | Path) -> str:
-    """The page of a study's folder.
+@dataclass(frozen=True)
+class StudySummary:
+    """What the page needs of ``summary.json``."""
+
+    title: str
+    problem: str
+    headline: tuple[str, ...]
+    runs: tuple[Mapping[str, Any], ...]
+    notes: tuple[str, ...]
+    tables: tuple[Table, ...]
+    failures: tuple[str, ...]
+
+
+def comparison_report(folder: str | Path) -> Section:
+    """What there is to say of a study's folder.
 
     Raises
     ------
@@ -27,22 +44,20 @@ def comparison_page(folder: str | Path) -> str:
         If it is not such a folder, or damaged.
     """
     folder = Path(folder)
-    summary = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
+    content = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
     with damage_refused(folder, SUMMARY_FILE, "repeat the study, finished runs are kept"):
-        return rendered(
-            "comparison.html",
-            summary=summary,
-            runs=len(summary["runs"]),
-            tables=[_checked(table) for table in summary["tables"]],
-            pictures=[
-                picture(file, CAPTIONS.get(file.stem, file.stem)) for file in own_pictures(folder)
-            ],
+        found = read(StudySummary, content)
+        pictures = [Picture(f, CAPTIONS.get(f.stem, f.stem)) for f in own_pictures(folder)]
+        ended = {"Runs without an answer": [Items(found.failures)] if found.failures else []}
+        titled = {**ended, "Pictures": pictures}
+        return Section(
+            found.title,
+            (
+                Line(f"{len(found.runs)} runs of {found.problem}", "quiet"),
+                Section("", found.headline, style="verdict good"),
+                *(Line(note, "quiet") for note in found.notes),
+                *found.tables,
+                *(Section(title, tuple(each)) for title, each in titled.items() if each),
+            ),
+            level=1,
         )
-
-
-def _checked(table: dict[str, Any]) -> dict[str, Any]:
-    """A table whose rows are texts and as wide as its heads."""
-    rows = [[str(cell) for cell in row] for row in table["rows"]]
-    if any(len(row) != len(table["heads"]) for row in rows):
-        raise ValueError(f"the table {table['title']!r} has rows of another length")
-    return {**table, "rows": rows, "names": int(table["names"])}

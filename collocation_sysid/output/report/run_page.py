@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from ...display import Cards, Items, Line, Listing, Picture, Section, Shown, Span, Table
 from ...experiment.nuisance import in_unit_for_people
-from ...fem.constants import symbol_of, unit_of
+from ...fem.constants import symbol_of, unit_of, with_unit
 from ...files import is_own
 from ...result import Result
-from ...statistics.places import Place
+from ...statistics.numerical import NumericalError
+from ...statistics.trust import Trust
 from ...tree import content
 from ..remedies import remedies_for
 from ..replay import LARGEST, read_arrays, reading_run
-from .page import millimetres, number, own_pictures, picture, rendered
+from .page import own_pictures
 
 MEANINGS = {
     "good": "nothing speaks against the answer and its error bars",
@@ -43,8 +46,8 @@ CAPTIONS = {
 }
 
 
-def run_page(run: str | Path) -> str:
-    """The page of a run folder.
+def run_report(run: str | Path) -> Section:
+    """What there is to say of a run folder.
 
     Raises
     ------
@@ -54,26 +57,54 @@ def run_page(run: str | Path) -> str:
     run = Path(run)
     result = Result.read(run)
     with reading_run(run):
-        parameters = _parameters(result)
-        return rendered(
-            "run.html",
-            result=result,
-            trust=result.trust,
-            meaning=MEANINGS[result.trust.verdict],
-            remedies=remedies_for(result.trust.concerns),
-            numbers=_numbers(result),
-            verdict=verdict(result),
-            notes=_notes(result),
-            parameters=parameters,
-            holds=max((row["holds"] for row in parameters), key=len, default=[]),
-            places=_places(result),
-            nuisance=_nuisance(result),
-            worst=_worst_errors(run),
-            pictures=_pictures(run),
-            problem=_problem(run),
-            size=content(result.problem),
-            provenance=content(result.provenance),
-        )
+        trust, title, found = result.trust, result.title or "Run", result.uncertainty
+        took = f"{result.iterations} iterations, {number(result.timing_s.total, 3)} s"
+        parts: list[Shown] = [
+            Line(
+                (
+                    Span(result.status, f"badge {trust.verdict}"),
+                    Span(f" {result.method}, {took}"),
+                ),
+                "quiet",
+            ),
+            Section("", tuple(_reasons(trust)), style=f"verdict {trust.verdict}"),
+            _cards(result),
+            *verdict(result),
+            *_section("What to do", *_cures(trust)),
+            Section("Parameters", tuple(_parameters(result))),
+        ]
+        if found is not None:
+            chi = number(found.reduced_chi_squared, 3)
+            said = f"Error bars for {found.errors} errors, noise {found.noise}; reduced χ² {chi}."
+            profiles = (profile.sentence for profile in found.profiles.values())
+            parts += [Line(said, "quiet"), Items((*found.verdicts, *profiles))]
+        parts += [*_places(result), *_nuisance(result)]
+        if notes := _notes(result):
+            parts.append(Section("Notes", (Items(tuple(notes)),)))
+        parts += [
+            Section("Residuals", tuple(_residuals(result, run))),
+            Section("Pictures", tuple(_pictures(run))),
+            Section("Problem and provenance", tuple(_provenance(result, run))),
+        ]
+        return Section(title, tuple(parts), level=1)
+
+
+def _section(title: str, *parts: Shown) -> list[Section]:
+    return [Section(title, parts)] if parts else []
+
+
+def _reasons(trust: Trust) -> Iterator[Line]:
+    yield Line((Span(f"Verdict: {trust.verdict}", "strong"), Span(f", {MEANINGS[trust.verdict]}.")))
+    for concern in trust.concerns:
+        cure = Span("what to do", to=f"#cure-{concern.topic}")
+        yield Line((Span(f"– {concern.sentence} ("), cure, Span(")")))
+
+
+def _cures(trust: Trust) -> Iterator[Line]:
+    for topic, remedy in remedies_for(trust.concerns).items():
+        about, page = Span(f"{remedy.about}.", "strong"), f"docs/howto/{remedy.page}.md"
+        more = (Span(f" {remedy.cure} More in the how-to page "), Span(page, "code"), Span("."))
+        yield Line((about, *more), name=f"cure-{topic}")
 
 
 def verdict(result: Result) -> list[str]:
@@ -97,30 +128,23 @@ def verdict(result: Result) -> list[str]:
     return said
 
 
-def _numbers(result: Result) -> list[dict[str, str]]:
+def _cards(result: Result) -> Cards:
     """The three numbers that matter: stiffness, misfit, and how well the answer repeats it."""
     found = result.values
     name = next((key for key in FOREMOST if key in found), next(iter(found)))
     low, high = found[name].ci95 or (None, None)
     interval = "no error bar" if low is None else f"{number(low, 4)} to {number(high, 4)} (95 %)"
     fit, rolled = result.fit, result.rollout
-    return [
-        {
-            "what": symbol_of(name),
-            "value": f"{number(found[name].value, 4)} {unit_of(name)}".strip(),
-            "beside": interval,
-        },
-        {
-            "what": "markers, fitted",
-            "value": millimetres(fit.rms_m),
-            "beside": f"RMS; noise alone leaves {millimetres(fit.noise_rms_m)}",
-        },
-        {
-            "what": "markers, re-simulated",
-            "value": millimetres(rolled.rms_m),
-            "beside": f"RMS; {millimetres(rolled.max_m)} at most",
-        },
-    ]
+    stiffness = f"{number(found[name].value, 4)} {unit_of(name)}".strip()
+    alone = f"RMS; noise alone leaves {millimetres(fit.noise_rms_m)}"
+    most = f"RMS; {millimetres(rolled.max_m)} at most"
+    return Cards(
+        (
+            (symbol_of(name), stiffness, interval),
+            ("markers, fitted", millimetres(fit.rms_m), alone),
+            ("markers, re-simulated", millimetres(rolled.rms_m), most),
+        )
+    )
 
 
 def _notes(result: Result) -> list[str]:
@@ -142,65 +166,108 @@ def _weakest(result: Result) -> list[str]:
     return said
 
 
-def _parameters(result: Result) -> list[dict[str, Any]]:
-    rows = []
-    for name, found in result.values.items():
-        low, high = found.ci95 or (None, None)
-        rows.append(
-            {
-                "symbol": symbol_of(name),
-                "unit": unit_of(name),
-                "value": found.value,
-                "std_error": found.std_error,
-                "low": low,
-                "high": high,
-                "reason": "fixed" if found.fixed else found.reason,
-                "guess": found.guess,
-                "derived": found.fixed is None,
-                "numerical": found.numerical_error,
-                "holds": found.ci95_holds,
-            }
+def _parameters(result: Result) -> Iterator[Shown]:
+    """Values with their intervals, and what is known of the numerical error."""
+    rows, values = [], result.values
+    for name, found in values.items():
+        interval = "–" if found.ci95 is None else " … ".join(number(x, 4) for x in found.ci95)
+        reason = "fixed" if found.fixed else found.reason or ""
+        numbers = number(found.value, 4), interval, number(found.std_error, 2), number(found.guess)
+        rows.append((with_unit(name), *numbers, reason))
+    heads = ("", "value", "95 % interval", "±", "guess", "")
+    yield Table("", heads, tuple(rows), texts=1, faint=_derived(result, values))
+    holds = max((found.ci95_holds for found in values.values()), key=len, default=())
+    if holds:
+        yield Line(f"Intervals hold: {', '.join(holds)}.", "quiet")
+    errors = {n: e for n, each in values.items() if (e := each.numerical_error) is not None}
+    if errors and "mesh" in holds:
+        said = "What half the step and half the edge lengths change, and where both tend to."
+    else:
+        said = (
+            "What half the step would change, to first order, and where that tends to; refine "
+            "measures it, and what the mesh does."
         )
-    return rows
+    if errors:
+        yield Section("Numerical error", (Line(said, "quiet"), _numerical(result, errors)), 3)
 
 
-def _places(result: Result) -> dict[str, list[dict[str, Any]]]:
+def _numerical(result: Result, errors: Mapping[str, NumericalError]) -> Table:
+    measured = any("mesh" in found.ci95_holds for found in result.values.values())
+    heads, rows = ("", "step", *["order", "mesh", "order"] * measured, "limit"), []
+    for name, error in errors.items():
+        mesh = number(error.step_order, 2), number(error.mesh, 3), number(error.mesh_order, 2)
+        limit = number(error.extrapolated)
+        rows.append((with_unit(name), number(error.step, 3), *(mesh if measured else ()), limit))
+    return Table("", heads, tuple(rows), faint=_derived(result, errors))
+
+
+def _derived(result: Result, names: Iterable[str]) -> tuple[int, ...]:
+    """The rows of what follows from parameters."""
+    return tuple(k for k, name in enumerate(names) if name in result.derived)
+
+
+def _places(result: Result) -> Iterator[Section]:
     """By experiment the places of the markers in millimetres."""
-    return {
-        experiment: [
-            {
-                "marker": marker,
-                "coordinates": _coordinates(place),
-                "prior": "exact" if place.prior_m == 0 else _size(place.prior_m, "m"),
-                "given": place.given,
-            }
-            for marker, place in places.items()
-        ]
-        for experiment, places in result.places.items()
-    }
+    said = (
+        "On the undeformed body, in millimetres, each with its standard error. Those that were not "
+        "given have a prior as wide as the body."
+    )
+    for experiment, places in result.places.items():
+        rows = []
+        for marker, place in places.items():
+            errors_m = [None] * 3 if place.std_error_m is None else place.std_error_m
+            cells = []
+            for x, error in zip(place.position_m, errors_m, strict=True):
+                cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
+            prior = "exact" if place.prior_m == 0 else _size(place.prior_m, "m")
+            rows.append((marker, *cells, prior, "" if place.given else "not given"))
+        heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
+        table = Table("", heads, tuple(rows), texts=1)
+        title = f"Places of the markers of '{experiment}'"
+        yield from _section(title, Line(said, "quiet"), table)
 
 
-def _coordinates(place: Place) -> list[tuple[str, str]]:
-    """Each coordinate with its error, in millimetres."""
-    errors_m = [None] * 3 if place.std_error_m is None else place.std_error_m
-    return [
-        (f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2))
-        for x, error in zip(place.position_m, errors_m, strict=True)
-    ]
-
-
-def _nuisance(result: Result) -> dict[str, list[dict[str, Any]]]:
+def _nuisance(result: Result) -> Iterator[Section]:
     """By experiment its other nuisance parameters in units for people."""
-    tables = {}
+    said = "Of this recording alone, estimated beside the parameters with a prior about zero."
     for experiment, named in result.nuisance.items():
-        tables[experiment] = []
+        rows = []
         for label, found in named.items():
             words, _, unit = label.rstrip("]").rpartition(" [")
-            cells = {
-                key: _size(getattr(found, key), unit) for key in ("value", "std_error", "prior")
-            }
-            tables[experiment].append({"label": words, **cells})
-    return tables
+            sizes = (found.value, found.std_error, found.prior)
+            rows.append((words, *(_size(each, unit) for each in sizes)))
+        table = Table("", ("", "value", "±", "prior ±"), tuple(rows))
+        title = f"Nuisance parameters of '{experiment}'"
+        yield from _section(title, Line(said, "quiet"), table)
+
+
+def _residuals(result: Result, run: Path) -> Iterator[Shown]:
+    """What each marker's residuals suggest, and the largest errors."""
+    if result.residuals:
+        rows = tuple(
+            (
+                f"{each.experiment}/{each.marker}",
+                millimetres(each.rms_m),
+                str(each.samples),
+                each.sentence.partition(": ")[2] or each.sentence,
+            )
+            for each in result.residuals
+        )
+        yield Table("", ("marker", "RMS", "samples", "suggests"), rows, texts=1)
+    if worst := _worst_errors(run):
+        rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
+        yield from ("The largest errors:", Table("", ("marker", "time", "error"), rows))
+
+
+def _provenance(result: Result, run: Path) -> Iterator[Shown]:
+    violated, share = result.dynamics.max_violation_n, result.dynamics.max_violation_relative
+    said = f"{number(violated, 2)} N ({number(share, 2)} of the largest force)"
+    rows = content(result.problem) | {"dynamics violated by at most": said}
+    rows |= content(result.provenance)
+    yield Table("", (), tuple((key, str(each)) for key, each in rows.items()), texts=1)
+    file = run / "problem.toml"
+    if is_own(run, file):
+        yield Listing("The problem file as run", file.read_text(encoding="utf-8"))
 
 
 def _size(value: float | None, unit: str) -> str:
@@ -211,8 +278,20 @@ def _size(value: float | None, unit: str) -> str:
     return "–" if value is None else f"{number(factor * value, digits)}{shown}"
 
 
-def _worst_errors(run: Path) -> list[dict[str, Any]]:
-    """The largest residuals, with time and marker."""
+def number(value: float | None, digits: int = 5) -> str:
+    """A number as people write it; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def millimetres(metres: float | None) -> str:
+    """A length in millimetres, to the micrometre at most."""
+    return "–" if metres is None or math.isnan(metres) else f"{1e3 * metres:.3g} mm"
+
+
+def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
+    """The largest residuals [m], with time and marker."""
     arrays, found = read_arrays(run), []
     for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
         prefix = key.removesuffix("residuals_m")
@@ -222,50 +301,26 @@ def _worst_errors(run: Path) -> list[dict[str, Any]]:
         if residuals_m.shape != shape or largest > LARGEST:
             raise ValueError(f"{key} does not go with its times and markers")
         errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
-        found += _peaks(prefix.rstrip("/"), errors, t_s, markers)
-    return sorted(found, key=lambda item: -item["error_m"])[:WORST]
+        for _ in range(WORST if errors.size else 0):
+            t, m = np.unravel_index(int(errors.argmax()), errors.shape)
+            if not errors[t, m] > 0:
+                break
+            found.append((float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}"))
+            errors[max(0, t - APART) : t + APART + 1, m] = 0
+    return sorted(found, key=lambda each: -each[0])[:WORST]
 
 
-def _peaks(
-    experiment: str, errors: np.ndarray, t_s: np.ndarray, markers: np.ndarray
-) -> list[dict[str, Any]]:
-    errors, found = errors.copy(), []
-    for _ in range(WORST if errors.size else 0):
-        t, m = np.unravel_index(int(errors.argmax()), errors.shape)
-        if not errors[t, m] > 0:
-            break
-        found.append(
-            {
-                "experiment": experiment,
-                "t_s": float(t_s[t]),
-                "marker": str(markers[m]),
-                "error_m": float(errors[t, m]),
-            }
-        )
-        errors[max(0, t - APART) : t + APART + 1, m] = 0
-    return found
-
-
-def _pictures(run: Path) -> list[dict[str, Any]]:
+def _pictures(run: Path) -> Iterator[Picture]:
     """Every PNG of the folder, those known here first."""
     order = list(CAPTIONS)
 
     def kind(file: Path) -> str:
         return next((k for k in order if file.stem.startswith(k)), "")
 
-    files = sorted(
-        own_pictures(run),
-        key=lambda f: (order.index(kind(f)) if kind(f) else len(order), f.name),
-    )
-    found = []
-    for file in files:
+    def place(file: Path) -> tuple[int, str]:
+        return order.index(kind(file)) if kind(file) else len(order), file.name
+
+    for file in sorted(own_pictures(run), key=place):
         about = file.stem.removeprefix(kind(file)).strip("_")
         caption = CAPTIONS.get(kind(file), file.stem)
-        title = f"{about}: {caption}" if about and kind(file) else caption
-        found.append(picture(file, title))
-    return found
-
-
-def _problem(run: Path) -> str:
-    file = run / "problem.toml"
-    return file.read_text(encoding="utf-8") if is_own(run, file) else ""
+        yield Picture(file, f"{about}: {caption}" if about and kind(file) else caption)

@@ -1,0 +1,70 @@
+"""One description, seen in a terminal, a browser, Markdown and JSON."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from collocation_sysid.display import (
+    Cards,
+    Items,
+    Line,
+    Listing,
+    Section,
+    Span,
+    Table,
+    as_html,
+    as_markdown,
+    labelled,
+    plain_text,
+)
+from collocation_sysid.tree import as_json, content, read
+
+NUMBERS = Table(
+    "Estimates", ("", "value", ""), (("E Pa", "1500", "a|b"), ("ν", "0.3", "")), texts=1
+)
+REPORT = Section(
+    "Foam & <silicone>",
+    (
+        Line((Span("Verdict: check", "strong"), Span(", see "), Span("why", to="#cure")), "check"),
+        Cards((("E", "1500 Pa", "±3"),)),
+        NUMBERS,
+        Section("Notes", (Items(("one", "two")), Listing("The file", "a = 1"))),
+    ),
+    level=1,
+)
+
+
+def test_a_terminal_shows_numbers_to_the_right_and_texts_to_the_left():
+    lines = plain_text(REPORT).splitlines()
+    assert lines[:2] == ["Foam & <silicone>", "Verdict: check, see why"]
+    assert "E Pa   1500  a|b" in lines
+    assert "ν       0.3" in lines
+    assert lines[-4:] == ["- one", "- two", "The file", "a = 1"]
+
+
+def test_a_page_escapes_texts_and_leads_to_names():
+    page = as_html(REPORT)
+    assert "<h1>Foam &amp; &lt;silicone&gt;</h1>" in page
+    assert (
+        '<p class="check"><strong>Verdict: check</strong>, see <a href="#cure">why</a></p>' in page
+    )
+    assert '<tr><td>E Pa</td><td class="n">1500</td><td>a|b</td></tr>' in page
+    assert "<details><summary>The file</summary><pre>a = 1</pre></details>" in page
+
+
+def test_markdown_keeps_cells_apart():
+    text = as_markdown([REPORT])
+    assert text.startswith(
+        "# Foam & <silicone>\n\n**Verdict: check**, see why\n\n- E: 1500 Pa (±3)\n"
+    )
+    assert "## Estimates\n\n|  | value |  |\n| --- | ---: | --- |\n| E Pa | 1500 | a\\|b |" in text
+    assert "## Notes\n\n- one\n- two\n\nThe file:\n\n```\na = 1\n```" in text
+
+
+def test_json_has_what_was_described():
+    assert read(Table, json.loads(as_json(NUMBERS))) == NUMBERS
+    assert content(labelled("Body", {"mesh": "8 nodes"}))["rows"] == [["  mesh ", "8 nodes"]]
+    with pytest.raises(ValueError, match="rows of another length"):
+        Table("", ("a", "b"), (("1",),))
