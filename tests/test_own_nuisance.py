@@ -81,14 +81,15 @@ def test_derivatives_beside_all_others_and_shared(rng):
 # Every one by one method; by the others one of them.
 FOUND_BY = [
     *((name, "reduced-space") for name in ROWS),
-    *(("camera_scale", each) for each in ("interior-point", "shooting")),
+    ("camera_scale", "shooting"),
+    ("clock_drift", "interior-point"),
 ]
 
 
 @pytest.mark.parametrize(("name", "method"), FOUND_BY)
 def test_what_a_user_adds_is_found_beside_the_material(name: str, method: str, rng):
-    steps = 14 if method == "reduced-space" else 9
-    cube = known_to(replace(cube_with_gaps(steps), nuisance=only(ROWS[name])), 1e-7)
+    steps, sigma_m = (14, 1e-7) if method == "reduced-space" else (9, 1e-5)
+    cube = known_to(replace(cube_with_gaps(steps), nuisance=only(ROWS[name])), sigma_m)
     phi = rng.uniform(-1, 1, NuisanceMap.of(cube).size)
     solution = solve(cs.Problem([seen_with(cube, phi)], GUESS), method)
     assert solution.status.converged

@@ -166,6 +166,22 @@ def test_places_found_once_leave_the_data_to_tell_of_the_material():
     assert spreads[1] < 0.7 * spreads[0]
 
 
+def test_methods_agree_where_clamp_and_clock_are_shared():
+    """Interior point's held dofs follow from φ that move the grasps of both."""
+    words = dict.fromkeys(("hand_eye_rad", "hand_eye_m", "time_shift_s"), "shared")
+    nuisance = Nuisance.none(gravity_rad=0.02, time_shift_s=2e-3, scope=words)
+    nuisance = replace(nuisance, hand_eye_rad=0.02, hand_eye_m=1e-3)
+    cube = hung_cube(6, (1, 1, 2), nuisance=nuisance)
+    pair = [noisy(cube, 2e-4), noisy(swung_again(cube, "again"), 2e-4, seed=8)]
+    drag = Parameters(tuple(replace(p, fixed=p.name == "gamma_m_1_s") for p in GUESS.items))
+    first, second = (solve(Problem(pair, drag), m) for m in ("reduced-space", "interior-point"))
+    assert second.status.converged
+    assert second.collocation.nphi == 2 * 2 + 7
+    np.testing.assert_allclose(second.theta, first.theta, rtol=1e-4)
+    found = [each.collocation.parameters_of(each.z)[3:] for each in (first, second)]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-3)
+
+
 # What cannot be shared
 
 
