@@ -23,7 +23,7 @@ from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.nlp.dynamics import Dynamics
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.stopwatch import Stopwatch
-from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.nlp.sweep import Sweep
 
 LAWS = ("rayleigh", "kelvin-voigt")
 
@@ -82,7 +82,7 @@ def sweep_of(
 
     def sweep() -> tuple[float, ...]:
         watch, began = Stopwatch(), time.perf_counter()
-        BlockSolver(segment, stopwatch=watch).forward(part.x, part.setting)
+        Sweep(segment, stopwatch=watch).forward(part.x, part.setting)
         return time.perf_counter() - began, watch.evaluations, watch.linear_algebra
 
     sweep()

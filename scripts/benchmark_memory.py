@@ -19,7 +19,7 @@ import numpy as np
 
 from collocation_sysid import Body, Collocation, Experiment, Parameters, Problem, Unknown
 from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.nlp.sweep import Sweep
 
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -62,7 +62,7 @@ def sweep(
     (segment,) = collocation.segments
     setting = segment.setting(collocation.guess_p, np.zeros(segment.nuisance.size))
     x = march(experiment=segment.experiment, dynamics=setting.dynamics, theta=setting.theta)
-    solver = BlockSolver(segment)
+    solver = Sweep(segment)
     solver.forward(x, setting)
     return lambda: solver.forward(x, setting), 1 + len(segment.moving)
 

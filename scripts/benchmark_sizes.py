@@ -27,7 +27,7 @@ from collocation_sysid.nlp.factorisation import Choice
 from collocation_sysid.nlp.marching import march_on
 from collocation_sysid.nlp.newton import NewtonOptions
 from collocation_sysid.nlp.stopwatch import Stopwatch
-from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.nlp.sweep import Sweep
 
 # Rings x layers of the cylinder, element, and steps that are enough to tell, by nodes.
 SIZES = {
@@ -96,7 +96,7 @@ def measured(size: str, steps: int | None, threads: int, choice: Choice, damping
         raise failure
     march = Cost(clock() - began, spent)
     spent = Stopwatch(clock)
-    solver = BlockSolver(segment, stopwatch=spent, factorisation=choice)
+    solver = Sweep(segment, stopwatch=spent, factorisation=choice)
     # The analysis of the pattern is made once for all sweeps.
     numbers = solver.chunk_bytes
     began = clock()
@@ -110,7 +110,7 @@ def measured(size: str, steps: int | None, threads: int, choice: Choice, damping
     )
 
 
-def kind(solver: BlockSolver) -> str:
+def kind(solver: Sweep) -> str:
     """What factorises."""
     chosen = solver.factoriser
     if chosen.skyline:

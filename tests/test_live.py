@@ -115,7 +115,7 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     reached, failure = horizon.extend(p)
     assert failure is None
     point = horizon.evaluate(
-        p, [leg.x + leg.tangent.step for leg in horizon.evaluate(p, reached).legs]
+        p, [each.x + each.tangent.step for each in horizon.evaluate(p, reached).trajectories]
     )
     flat = live.model.flat(p)
     rows = np.column_stack([point.fit.slope, point.fit.residual - point.fit.slope @ flat])
@@ -124,7 +124,7 @@ def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
     priors = len(collocation.prior(p)[0]) + collocation.nq
-    measured = sum(len(leg.slope) for leg in point.legs)
+    measured = sum(len(each.slope) for each in point.trajectories)
     assert live.track.information.rows == measured + priors
 
 
@@ -285,7 +285,7 @@ def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(mo
         p = live.track.p + size * way
         whole = Track(live.model, p, live.prior, live._block_rows)
         state = live.track.blocks[1]
-        part = sweep.Sweep(live.model, p, live.prior, state.start, state.at)
+        part = sweep.LiveSweep(live.model, p, live.prior, state.start, state.at)
         for number, row in enumerate(live.log):
             whole.advance([row.poses])
             if number >= live._block_rows:

@@ -14,7 +14,7 @@ from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simul
 from collocation_sysid.nlp.collocation import Collocation, Part
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.nlp.sweep import Sweep
 
 KINDS = {
     "relaxed": ("hung-cube", {}),
@@ -70,22 +70,22 @@ def test_marched_trajectories_satisfy_the_equations(collocation: Collocation):
 def test_sensitivities_are_those_of_simulations(collocation: Collocation):
     p = some_parameters(collocation)
     part = marched(collocation, p)
-    found = BlockSolver(part.segment).forward(part.x, part.setting).by_p
+    found = Sweep(part.segment).forward(part.x, part.setting).by_p
     for k, place in enumerate(part.segment.moving):
         expected = directional_derivative(
             lambda at: marched(collocation, at).x, p, np.eye(len(p))[place]
         )
         assert relative_error(found[:, :, k], expected) < 1e-6
-    rows = BlockSolver(part.segment).sensitivities(part.x, part.setting)
+    rows = Sweep(part.segment).sensitivities(part.x, part.setting)
     np.testing.assert_array_equal(np.stack(list(rows)), found)
 
 
 def test_a_sweep_may_be_continued(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
     x, setting = disturbed(part), part.setting
-    known = BlockSolver(part.segment, 3).forward(x[:3], setting)
-    continued = BlockSolver(part.segment).forward(x, setting, known)
-    whole = BlockSolver(part.segment).forward(x, setting)
+    known = Sweep(part.segment, 3).forward(x[:3], setting)
+    continued = Sweep(part.segment).forward(x, setting, known)
+    whole = Sweep(part.segment).forward(x, setting)
     np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(continued.step, whole.step, rtol=1e-12, atol=1e-15)
 
@@ -93,7 +93,7 @@ def test_a_sweep_may_be_continued(collocation: Collocation):
 def test_the_feasibility_step_solves_the_linearised_equations(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
     segment, setting, x = part.segment, part.setting, disturbed(part)
-    step = BlockSolver(segment).forward(x, setting).step
+    step = Sweep(segment).forward(x, setting).step
     change = directional_derivative(lambda at: segment.residual_n(at, setting), x, step)
     assert relative_error(change, -segment.residual_n(x, setting)) < 1e-9
 
@@ -102,8 +102,8 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     part = marched(collocation, some_parameters(collocation))
     segment, setting, x = part.segment, part.setting, disturbed(part)
     gradient = rng.standard_normal(x.shape)
-    y = BlockSolver(segment).backward(x, setting, gradient)
-    step = BlockSolver(segment).forward(x, setting).step
+    y = Sweep(segment).backward(x, setting, gradient)
+    step = Sweep(segment).forward(x, setting).step
     residual = setting.dynamics.residual(x, setting.theta)
     residual[:, segment.held_dofs] = 0
     residual = setting.dynamics.without_taken(residual)

@@ -18,7 +18,7 @@ from collocation_sysid.fem.selection import Box
 from collocation_sysid.methods import METHODS
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters, Tied, Unknown
-from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.nlp.sweep import Sweep
 from collocation_sysid.statistics.uncertainty import covariance
 
 LEFT_HALF = Box((-1, -1, -1), (0.075, 1, 1))
@@ -156,7 +156,7 @@ def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypa
         collocation = Collocation([experiment], Parameters.of(stated))
         (segment,) = collocation.segments
         z = METHODS["reduced-space"](max_iterations=1)(collocation).z
-        solver = BlockSolver(segment)
+        solver = Sweep(segment)
         factorised = []
         factorise_each = solver.factoriser.factorise_each
 

@@ -13,7 +13,7 @@ from ..errors import SimulationError
 from ..methods.reduced_space import memory_mb
 from ..nlp.collocation import Collocation
 from ..nlp.factorisation import Choice
-from ..nlp.tangent import BlockSolver
+from ..nlp.sweep import Sweep
 from .memory import interior_point_mb, machine_memory_mb
 
 # Rows timed, and sweeps that the reduced space mostly takes.
@@ -112,7 +112,7 @@ def _sweeps_s(
     total = 0.0
     for segment, part in zip(collocation.segments, short.parts(z), strict=True):
         rows, setting = min(ROWS, len(part.x)), part.setting
-        solver = BlockSolver(part.segment, rows, factorisation=factorisation)
+        solver = Sweep(part.segment, rows, factorisation=factorisation)
         began = time.perf_counter()
         try:
             solver.forward(part.x[:rows], setting)

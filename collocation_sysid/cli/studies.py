@@ -128,7 +128,7 @@ def _planned_models(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep(Many):
+class SweepOptions(Many):
     """Options of `sweep`.
 
     Attributes
@@ -148,7 +148,7 @@ class Sweep(Many):
     "sweep problem.toml --over transcription.substeps=1,2,4",
     "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
 )
-def sweep(options: Sweep) -> None:
+def sweep(options: SweepOptions) -> None:
     """Solve for every combination of values of some keys."""
     method = parse_methods(options.method, "--method")[0] if options.method else None
     over, overrides = parse_over(options.over), options.set_ or ()

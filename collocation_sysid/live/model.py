@@ -26,7 +26,7 @@ from ..nlp.markers import NEIGHBOURS, MarkerReading
 from ..nlp.newton import NewtonOptions, Solver
 from ..nlp.row import Row
 from ..nlp.segment import Segment
-from ..nlp.tangent import BlockSolver
+from ..nlp.sweep import Sweep
 from ..problem import Problem
 
 if TYPE_CHECKING:
@@ -104,9 +104,9 @@ class Model:
         return self.collocation.segments[0]
 
     @cached_property
-    def solver(self) -> BlockSolver:
+    def solver(self) -> Sweep:
         """Of its rows."""
-        return BlockSolver(self.segment, self.rows)
+        return Sweep(self.segment, self.rows)
 
     @cached_property
     def newton(self) -> Solver:

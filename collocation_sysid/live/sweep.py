@@ -26,7 +26,7 @@ from ..nlp.newton import NewtonFailure, simulation_error
 from ..nlp.reading import as_squares
 from ..nlp.rest import start_state
 from ..nlp.row import Row
-from ..nlp.tangent import Columns, Forward, GivenMotion, Memory, Step
+from ..nlp.sweep import Columns, Forward, GraspMotion, LastRows, Step
 from .model import TOGETHER, Model, Poses
 
 # A row's correction over the body's size: the next one would be its square. Where rows are solved
@@ -85,7 +85,7 @@ class State:
         Rows done, and the place of the next one in the template.
     x, force : (rows, 3n) of the template
     given : (rows, g, 1 + m) of grasped dofs
-    memory : Memory, None at first
+    memory : LastRows, None at first
     read : tuple of rows with their markers, latest last
     """
 
@@ -94,11 +94,11 @@ class State:
     x: Array
     force: Array
     given: Array
-    memory: Memory | None
+    memory: LastRows | None
     read: tuple[Read, ...]
 
 
-class Sweep:
+class LiveSweep:
     """A pass at p.
 
     Parameters
@@ -186,7 +186,7 @@ class Sweep:
         self.x, self.force, self.given = state.x.copy(), state.force.copy(), state.given.copy()
         grasped = None
         if self.segment.nuisance.moves_grasps:
-            grasped = GivenMotion.along(self.solver, self.grasped, self.given)
+            grasped = GraspMotion.along(self.solver, self.grasped, self.given)
         self.columns = Columns(self.setting, self.count, step=True, grasped=grasped)
         self.forward = Forward(self.solver, self.columns, state.memory)
         most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
@@ -201,7 +201,7 @@ class Sweep:
     def state(self) -> State:
         """What the next row depends on."""
         arrays = self.x.copy(), self.force.copy(), self.given.copy()
-        return State(self.row, self.end, *arrays, self.forward.memory, tuple(self.read))
+        return State(self.row, self.end, *arrays, self.forward.last, tuple(self.read))
 
     # Rows -------------------------------------------------------------------------------------
 
@@ -297,7 +297,7 @@ class Sweep:
         solver, forward, (at, sides) = self.solver, self.forward, self._linearised(here)
         found: list[Array] = []
         for k, (t, right, force) in enumerate(zip(here, *sides, strict=True)):
-            row, before, whole = self._row(t), forward.memory, np.zeros(forward.shape)
+            row, before, whole = self._row(t), forward.last, np.zeros(forward.shape)
             parts, skew = (at.by_position[k], at.by_velocity[k]), at.by_position_skew[k]
             matrix = row.block(*parts, solver.pattern), row.skew_block(skew)
             found.append(whole)

@@ -20,7 +20,7 @@ from ..arrays import Array
 from ..nlp.least_squares import LeastSquares
 from .model import TOGETHER, Model, Poses
 from .statistics import Scatter
-from .sweep import Kept, LoggedRow, Said, State, Sweep
+from .sweep import Kept, LiveSweep, LoggedRow, Said, State
 
 # Readings that a pass may lack for its others to count; all are joined anew with each frame.
 LATE = 20
@@ -70,7 +70,7 @@ class Track:
         self.prior, self.base, self.block_rows = prior, base, block_rows
         self.start = (None, p) if first is None else (first.start, first.at)
         self.model = model
-        self.sweep = Sweep(model, p, prior.joined(model.stated(p)), *self.start)
+        self.sweep = LiveSweep(model, p, prior.joined(model.stated(p)), *self.start)
         self.blocks: list[Block] = []
         self._turns = [(0, self.sweep.flat)]
         self.failed = False
@@ -114,7 +114,7 @@ class Track:
 
     def turn(self, p: Array) -> None:
         """Go on from here at another p; what is done stays linearised where it was."""
-        self.sweep = Sweep(self.model, p, self.information, self.sweep.state, self.p)
+        self.sweep = LiveSweep(self.model, p, self.information, self.sweep.state, self.p)
         self._turns.append((self.rows, self.sweep.flat))
 
     @property

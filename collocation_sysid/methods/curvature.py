@@ -45,7 +45,7 @@ def exact_curvature(
     SimulationError
         Where a timestep's equations are singular.
     """
-    projected = [leg.x + leg.tangent.step for leg in point.legs]
+    projected = [each.x + each.tangent.step for each in point.trajectories]
     z = collocation.pack(point.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch)
     directions = np.column_stack([_direction(collocation, point, k) for k in range(len(point.p))])
@@ -58,7 +58,7 @@ def _direction(collocation: Collocation, point: Point, k: int) -> Array:
     """Variables per unit of p_k along the equations of motion."""
     unit = np.eye(len(point.p))[k]
     moved = [
-        leg.tangent.by_p @ unit[segment.places[segment.moving]]
-        for leg, segment in zip(point.legs, collocation.segments, strict=True)
+        each.tangent.by_p @ unit[segment.places[segment.moving]]
+        for each, segment in zip(point.trajectories, collocation.segments, strict=True)
     ]
     return collocation.pack(unit, moved)

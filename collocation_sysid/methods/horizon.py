@@ -16,8 +16,20 @@ from ..nlp.factorisation import Choice
 from ..nlp.lapack import one_blas_thread
 from ..nlp.least_squares import LeastSquares
 from ..nlp.stopwatch import Stopwatch
-from ..nlp.tangent import BlockSolver
-from .leg import Leg, Reached, Report, Seen, moved, reached, reread, seen, swept, trajectory, tried
+from ..nlp.sweep import Sweep
+from .trajectory import (
+    Reached,
+    Report,
+    Seen,
+    Trajectory,
+    moved,
+    positions,
+    reached,
+    reread,
+    seen,
+    swept,
+    tried,
+)
 from .workers import Here, Workers
 
 
@@ -28,22 +40,22 @@ class Point:
     Attributes
     ----------
     p : (np,) all parameters, see `Collocation.pack`
-    legs : list of Leg, one per experiment, kept where they were found
-    reports : list of Report, of the legs
+    trajectories : list of Trajectory, one per experiment, kept where they were found
+    reports : list of Report, of the trajectories
     fit : LeastSquares
         By a step from p: of markers after the feasibility step, sensors and priors.
     crossed : (np,) S_0ᵀ r of its residuals, with the slopes S_0 of the point it was tried from
     """
 
     p: Array
-    legs: list[Any]
+    trajectories: list[Any]
     reports: list[Report]
     fit: LeastSquares
     crossed: Array
 
     @cached_property
     def loss(self) -> float:
-        """Loss of the projected trajectory, priors included."""
+        """Loss of the projected positions, priors included."""
         return self.fit.loss(np.zeros(len(self.p)))
 
     @cached_property
@@ -69,7 +81,7 @@ class Point:
 class Horizon:
     """The NLP on the first rows of every experiment.
 
-    Trajectories are kept by the workers: of any kind that `trajectory` takes.
+    Trajectories are kept by the workers: of any kind that `positions` takes.
 
     Parameters
     ----------
@@ -100,7 +112,7 @@ class Horizon:
         self.read_in(collocation)
         with self.stopwatch.building():
             options = self._all(None), self._all(factorisation)
-            self.solvers = self.workers.each(BlockSolver, self.segments, self.rows, *options)
+            self.solvers = self.workers.each(Sweep, self.segments, self.rows, *options)
 
     def read_in(self, collocation: Collocation) -> None:
         """Take the same problem, read elsewhere."""
@@ -114,8 +126,8 @@ class Horizon:
         SimulationError
             Where it is singular or not finite.
         """
-        legs = known.legs if known else self._all(None)
-        return self._found(p, swept, x, legs)
+        trajectories = known.trajectories if known else self._all(None)
+        return self._found(p, swept, x, trajectories)
 
     def tried(self, p: Array, before: Point, step: Array) -> Point:
         """One sweep after a step from a point, static bodies in equilibrium where that is near.
@@ -125,17 +137,17 @@ class Horizon:
         SimulationError
             Where it is singular or not finite.
         """
-        return self._found(p, tried, before.legs, self._own(step))
+        return self._found(p, tried, before.trajectories, self._own(step))
 
     def reread(self, p: Array, point: Point) -> Point:
         """The point as the problem is read now, where its parameters are p."""
-        return self._found(p, reread, point.legs)
+        return self._found(p, reread, point.trajectories)
 
     @one_blas_thread()
-    def _found(self, p: Array, run: Callable[..., Leg], *columns: Sequence[Any]) -> Point:
+    def _found(self, p: Array, run: Callable[..., Trajectory], *columns: Sequence[Any]) -> Point:
         common = self.segments, self._all(self.collocation.huber), self._own(p)
-        legs = self.workers.each(run, self.solvers, *common, *columns)
-        reports: list[Report] = self.workers.fetch(self.workers.each(_report, legs))
+        trajectories = self.workers.each(run, self.solvers, *common, *columns)
+        reports: list[Report] = self.workers.fetch(self.workers.each(_report, trajectories))
         nq, places = self.collocation.nq, self.collocation.places
         fit, crossed = LeastSquares.none(len(p)), np.zeros(len(p))
         for report, own in zip(reports, places, strict=True):
@@ -151,7 +163,7 @@ class Horizon:
             fit = fit.add(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
-        return Point(p, legs, reports, fit, crossed)
+        return Point(p, trajectories, reports, fit, crossed)
 
     def extend(
         self, p: Array, x: Sequence[Any] | None = None, near: Point | None = None
@@ -160,7 +172,7 @@ class Horizon:
 
         Equilibria are looked for first where those of `near` are.
         """
-        known, beside = x or self._all(None), near.legs if near else self._all(None)
+        known, beside = x or self._all(None), near.trajectories if near else self._all(None)
         common = self.solvers, self.segments, self._own(p)
         found = self.workers.each(reached, *common, known, beside)
         failures = []
@@ -171,7 +183,7 @@ class Horizon:
 
     def moved(self, point: Point, step: Array) -> list[Any]:
         """Trajectories after a step of the parameters."""
-        return self.workers.each(moved, self.segments, point.legs, self._own(step))
+        return self.workers.each(moved, self.segments, point.trajectories, self._own(step))
 
     def seen(self, p: Array, x: Sequence[Any]) -> list[Seen]:
         """How trajectories fit that were not swept."""
@@ -195,17 +207,17 @@ class Horizon:
         return [value] * len(self.rows)
 
 
-def _report(leg: Leg) -> Report:
-    return leg.report
+def _report(found: Trajectory) -> Report:
+    return found.report
 
 
-def _rows(found: Leg | Reached | Array) -> int:
-    return len(trajectory(found))
+def _rows(found: Trajectory | Reached | Array) -> int:
+    return len(positions(found))
 
 
 def _end(found: Reached) -> tuple[SimulationError | None, tuple[float, float, float]]:
     return found.failure, found.spent
 
 
-def _first(found: Leg | Reached | Array, count: int) -> Array:
-    return trajectory(found)[:count]
+def _first(found: Trajectory | Reached | Array, count: int) -> Array:
+    return positions(found)[:count]

@@ -8,7 +8,7 @@ from ..arrays import Array
 from ..fem.batched import side_by_side
 from ..nlp.collocation import Collocation, Part
 from ..nlp.stopwatch import Stopwatch
-from ..nlp.tangent import BlockSolver
+from ..nlp.sweep import Sweep
 
 
 def constraint_multipliers(
@@ -27,7 +27,7 @@ def constraint_multipliers(
     def of(part: Part) -> Array:
         segment = part.segment
         gradient = collocation.loss_scale * part.gradient()[0]
-        solver = BlockSolver(segment, stopwatch=stopwatch)
+        solver = Sweep(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(part.x, part.setting, gradient)
         return segment.of_rows(y)
 

@@ -1,7 +1,7 @@
 """Reduced space: given θ the trajectory is determined, so only θ is searched for.
 
 Each iteration is a Gauss–Newton step on the same NLP as interior point's, with the same optimum.
-One factorisation a timestep gives the feasibility step p and the sensitivities Z (`nlp.tangent`);
+One factorisation a timestep gives the feasibility step p and the sensitivities Z (`nlp.sweep`);
 the step of all variables is (p + Z dq, dq), and dq solves a bounded least-squares problem in the
 few parameters,
 
@@ -30,14 +30,14 @@ from ..errors import InputError
 from ..fem.batched import at_once
 from ..nlp.collocation import Collocation
 from ..nlp.lapack import one_blas_thread
-from ..nlp.tangent import BlockSolver
+from ..nlp.sweep import Sweep
 from .curvature import require_second_derivatives
-from .leg import trajectory
 from .method import Watch
 from .recorder import Recorder
 from .search import Search, SearchOptions
 from .solution import Solution, Status
 from .start import completed
+from .trajectory import positions
 from .workers import Here, Workers
 
 # Misfits above this many standard deviations of the markers are worth a note.
@@ -75,7 +75,7 @@ class ReducedSpace(SearchOptions):
         search = Search(self, recorder, start, workers)
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
-        found = search.x and workers.fetch(workers.each(trajectory, search.x))
+        found = search.x and workers.fetch(workers.each(positions, search.x))
         z = completed(collocation, search.p, found)
         rows = [segment.grid_rows for segment in collocation.segments]
         reached = found is not None and [len(x) for x in found] == rows
@@ -89,7 +89,7 @@ def memory_mb(collocation: Collocation) -> float:
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
     numbers = columns * collocation.variables
-    chunks = sorted(BlockSolver(segment).chunk_bytes for segment in collocation.segments)
+    chunks = sorted(Sweep(segment).chunk_bytes for segment in collocation.segments)
     together = at_once(len(chunks), collocation.threads)
     return (8 * numbers + sum(chunks[-together:])) / 1e6
 

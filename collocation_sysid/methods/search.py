@@ -14,11 +14,11 @@ from ..nlp.factorisation import Choice
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
 from .ladder import FEWEST, SHARES, Shares, part_of
-from .leg import Seen
 from .options import Options
 from .recorder import Recorder
 from .secant import updated, with_curvature
 from .solution import Iteration, Status
+from .trajectory import Seen
 
 if TYPE_CHECKING:
     from ..nlp.collocation import Collocation
@@ -103,7 +103,7 @@ class Search:
         self.rereadings = 0
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
-        # Kept by the workers, see `leg.trajectory`.
+        # Kept by the workers, see `trajectory.positions`.
         self.x: list[Any] | None = None
         self.workers = workers
         if start is not None:
@@ -330,7 +330,7 @@ class Search:
         self.point = point = self._follow(rung, point)
         self.indefinite = sum(report.indefinite for report in point.reports)
         seen = [report.seen for report in point.reports]
-        self._record(point.p, point.legs, point.loss, seen)
+        self._record(point.p, point.trajectories, point.loss, seen)
         return point
 
     def _record(self, p: Array, x: list[Any], loss: float, seen: list[Seen]) -> None:

@@ -15,7 +15,7 @@ from ..fem.body import Linearisation
 from ..fem.pattern import SymmetricPattern
 from .block_band import Block, BlockBand, Term
 from .dynamics import Dynamics
-from .passing import PassingGrasps
+from .release import ReleasedGrasps
 from .unsymmetric import adding_skew, skew_values
 
 
@@ -118,9 +118,9 @@ class MotionRows:
         return self._inertia(self.dynamics, np.zeros(0))
 
     @cached_property
-    def _passing(self) -> PassingGrasps:
+    def _passing(self) -> ReleasedGrasps:
         scale = self.length_m / self.force_n
-        return PassingGrasps.of(
+        return ReleasedGrasps.of(
             self.dynamics, self.band, self._starts, self.pattern, self.row_dofs, scale
         )
 

@@ -22,7 +22,7 @@ from ..experiment.poses import PoseSequence
 from ..nlp.collocation import Collocation, Part
 from ..nlp.lapack import one_blas_thread
 from ..nlp.reaction import HeldForces
-from ..nlp.tangent import BlockSolver
+from ..nlp.sweep import Sweep
 
 # Samples of D η, and the fewest and the memory where bodies are large.
 DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
@@ -125,7 +125,7 @@ def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) ->
         _add_noise(moved, part, grasp, shifts, turns)
         off.append((grasp, shifts, turns))
     forces = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), count)
-    rows = BlockSolver(segment).response(part.x, part.setting, moved, forces)
+    rows = Sweep(segment).response(part.x, part.setting, moved, forces)
     response = part.sensing.read_along(rows, forces)
     motions, changes = part.sensing.moving(part.x, response, by_p=False), []
     for reading, motion in zip(segment.readings, motions, strict=True):

@@ -1,6 +1,6 @@
 """How the trajectory follows the parameters: Z = dx/dp with the equations of motion kept.
 
-From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.tangent`; p are the
+From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.sweep`; p are the
 shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
 """
 
@@ -14,7 +14,7 @@ from ..nlp.collocation import Collocation, Part
 from ..nlp.lapack import one_blas_thread
 from ..nlp.reaction import HeldForces
 from ..nlp.sensing import Response
-from ..nlp.tangent import BlockSolver
+from ..nlp.sweep import Sweep
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
@@ -28,7 +28,7 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
         Where the equations of a step are singular.
     """
     return [
-        np.stack(list(BlockSolver(part.segment).sensitivities(part.x, part.setting)))
+        np.stack(list(Sweep(part.segment).sensitivities(part.x, part.setting)))
         for part in collocation.parts(z)
     ]
 
@@ -46,7 +46,7 @@ def responses(collocation: Collocation, z: Array) -> list[Response]:
     def of(part: Part) -> Response:
         segment = part.segment
         held = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), len(segment.moving))
-        rows = BlockSolver(segment).sensitivities(part.x, part.setting, held)
+        rows = Sweep(segment).sensitivities(part.x, part.setting, held)
         return part.sensing.read_along(rows, held)
 
     return side_by_side(of, collocation.parts(z), collocation.threads)

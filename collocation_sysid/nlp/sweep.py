@@ -10,7 +10,8 @@ step of the scheme:
     −A = −∂c_t/∂x_t = −w_0 (p_0 G + q_0 C / Δt) + s_0 M / Δt²,
 
 and dF_t follows from the row itself. For the feasibility step p, R is c and F_R is zero; for
-Z = dx/dq, R is zero and F_R is ∂F/∂q. With memory F' has what it brings, see `nlp.memory`.
+Z = dx/dq, R is zero and F_R is ∂F/∂q. Grasped dofs that move have their Y given. With memory F' has
+what it brings, see `nlp.memory`.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Tangent:
         Largest |c|.
     indefinite : int
         Timesteps whose block −∂c_t/∂x_t is not positive definite.
-    memory : Memory
+    last : LastRows
         To continue with later rows.
     held : HeldForces
         Of the dofs of grasps whose wrench is measured, by the step and by p.
@@ -69,12 +70,12 @@ class Tangent:
     by_p: Array
     violation_n: float
     indefinite: int
-    memory: Memory
+    last: LastRows
     held: HeldForces
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class LastRows:
     """What the next row depends on, most recent row first.
 
     Attributes
@@ -113,7 +114,7 @@ class Chunk:
 
 
 @dataclass(frozen=True, eq=False)
-class GivenMotion:
+class GraspMotion:
     """Columns Y of grasped dofs, which are given: the way to their goals, and ∂goal/∂φ.
 
     Attributes
@@ -128,7 +129,7 @@ class GivenMotion:
     holds: NDArray[np.bool_]
 
     @classmethod
-    def along(cls, solver: BlockSolver, dofs: Index, columns: Array) -> GivenMotion:
+    def along(cls, solver: Sweep, dofs: Index, columns: Array) -> GraspMotion:
         """Those of dofs (g,) that move by `columns` (N, g, c)."""
         return cls(dofs, columns, solver.dynamics.taken[:, dofs] | ~np.isin(dofs, solver.free))
 
@@ -142,7 +143,7 @@ class GivenMotion:
         here = self.holds[t]
         solution[self.dofs[here]] = self.columns[t, here]
 
-    def force(self, solver: BlockSolver, step: Step) -> Array | float:
+    def force(self, solver: Sweep, step: Step) -> Array | float:
         """What their motion at t adds to F' (free, columns)."""
         now = np.where(self.holds[step.t, :, None], self.columns[step.t], 0.0)
         # What is only parameters of other kinds does not move them.
@@ -167,7 +168,7 @@ class Columns:
         Whether the last are by the parameters that move the body.
     step : bool
         Whether the first is the way to the equations.
-    grasped : GivenMotion, optional
+    grasped : GraspMotion, optional
         Where grasped dofs move.
     """
 
@@ -175,12 +176,10 @@ class Columns:
     count: int
     by_p: bool = True
     step: bool = False
-    grasped: GivenMotion | None = None
+    grasped: GraspMotion | None = None
 
     @classmethod
-    def by_parameters(
-        cls, solver: BlockSolver, setting: Setting, x: Array | None = None
-    ) -> Columns:
+    def by_parameters(cls, solver: Sweep, setting: Setting, x: Array | None = None) -> Columns:
         """By all that moves the body, and in front, where x (N, 3n) is given, the step from it."""
         first, count, grasped = int(x is not None), len(solver.segment.moving), None
         if setting.held.moves:
@@ -190,13 +189,13 @@ class Columns:
             columns[..., first + solver.segment.nq :] = held.by_phi[: len(goals)]
             if x is not None:
                 columns[..., 0] = np.nan_to_num(goals - x[:, held.dofs])
-            grasped = GivenMotion.along(solver, held.dofs, columns)
+            grasped = GraspMotion.along(solver, held.dofs, columns)
         return cls(setting, first + count, step=x is not None, grasped=grasped)
 
     @classmethod
-    def along(cls, solver: BlockSolver, setting: Setting, moved: Array) -> Columns:
+    def along(cls, solver: Sweep, setting: Setting, moved: Array) -> Columns:
         """By grasped dofs that move by `moved` (N, g, c)."""
-        grasped = GivenMotion.along(solver, setting.held.dofs, moved)
+        grasped = GraspMotion.along(solver, setting.held.dofs, moved)
         return cls(setting, grasped.count, by_p=False, grasped=grasped)
 
     def sides(
@@ -232,7 +231,7 @@ class Columns:
         return np.zeros((len(self.setting.theta), self.count))
 
 
-class BlockSolver:
+class Sweep:
     """Forward and backward substitution in time for the first rows of one experiment.
 
     Parameters
@@ -264,8 +263,8 @@ class BlockSolver:
         self.of_sensed = Submatrix(self.pattern, self.sensed)
         self._takes = bool(self.dynamics.taken.any())
 
-    def __reduce__(self) -> tuple[type[BlockSolver], tuple[Segment, int, None, Choice]]:
-        return BlockSolver, (self.segment, self.dynamics.rows, None, self.factorisation)
+    def __reduce__(self) -> tuple[type[Sweep], tuple[Segment, int, None, Choice]]:
+        return Sweep, (self.segment, self.dynamics.rows, None, self.factorisation)
 
     @one_blas_thread()
     def forward(self, x: Array, setting: Setting, known: Tangent | None = None) -> Tangent:
@@ -284,7 +283,7 @@ class BlockSolver:
         carried = Columns.by_parameters(self, setting, x)
         columns = np.zeros((*x.shape, carried.count))
         held = HeldForces.nothing(len(x), len(self.sensed), carried.count)
-        march = Forward(self, carried, known.memory if known else None, held)
+        march = Forward(self, carried, known.last if known else None, held)
         if known is not None:
             done = len(known.step)
             columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
@@ -293,7 +292,7 @@ class BlockSolver:
         for _ in march.rows(x, 0 if known is None else len(known.step), columns):
             pass
         found = columns[:, :, 0], columns[:, :, 1:], march.violation_n, march.indefinite
-        return Tangent(*found, march.memory, held)
+        return Tangent(*found, march.last, held)
 
     def sensitivities(
         self, x: Array, setting: Setting, held: HeldForces | None = None
@@ -376,7 +375,7 @@ class BlockSolver:
 
     @property
     def chunk_bytes(self) -> int:
-        """Memory that takes."""
+        """LastRows that takes."""
         return self.chunk * self._step_bytes
 
     @property
@@ -460,9 +459,9 @@ class Forward:
 
     def __init__(
         self,
-        solver: BlockSolver,
+        solver: Sweep,
         columns: Columns,
-        memory: Memory | None = None,
+        last: LastRows | None = None,
         held: HeldForces | None = None,
     ) -> None:
         self.solver, self.columns = solver, columns
@@ -471,21 +470,21 @@ class Forward:
         size, reach = solver.pattern.size, solver.dynamics.reach
         self.shape, self._of_free = (size, columns.count), (len(solver.free), columns.count)
         nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
-        memory = memory or Memory(*((each,) * reach for each in nothing))
-        self.past = deque(memory.solutions, maxlen=reach)
-        self.past_increments = deque(memory.increments, maxlen=reach)
-        self.past_forces = deque(memory.forces, maxlen=reach)
+        last = last or LastRows(*((each,) * reach for each in nothing))
+        self.past = deque(last.solutions, maxlen=reach)
+        self.past_increments = deque(last.increments, maxlen=reach)
+        self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
         self.slopes: Slopes | None = None
-        self._overstress = memory.overstress
+        self._overstress = last.overstress
 
     @property
-    def memory(self) -> Memory:
+    def last(self) -> LastRows:
         """What later rows depend on."""
         overstress = tuple(self.slopes.columns) if self.slopes else ()
         past = tuple(self.past), tuple(self.past_increments), tuple(self.past_forces)
-        return Memory(*past, overstress)
+        return LastRows(*past, overstress)
 
     def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
         """Y_t (3n, c) at x (N, 3n) after rows that are done, also into `out` (N, 3n, c)."""

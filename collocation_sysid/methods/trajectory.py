@@ -1,7 +1,7 @@
-"""One experiment's leg of a point of the search: what is done where its recording is.
+"""One experiment's trajectory at a point of the search: what is done where its recording is.
 
-A leg holds what grows with the timesteps and stays where it was found; a `Report` of it, which
-does not grow, is all that the search needs to know. Parameters p are the experiment's own (q, φ).
+It holds what grows with the timesteps and stays where it was found; a `Report` of it, which does
+not grow, is all that the search needs to know. Parameters p are the experiment's own (q, φ).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..nlp.marching import march_on
 from ..nlp.newton import NewtonOptions
 from ..nlp.reading import as_squares
 from ..nlp.segment import Segment
-from ..nlp.tangent import BlockSolver, Tangent
+from ..nlp.sweep import Sweep, Tangent
 from .start import continued
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
@@ -57,17 +57,17 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a search needs to know of a leg, of a size that does not grow with the timesteps.
+    """What a search needs to know of a trajectory, of a size that does not grow with the timesteps.
 
     Attributes
     ----------
     fit : LeastSquares
         Residuals by a step of the k parameters.
-    crossed : (k,) S_0ᵀ r with the slopes of the leg before; zeros where there was none
+    crossed : (k,) S_0ᵀ r with the slopes of the trajectory before; zeros where there was none
     feasibility_m : float
         Longest coordinate of the feasibility step.
     moved_m : float
-        The same of the way from the leg before.
+        The same of the way from the trajectory before.
     indefinite : int
         Timesteps whose equations are not positive definite.
     seen : Seen
@@ -85,7 +85,7 @@ class Report:
 
 
 @dataclass(frozen=True, eq=False)
-class Leg:
+class Trajectory:
     """A trajectory with what one sweep found there.
 
     Attributes
@@ -116,40 +116,40 @@ class Reached:
     spent: tuple[float, float, float]
 
 
-def trajectory(found: Leg | Reached | Array) -> Array:
+def positions(found: Trajectory | Reached | Array) -> Array:
     """The positions (rows, 3n) of what was found."""
     return found if isinstance(found, np.ndarray) else found.x
 
 
 def swept(
-    solver: BlockSolver,
+    solver: Sweep,
     segment: Segment,
     huber: float | None,
     p: Array,
-    start: Leg | Reached | Array,
-    known: Leg | None = None,
-    before: Leg | None = None,
-) -> Leg:
-    """One sweep; a known leg of the first rows, at the same p and positions, is continued.
+    start: Trajectory | Reached | Array,
+    known: Trajectory | None = None,
+    before: Trajectory | None = None,
+) -> Trajectory:
+    """One sweep; a known trajectory of the first rows, at the same p and positions, is continued.
 
     Raises
     ------
     SimulationError
         Where it is singular or not finite.
     """
-    part = _part(segment, p, trajectory(start))
+    part = _part(segment, p, positions(start))
     tangent = solver.forward(part.x, part.setting, known.tangent if known else None)
     return _read(part, huber, tangent, before, solver.stopwatch.taken())
 
 
 def tried(
-    solver: BlockSolver,
+    solver: Sweep,
     segment: Segment,
     huber: float | None,
     p: Array,
-    before: Leg,
+    before: Trajectory,
     step: Array,
-) -> Leg:
+) -> Trajectory:
     """One sweep after a step of the parameters to p.
 
     A static body is brought to equilibrium first, where one is near: a step along the tangent
@@ -175,25 +175,27 @@ def tried(
     return swept(solver, segment, huber, p, x, before=before)
 
 
-def reread(solver: BlockSolver, segment: Segment, huber: float | None, p: Array, leg: Leg) -> Leg:
-    """A leg whose recording is read elsewhere."""
-    return _read(_part(segment, p, leg.x), huber, leg.tangent, None, solver.stopwatch.taken())
+def reread(
+    solver: Sweep, segment: Segment, huber: float | None, p: Array, found: Trajectory
+) -> Trajectory:
+    """A trajectory whose recording is read elsewhere."""
+    return _read(_part(segment, p, found.x), huber, found.tangent, None, solver.stopwatch.taken())
 
 
-def moved(segment: Segment, leg: Leg, step: Array) -> Array:
+def moved(segment: Segment, found: Trajectory, step: Array) -> Array:
     """The trajectory after a step of the parameters."""
-    return leg.x + leg.tangent.step + leg.tangent.by_p @ step[segment.moving]
+    return found.x + found.tangent.step + found.tangent.by_p @ step[segment.moving]
 
 
 def reached(
-    solver: BlockSolver,
+    solver: Sweep,
     segment: Segment,
     p: Array,
-    known: Leg | Reached | Array | None,
-    near: Leg | None,
+    known: Trajectory | Reached | Array | None,
+    near: Trajectory | None,
 ) -> Reached:
     """The solver's rows at p as far as they go, continuing those known."""
-    part = _part(segment, p, np.zeros((0, segment.dofs)) if known is None else trajectory(known))
+    part = _part(segment, p, np.zeros((0, segment.dofs)) if known is None else positions(known))
     beside = None if near is None else near.x
     x, failure = continued(part, solver.dynamics.rows, MARCHED, solver.stopwatch, beside)
     return Reached(x, failure, solver.stopwatch.taken())
@@ -213,9 +215,9 @@ def _read(
     part: Part,
     huber: float | None,
     tangent: Tangent,
-    before: Leg | None,
+    before: Trajectory | None,
     spent: tuple[float, float, float],
-) -> Leg:
+) -> Trajectory:
     """Everything after the feasibility step."""
     response = part.sensing.looked_along(tangent.by_p, tangent.held)
     found = part.sensing.linearised(part.x, response, tangent.step)
@@ -231,4 +233,4 @@ def _read(
         seen=Seen.of(part, part.x + tangent.step, tangent.violation_n),
         spent=spent,
     )
-    return Leg(part.x, tangent, slope, report)
+    return Trajectory(part.x, tangent, slope, report)

@@ -29,7 +29,7 @@ class _Dropped:
 
 
 @dataclass(frozen=True, eq=False)
-class PassingGrasps:
+class ReleasedGrasps:
     """What to correct in the values of ∂c/∂x."""
 
     dropped: tuple[_Dropped, ...]
@@ -45,7 +45,7 @@ class PassingGrasps:
         pattern: SymmetricPattern,
         row_dofs: Index,
         scale: float,
-    ) -> PassingGrasps:
+    ) -> ReleasedGrasps:
         """The corrections of a segment's Jacobian, whose rows are scaled by `scale`."""
         taken = dynamics.taken
         nothing = np.zeros(0, dtype=np.int64)

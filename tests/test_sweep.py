@@ -19,13 +19,13 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.multipliers import constraint_multipliers
-from collocation_sysid.nlp import tangent
+from collocation_sysid.nlp import sweep
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.marching import march
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.setting import Setting
 from collocation_sysid.nlp.stopwatch import Stopwatch
-from collocation_sysid.nlp.tangent import BlockSolver, Tangent
+from collocation_sysid.nlp.sweep import Sweep, Tangent
 
 EXPERIMENTS = SMALL_EXPERIMENTS | {"bar-loaded": bar_loaded}
 LAYOUTS = {
@@ -64,7 +64,7 @@ def only_setting(collocation: Collocation) -> Setting:
 
 def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tangent]:
     parts = collocation.parts_at(some_parameters(collocation), positions)
-    return [BlockSolver(part.segment).forward(part.x, part.setting) for part in parts]
+    return [Sweep(part.segment).forward(part.x, part.setting) for part in parts]
 
 
 @pytest.fixture(
@@ -121,7 +121,7 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     goals = setting.held.positions_m  # what is grasped is where it should be: no step of its own
     x[:, setting.held.dofs] = np.where(np.isnan(goals), x[:, setting.held.dofs], goals)
     gradient = rng.standard_normal(x.shape)
-    y = BlockSolver(segment).backward(x, setting, gradient)
+    y = Sweep(segment).backward(x, setting, gradient)
     (found,) = forward(collocation, [x])
     residual, free = segment.residual_n(x, setting), segment.free_dofs
     left = np.sum(gradient[:, free] * found.step[:, free])
@@ -142,7 +142,7 @@ def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch):
     z, positions = disturbed(collocation)
     (whole,) = forward(collocation, positions)
     multipliers = constraint_multipliers(collocation, z)
-    monkeypatch.setattr(tangent, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(sweep, "CHUNK_BYTES", 1)
     (parts,) = forward(collocation, positions)
     np.testing.assert_allclose(parts.step, whole.step, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(parts.by_p, whole.by_p, rtol=1e-10, atol=1e-15)
@@ -155,7 +155,7 @@ def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
     (segment,) = collocation.segments
-    part = BlockSolver(segment, rows=5).forward(x[:5], only_setting(collocation))
+    part = Sweep(segment, rows=5).forward(x[:5], only_setting(collocation))
     np.testing.assert_allclose(part.step, whole.step[:5], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(part.by_p, whole.by_p[:5], rtol=1e-9, atol=1e-15)
 
@@ -168,8 +168,8 @@ def test_the_first_rows_can_be_continued(scheme: str, done: int):
     (whole,) = forward(collocation, [x])
     (segment,) = collocation.segments
     setting = only_setting(collocation)
-    first = BlockSolver(segment, done).forward(x[:done], setting)
-    continued = BlockSolver(segment).forward(x, setting, first)
+    first = Sweep(segment, done).forward(x[:done], setting)
+    continued = Sweep(segment).forward(x, setting, first)
     np.testing.assert_allclose(continued.step, whole.step, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-9, atol=1e-15)
     assert continued.violation_n == pytest.approx(whole.violation_n)
@@ -179,7 +179,7 @@ def test_rows_one_by_one_are_the_same_sensitivities():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    rows = BlockSolver(collocation.segments[0]).sensitivities(x, only_setting(collocation))
+    rows = Sweep(collocation.segments[0]).sensitivities(x, only_setting(collocation))
     np.testing.assert_allclose(np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15)
 
 
@@ -211,7 +211,7 @@ def test_time_is_accounted_for():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     stopwatch = Stopwatch()
-    solver = BlockSolver(collocation.segments[0], stopwatch=stopwatch)
+    solver = Sweep(collocation.segments[0], stopwatch=stopwatch)
     solver.forward(x, only_setting(collocation))
     assert stopwatch.evaluations > 0
     assert stopwatch.linear_algebra > 0
