@@ -223,7 +223,7 @@ def _read(
     found = part.sensing.linearised(part.x, response, tangent.step)
     pairs = [as_squares(*each, huber) for each in found]
     residual = np.concatenate([values.ravel() for values, _ in pairs])
-    slope = np.concatenate([by.reshape(-1, by.shape[-1]) for _, by in pairs])
+    slope = np.concatenate([by.reshape(values.size, by.shape[-1]) for values, by in pairs])
     report = Report(
         fit=LeastSquares.none(slope.shape[1]).add(residual, slope),
         crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
