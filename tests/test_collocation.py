@@ -338,6 +338,19 @@ def swung_cube_without_places() -> Experiment:
     return replace(experiment, markers=Markers(marked.t_s, tracks, marked.sigma_m, marked.names))
 
 
+def test_gauss_newtons_model_of_wild_samples_is_nowhere_below_their_loss(rng):
+    collocation = Collocation([swung()], GUESS, huber=2.0)
+    z = some_point(collocation)
+    value, slope = collocation.objective(z), collocation.gradient(z)
+    hessian = collocation.hessian(z, 1.0, None)
+    x = collocation.segments[0].columns
+    for length in (1e-4, -1e-2, 1.0):
+        step = np.zeros(len(z))
+        step[x] = length * rng.normal(size=len(step[x]))
+        model = value + slope @ step + step @ (hessian @ step) / 2
+        assert collocation.objective(z + step) <= model * (1 + 1e-12)
+
+
 def test_gauss_newtons_hessian_is_the_exact_one_where_readings_are_met():
     truth = Parameters(tuple(replace(item, guess=TRUTH[item.name]) for item in GUESS.items))
     collocation = Collocation([measured(cube_with_nuisance(4))], truth)

@@ -61,11 +61,6 @@ class Instrument:
         """Σ ρ of the same."""
         return Generated(self._loss, self._inputs, self._data)
 
-    @cached_property
-    def _robust(self) -> Generated:
-        """Σ ρ of residuals."""
-        return Generated(self._rhos, self.measured, 0)
-
     @property
     def is_quadratic(self) -> bool:
         """Whether second derivatives of the loss are always the same."""
@@ -74,13 +69,19 @@ class Instrument:
     def curvature(self, u: Array, data: Array, bent: bool = True) -> Array:
         """Second derivatives (k, k, …) of the loss by u.
 
-        Unless readings are bent, they count as linear: Gauss–Newton's, which is convex.
+        Unless readings are bent, they count as linear: Gauss–Newton's, which is convex. Then wild
+        samples have the weights ρ'/2d of least squares, which curve no less than ρ does anywhere;
+        ρ'' is zero along their residuals, and steps by it would be too long.
         """
         if bent:
             return self.loss.curvature(u, data)
         residual, slopes = self.residual.slopes(u, data)
-        bending = self._robust.curvature(residual, data[:0])
-        return np.einsum("ai...,ab...,bj...->ij...", slopes, bending, slopes, optimize=True)
+        weights = np.full(residual.shape, 2.0)
+        if self.huber is not None:
+            groups = residual.reshape(-1, GROUP, *residual.shape[1:])
+            lengths = np.linalg.norm(groups, axis=1)
+            weights *= np.repeat(self.huber / np.maximum(lengths, self.huber), GROUP, axis=0)
+        return np.einsum("ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True)
 
     @property
     def _inputs(self) -> int:
