@@ -12,10 +12,13 @@ from types import SimpleNamespace
 import pytest
 from matplotlib.image import imread
 from problem_files import TRUTH, Outcome, run_command, write_problem
+from results_small import a_result
 from rich.console import Console
 
 from collocation_sysid.cli import studies
+from collocation_sysid.result import HistoryLine
 from collocation_sysid.study import display, process
+from collocation_sysid.tree import as_json
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
 METHODS = ("interior-point", "reduced-space")
@@ -29,31 +32,20 @@ times = [0.0, 0.01]
 record = {
     "outcome": "finished",
     "message": "Converged.",
-    "result": {
-        "status": "converged",
-        "converged": True,
-        "parameters": {
-            name: {"value": guess, "std_error": 0.1 * guess, "ci95": [0.8 * guess, 1.2 * guess]}
-            for name, guess in planned["guess"].items()
-        },
-        "fit": {"rms_m": 1e-3},
-        "dynamics": {"max_violation_n": 1e-9, "max_violation_relative": 1e-8},
-        "rollout": {"rms_m": 1e-3, "max_m": 3e-3},
-        "iterations": 5,
-        "timing_s": {"build": 0.1, "evaluations": 0.2, "linear_algebra": 0.3, "total": 0.6},
-        "history": [
-            {"iteration": k, "loss": 10.0 / k, "violation_n": 10.0**-k, "time_s": 0.1 * k}
-            for k in (1, 2)
-        ],
-    },
+    "result": json.loads(sys.argv[1]),
     "tip": {
         "experiment": "swing", "marker": "low", "max_m": 1e-3, "t_s": times,
         "measured_m": [[0, 0, 0], [None, None, None]], "rolled_out_m": [[0, 0, 0], [1, 1, 1]],
     },
 }
+record["result"]["parameters"] = {
+    name: like | {"value": guess, "std_error": 0.1 * guess, "ci95": [0.8 * guess, 1.2 * guess]}
+    for like in record["result"]["parameters"].values() for name, guess in planned["guess"].items()
+}
 with open(out, "w") as file:
     json.dump(record, file)
 """
+HISTORY = tuple(HistoryLine(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2))
 
 
 @pytest.fixture
@@ -61,7 +53,8 @@ def stand_in(tmp_path, monkeypatch):
     """Replaces the runs' processes."""
     script = tmp_path / "stand_in.py"
     script.write_text(STAND_IN)
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, str(script)))
+    found = as_json(a_result(history=HISTORY))
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, str(script), found))
 
 
 def table(file: Path) -> list[dict[str, str]]:

@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from problem_files import TRUTH
+from results_small import a_result, value
 
 from collocation_sysid import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
+from collocation_sysid.result import HistoryLine
 from collocation_sysid.study import (
     Limits,
     PlannedRun,
@@ -31,6 +33,7 @@ from collocation_sysid.study.arguments import parse_methods, parse_over, read_tr
 from collocation_sysid.study.display import time_left_s
 from collocation_sysid.study.plan import short_keys
 from collocation_sysid.study.table import Yardstick, method_rows, run_row, wilson_interval
+from collocation_sysid.tree import as_json, content
 
 NAMES = tuple(TRUTH)
 # Stands in for a run's process: it reads the run, and ends as its first argument says.
@@ -311,7 +314,7 @@ OBEDIENT = """
 import json, pathlib, signal, sys
 file, ready = map(pathlib.Path, (sys.argv[-1], sys.argv[-2]))
 def end(*_):
-    file.write_text(json.dumps({"outcome": "finished", "result": {"converged": False, "fit": {}}}))
+    file.write_text(json.dumps({"outcome": "finished", "result": json.loads(sys.argv[1])}))
     sys.exit()
 signal.signal(signal.SIGTERM, end)
 ready.touch()
@@ -322,12 +325,13 @@ signal.pause()
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     ready = tmp_path / "ready"
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", OBEDIENT, str(ready)))
+    found = as_json(a_result(status="interrupted", converged=False))
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", OBEDIENT, found, str(ready)))
     monkeypatch.setattr(process.time, "monotonic", lambda: 100.0 if ready.exists() else 0.0)
     planned = planned_runs(1)[0]
     record = process.execute(planned.as_dict(), time_limit_s=10.0)
     assert record["outcome"] == "timeout"
-    assert record["result"] == {"converged": False, "fit": {}}
+    assert record["result"] == json.loads(found)
     assert run_row(planned, record, Yardstick())["status"] == "timeout"
 
 
@@ -457,18 +461,15 @@ def test_wilson_intervals_agree_with_published_ones(successes, trials, interval)
 
 def answer(run: PlannedRun, factor: float = 1.0, status: str = "converged") -> dict:
     """A record as a run's process writes it, off by a factor."""
-    values = {name: {"value": factor * value} for name, value in TRUTH.items()}
-    return {
-        **run.as_dict(),
-        "outcome": "finished",
-        "result": {
-            "status": status,
-            "converged": status == "converged",
-            "parameters": values,
-            "iterations": 7,
-            "history": [{"loss": factor}],
-        },
-    }
+    values = {name: value(factor * true) for name, true in TRUTH.items()}
+    found = a_result(
+        values,
+        status=status,
+        converged=status == "converged",
+        iterations=7,
+        history=(HistoryLine(1, factor, 1e-3, 1e-9, {}, 0.1, 1.0),),
+    )
+    return {**run.as_dict(), "outcome": "finished", "result": content(found)}
 
 
 def test_success_needs_convergence_and_the_truth():

@@ -27,6 +27,8 @@ from ..output.style import (
     mathematical,
     new_figure,
 )
+from ..result import Result
+from ..tree import read
 from .plan import short_keys
 from .store import Record
 from .table import Row, Yardstick, best_run, distance, reference, wilson_interval
@@ -84,10 +86,10 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
     for method, (colour, runs) in _by_method(rows).items():
         style: dict[str, Any] = {"color": colour, "lw": LINE_PT, "marker": ".", "ms": 3}
         for k, row in enumerate(runs):
-            history = records[row["key"]]["result"]["history"]
-            times = [line["time_s"] for line in history]
+            history = read(Result, records[row["key"]]["result"]).history
+            times = [line.time_s for line in history]
             for axes, name in zip(panels, ("loss", "violation_n"), strict=True):
-                values = np.array([line[name] for line in history], dtype=float)
+                values = np.array([getattr(line, name) for line in history], dtype=float)
                 values[~(values > 0)] = np.nan
                 label = None if k else method
                 axes.plot(times, values, label=label, alpha=max(0.2, len(runs) ** -0.5), **style)

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..result import Result
+from ..tree import read
 from .plan import PlannedRun
 from .store import TIMEOUT, Record
 
@@ -22,6 +24,21 @@ MEDIANS = (
     "violation_relative",
     "rollout_rms_m",
     "tip_max_m",
+    "iterations",
+    "evaluations",
+    "build_s",
+    "evaluations_s",
+    "linear_algebra_s",
+    "total_s",
+)
+# What a run's result says of its quality and cost.
+NUMBERS = (
+    "loss",
+    "rms_m",
+    "violation_n",
+    "violation_relative",
+    "rollout_rms_m",
+    "rollout_max_m",
     "iterations",
     "evaluations",
     "build_s",
@@ -85,54 +102,55 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
     (relative to the truth) hold the parameters; swept keys have columns of their own.
     """
     record = record or {"outcome": "missing", "message": "not run yet"}
-    result = record.get("result") or {}
-    timing, rollout = result.get("timing_s") or {}, result.get("rollout") or {}
-    dynamics, history = result.get("dynamics") or {}, result.get("history") or []
+    result: Result | None = read(Result | None, record.get("result"))
     late = record["outcome"] == TIMEOUT
-    converged = bool(result.get("converged")) and not late
+    converged = result is not None and result.converged and not late
     parameters = _parameters(run, result, yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
     near = all(error is not None and error <= yardstick.within for error in errors)
-    return {
+    numbers: Row = dict.fromkeys(NUMBERS) if result is None else _numbers(result)
+    row = {
         "key": run.key,
         "method": run.method,
         "start": run.start,
         **run.swept,
-        "status": record["outcome"] if late else result.get("status", record["outcome"]),
+        "status": record["outcome"] if late or result is None else result.status,
         "converged": converged,
         "success": converged and near,
         **parameters,
-        "loss": history[-1]["loss"] if history else None,
-        "rms_m": (result.get("fit") or {}).get("rms_m"),
-        "violation_n": dynamics.get("max_violation_n"),
-        "violation_relative": dynamics.get("max_violation_relative"),
-        "rollout_rms_m": rollout.get("rms_m"),
-        "rollout_max_m": rollout.get("max_m"),
+        **numbers,
         "tip_max_m": (record.get("tip") or {}).get("max_m"),
-        "iterations": result.get("iterations"),
-        "evaluations": result.get("evaluations"),
-        **{
-            f"{part}_s": timing.get(part)
-            for part in ("build", "evaluations", "linear_algebra", "total")
-        },
         "wall_s": record.get("wall_s"),
         "attempts": record.get("attempts"),
         "message": record.get("message", ""),
     }
+    return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
 
 
-def _parameters(run: PlannedRun, result: Mapping[str, Any], truth: Mapping[str, float]) -> Row:
+def _numbers(result: Result) -> Row:
+    """Quality and cost, by `NUMBERS`."""
+    dynamics, rollout, timing = result.dynamics, result.rollout, result.timing_s
+    loss = result.history[-1].loss if result.history else None
+    violated = (dynamics.max_violation_n, dynamics.max_violation_relative)
+    misfits = (result.fit.rms_m, *violated, rollout.rms_m, rollout.max_m)
+    cost = (timing.build, timing.evaluations, timing.linear_algebra, timing.total)
+    values = (loss, *misfits, result.iterations, result.evaluations, *cost)
+    return dict(zip(NUMBERS, values, strict=True))
+
+
+def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
     row: Row = {}
-    found = result.get("parameters") or {}
+    found = {} if result is None else result.parameters
     for name, guess in run.guess.items():
-        estimate = found.get(name) or {}
-        row[f"guess_{name}"] = estimate.get("guess") if guess is None else guess
+        known = found[name].guess if name in found else None
+        row[f"guess_{name}"] = known if guess is None else guess
     for name in run.guess:
-        estimate = found.get(name) or {}
-        value = estimate.get("value")
+        estimate = found.get(name)
+        value = None if estimate is None else estimate.value
         row[f"value_{name}"] = value
-        row[f"std_error_{name}"] = estimate.get("std_error")
-        row[f"low_{name}"], row[f"high_{name}"] = estimate.get("ci95") or (None, None)
+        row[f"std_error_{name}"] = None if estimate is None else estimate.std_error
+        interval = None if estimate is None else estimate.ci95
+        row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
             error = None if value is None else abs(value / truth[name] - 1)
             row[f"error_{name}"] = error
