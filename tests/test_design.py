@@ -517,6 +517,19 @@ def test_poses_are_written_as_the_robot_has_them(tiny, tmp_path):
     assert not np.allclose(np.array(written[1:4], float), found.poses.positions_m[0], atol=1e-3)
 
 
+def test_a_design_knows_where_the_files_of_the_problem_are(tiny, tmp_path):
+    shutil.copytree(tiny.parent, tmp_path / "own")
+    file = tmp_path / "own" / "problem.toml"
+    (file.parent / "drag.py").write_text("def drag(x, v, at):\n    return -1e-6 * v\n")
+    force = 'density_kg_m3 = 30.0\n[[object.force]]\nfile = "drag.py"\nfunction = "drag"\n'
+    file.write_text(file.read_text().replace("density_kg_m3 = 30.0\n", force))
+    loaded = Problem.read(file, allow_code=True)
+    designed = design(loaded, LIMITS, 0.05, options=DesignOptions(1, pairs=0))
+    write_design(designed, tmp_path / "out", with_film=False)
+    again = Problem.read(tmp_path / "out" / PROBLEM_FILE, allow_code=True)
+    assert [force.name for force in again.bodies[0].forces] == ["drag"]
+
+
 def test_an_interrupted_design_is_written_and_told(tiny, tmp_path, monkeypatch):
     def interrupt(self, number, size):
         raise KeyboardInterrupt

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -57,15 +58,18 @@ def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
 
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Largest relative deviations of J and H along a random direction at a disturbed start."""
-    rng, of_given = np.random.default_rng(0), 0.0
-    program = collocation.made_explicit()
-    if program.explicit:
-        of_given = _gradient_error(collocation, z, rng)
-        if collocation.remembers:
-            of_given = max(of_given, _slopes_error(collocation, z, rng))
+    rng, of_slopes = np.random.default_rng(0), 0.0
+    program, plain = collocation.made_explicit(), collocation
+    if program.explicit:  # methods use these without memory and wrenches as variables
+        of_slopes = _slope_error(plain.objective, plain.gradient, z, rng)
+        if plain.remembers:
+            forces = rng.normal(size=plain.constraints)
+            through = partial(plain.pulled_back, multipliers=forces)
+            along = _slope_error(lambda at: forces @ plain.constraint_values(at), through, z, rng)
+            of_slopes = max(of_slopes, along)
         if sum(program.carried_nonzeros) > LAID_OUT:
-            return of_given, 0.0
-        collocation, z = program, carried_over(z, collocation, program)
+            return of_slopes, 0.0
+        collocation, z = program, carried_over(z, plain, program)
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     multipliers = rng.normal(size=collocation.constraints)
@@ -77,26 +81,13 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     along = collocation.jacobian(point) @ direction
     first = _deviation(collocation.constraint_values, along, point, direction)
     second = _deviation(lagrangian_gradient, hessian @ direction, point, direction)
-    return max(first, of_given), second
+    return max(first, of_slopes), second
 
 
-def _gradient_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:
-    """That of the objective's gradient, wrenches included."""
+def _slope_error(function, gradient, z: Array, rng: np.random.Generator) -> float:
+    """That of a gradient along a random direction."""
     point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
-    exact = np.array([collocation.gradient(point) @ direction])
-    return _deviation(lambda at: np.array([collocation.objective(at)]), exact, point, direction)
-
-
-def _slopes_error(collocation: Collocation, z: Array, rng: np.random.Generator) -> float:
-    """That of Jᵀ alone through the memory, which methods use that do not have it as variables."""
-    point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
-    multipliers = rng.normal(size=collocation.constraints)
-    exact = collocation.pulled_back(point, multipliers) @ direction
-
-    def lagrangian(at: Array) -> Array:
-        return np.array([multipliers @ collocation.constraint_values(at)])
-
-    return _deviation(lagrangian, np.array([exact]), point, direction)
+    return _deviation(function, gradient(point) @ direction, point, direction)
 
 
 def _deviation(function, exact: Array, point: Array, direction: Array) -> float:

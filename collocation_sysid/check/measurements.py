@@ -78,10 +78,10 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     if positions_m is not None:
         seen_m = markers.positions_m[: len(positions_m)]
         miss = np.linalg.norm(markers.observe(positions_m) - seen_m, axis=2)
-    found = []
+    findings = []
     for k, name in enumerate(markers.names):
         seen = np.flatnonzero(markers.present[:, k])
-        found.append(
+        findings.append(
             MarkerFinding(
                 name,
                 float(markers.placement.distance_m[k]),
@@ -99,7 +99,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
         len(experiment.t_s),
         markers.samples,
         int(markers.missing.sum()),
-        tuple(found),
+        tuple(findings),
     )
 
 

@@ -101,17 +101,17 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
     free = np.flatnonzero(~held[least])
     forces = Forces.of(experiment, time_s)
     modes = natural_modes(experiment.body, x, free, theta, COUNT, forces)
-    found = _mode_findings(modes, experiment, scheme, step_s)
+    findings = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
-    if found:
+    if findings:
         omega = float(modes.angular_frequencies_rad_s[0])
-        limit = _damping_limit(found[0])
-        ratio = _oscillating(found[0].damping_ratio)
+        limit = _damping_limit(findings[0])
+        ratio = _oscillating(findings[0].damping_ratio)
         needed = substeps_needed(scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio)
     return Motion(
         experiment.name,
         about,
-        found,
+        findings,
         scheme.name,
         step_s,
         experiment.duration_s,
@@ -188,7 +188,10 @@ def _grid_warnings(motion: Motion, mode: ModeFinding) -> list[str]:
     added = mode.numerical_damping_ratio
     if abs(added) > _damping_limit(mode):
         does, found = (("adds", "to"), "low") if added > 0 else (("takes", "from"), "high")
-        remedy = _finer(motion) if motion.scheme == UNDAMPED else _less_damping(motion)
+        remedy = _finer(motion)
+        if motion.scheme != UNDAMPED:
+            or_finer = "" if motion.substeps_needed is None else f", or {_bare(motion)}"
+            remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
         return [
             f"{motion.scheme} at {1e3 * motion.timestep_s:.3g} ms {does[0]} a damping ratio of "
             f"{abs(added):.2g} {does[1]} {which}, by which the damping found will be too {found}: "
@@ -229,11 +232,6 @@ def motion_notes(motion: Motion) -> list[str]:
             f"{_finer(motion)}"
         )
     return notes
-
-
-def _less_damping(motion: Motion) -> str:
-    undamped = f'set transcription.scheme = "{UNDAMPED}"'
-    return undamped if motion.substeps_needed is None else f"{undamped}, or {_bare(motion)}"
 
 
 def _finer(motion: Motion) -> str:

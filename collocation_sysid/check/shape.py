@@ -75,8 +75,8 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
 
 
 def _guess(body: Body, theta: Array) -> dict[str, float]:
-    found = {}
+    moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering(*lame)
-        found |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
-    return found | dict(zip(body.constants, theta.tolist(), strict=True))
+        moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
+    return moduli | dict(zip(body.constants, theta.tolist(), strict=True))

@@ -44,13 +44,13 @@ class Criterion:
     over: Over = "mean"
 
     def __post_init__(self) -> None:
-        for option, given, known in (
+        for option, chosen, known in (
             ("--criterion", self.kind, get_args(Kind)),
             ("--over", self.over, get_args(Over)),
         ):
-            if given not in known:
+            if chosen not in known:
                 raise InputError(
-                    f"found {given!r}; expected one of {', '.join(known)}", None, option
+                    f"found {chosen!r}; expected one of {', '.join(known)}", None, option
                 )
 
     def log_size(self, errors: Errors) -> float:
@@ -171,5 +171,5 @@ def both_sides(
     ways = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
     lower, upper = parameters.bounds_q
     inside = 1e-3 * np.minimum(upper - lower, 1.0)
-    found = [middle, *(middle + sign * way for way in ways for sign in (1, -1))]
-    return [np.clip(q, lower + inside, upper - inside) for q in found]
+    draws = [middle, *(middle + sign * way for way in ways for sign in (1, -1))]
+    return [np.clip(q, lower + inside, upper - inside) for q in draws]

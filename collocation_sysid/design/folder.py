@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from ..arrays import Array
 from ..experiment import (
     PoseSequence,
     write_markers_csv,
@@ -23,9 +22,8 @@ from ..output.animation import film
 from ..output.pictures.album import save_pictures
 from ..output.replay import Replay
 from ..output.writers import run_folder
-from ..problem import Problem
 from ..problem.schema import ProblemFile, completed
-from ..tree import as_json
+from ..tree import as_json, content
 from .designing import Bars, Design
 from .pictures import pictures
 
@@ -54,6 +52,8 @@ OF_MARKERS = (
     "template_window_s",
     "max_template_residual_m",
 )
+# Whose texts are files, wherever they stand.
+OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pressure")
 OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
@@ -64,7 +64,7 @@ HEAD = """\
 
 
 def write_design(
-    found: Design, folder: str | Path, with_film: bool = True, say: Callable[[str], None] = print
+    design: Design, folder: str | Path, with_film: bool = True, say: Callable[[str], None] = print
 ) -> Path:
     """Write the folder, whole or not at all, and return it.
 
@@ -75,61 +75,55 @@ def write_design(
     """
     target = Path(folder)
     with run_folder(target, mark=DESIGN_FILE, what="design") as place:
-        write_poses_csv(place / POSES_FILE, _of_gripper(found))
-        experiment = found.experiment
+        write_poses_csv(place / POSES_FILE, _of_gripper(design))
+        experiment = design.experiment
         markers = experiment.markers
         write_markers_csv(place / MARKERS_FILE, markers.t_s, markers.names, markers.positions_m)
-        for sensor, wrench in zip(_sensors(found), found.predicted.wrenches, strict=True):
+        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+        for sensor, wrench in zip(sensors, design.predicted.wrenches, strict=True):
             write_wrench_csv(place / WRENCH_FILE, sensor.t_s, wrench)
-        if found.recording.problem.origin is not None:
-            text = HEAD + tomli_w.dumps(_content(found, target.resolve()))
+        if design.recording.problem.origin is not None:
+            text = HEAD + tomli_w.dumps(_content(design, target.resolve()))
             (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
-        save_pictures(place, pictures(found))
+        save_pictures(place, pictures(design))
         if with_film:
             say("filming the motion")
-            shapes_m = found.predicted.positions_m
+            shapes_m = design.predicted.positions_m
             replay = Replay.of(experiment, (shapes_m, markers.positions_m))
             film(replay, place / FILM_FILE, FRAMES_PER_SECOND, names=("predicted", ""))
-        (place / DESIGN_FILE).write_text(as_json(as_dict(found)), encoding="utf-8")
+        (place / DESIGN_FILE).write_text(as_json(as_dict(design)), encoding="utf-8")
     return target
 
 
-def as_dict(found: Design) -> dict[str, Any]:
+def as_dict(design: Design) -> dict[str, Any]:
     """What design.json holds."""
-    motion, search, given = found.motion, found.found, found.limits
+    search, limits = design.found, design.limits
     return {
         "schema": SCHEMA,
-        "experiment": found.recording.template.name,
-        "duration_s": found.experiment.duration_s,
-        "samples": len(found.experiment.t_s),
+        "experiment": design.recording.template.name,
+        "duration_s": design.experiment.duration_s,
+        "samples": len(design.experiment.t_s),
         "criterion": {
-            "kind": found.criterion.kind,
-            "for": list(found.criterion.names),
-            "over": found.criterion.over,
-            "draws": found.draws,
-            "relative_error": found.size,
+            "kind": design.criterion.kind,
+            "for": list(design.criterion.names),
+            "over": design.criterion.over,
+            "draws": design.draws,
+            "relative_error": design.size,
         },
-        "recordings_count": found.added,
-        "before": None if found.before is None else _bars(found.before),
-        "after": _bars(found.after),
+        "recordings_count": design.added,
+        "before": None if design.before is None else _bars(design.before),
+        "after": _bars(design.after),
         "limits": {
-            name: {"limit": getattr(given, name), "share_used": share}
-            for name, share in found.shares.items()
+            name: {"limit": getattr(limits, name), "share_used": share}
+            for name, share in design.shares.items()
         },
-        "limits_reached": found.reached,
+        "limits_reached": design.reached,
         "search": {
             "evaluations": len(search.history),
             "interrupted": search.interrupted,
             "history": [float(np.exp(min(value, 100.0))) for value in search.history],
         },
-        "motion": {
-            "active_s": motion.active_s,
-            "rise_s": motion.rise_s,
-            "amplitude": motion.amplitude.tolist(),
-            "first_hz": motion.first_hz.tolist(),
-            "last_hz": motion.last_hz.tolist(),
-            "phase_rad": motion.phase_rad.tolist(),
-        },
+        "motion": content(design.motion),
     }
 
 
@@ -145,48 +139,42 @@ def _bars(bars: Bars) -> dict[str, Any]:
     }
 
 
-def _sensors(found: Design) -> list[Any]:
-    return [grasp.wrench for grasp in found.experiment.grasps if grasp.wrench is not None]
-
-
 # The problem --------------------------------------------------------------------------------------
 
 
-def _of_gripper(found: Design) -> PoseSequence:
+def _of_gripper(design: Design) -> PoseSequence:
     """The poses as the robot has them: of its gripper, where the problem says how it holds."""
-    matrix = _gripper_to_body(found.recording.problem, found.recording.template.name)
-    return found.poses if matrix is None else found.poses.after(np.linalg.inv(matrix))
-
-
-def _gripper_to_body(problem: Problem, name: str) -> Array | None:
-    if problem.origin is None:
-        return None
-    sections = ProblemFile.model_validate(tomllib.loads(problem.origin.text)).experiment
+    origin, name = design.recording.problem.origin, design.recording.template.name
+    if origin is None:
+        return design.poses
+    sections = ProblemFile.model_validate(tomllib.loads(origin.text)).experiment
     (section,) = (section for section in sections if section.name == name)
     transform = section.grasps[0].gripper_to_body
-    return None if transform is None else transform.matrix
+    return (
+        design.poses if transform is None else design.poses.after(np.linalg.inv(transform.matrix))
+    )
 
 
-def _content(found: Design, folder: Path) -> dict[str, Any]:
+def _content(design: Design, folder: Path) -> dict[str, Any]:
     """The problem of the designed recording, and of those there are where they count."""
-    origin, recording = found.recording.problem.origin, found.recording
+    origin, recording = design.recording.problem.origin, design.recording
     assert origin is not None
-    content = completed(tomllib.loads(origin.text))
-    content.pop("experiment_defaults", None)
-    tables = content["experiment"]
+    described = completed(tomllib.loads(origin.text))
+    described.pop("experiment_defaults", None)
+    places = origin.path.resolve().parent, folder
+    described |= {key: _seen_from(described[key], *places) for key in ("object", "experiment")}
+    tables = described["experiment"]
     names = [each.get("name") for each in tables]
-    chosen = deepcopy(tables[names.index(recording.template.name)])
-    _named_from(content, origin.path.resolve().parent, folder)
-    relocated = _relocated_experiment(chosen, origin.path.resolve().parent, folder)
-    taken = {*names} if found.added else set()
+    new = deepcopy(tables[names.index(recording.template.name)])
+    taken = {*names} if design.added else set()
     free = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
-    relocated["name"] = next(name for name in free if name not in taken)
-    content["experiment"] = [*(tables if found.added else []), _designed(relocated)]
+    new["name"] = next(name for name in free if name not in taken)
+    described["experiment"] = [*(tables if design.added else []), _designed(new)]
     for item in recording.problem.parameters.free:
-        given = content["parameters"].get(item.name)
-        guess = {"guess": found.after.values[item.name]}
-        content["parameters"][item.name] = (given if isinstance(given, dict) else {}) | guess
-    return content
+        stated = described["parameters"].get(item.name)
+        guess = {"guess": design.after.values[item.name]}
+        described["parameters"][item.name] = (stated if isinstance(stated, dict) else {}) | guess
+    return described
 
 
 def _designed(table: dict[str, Any]) -> dict[str, Any]:
@@ -214,33 +202,15 @@ def _of_design(wrench: dict[str, Any]) -> dict[str, Any]:
     return kept | sigmas | {"file": WRENCH_FILE}
 
 
-def _named_from(content: dict[str, Any], old: Path, new: Path) -> None:
-    """Name the files of a problem from another folder, in place."""
-    body = content["object"]
-    _rename(body, ("mesh", "surface"), old, new)
-    for table in (body, *body.get("region", [])):
-        if isinstance(table.get("material"), dict):
-            _rename(table["material"], ("file",), old, new)
-    for table in content["experiment"]:
-        _relocated_experiment(table, old, new)
-
-
-def _relocated_experiment(table: dict[str, Any], old: Path, new: Path) -> dict[str, Any]:
-    grasps = table.get("grasp", [])
-    for grasp in grasps if isinstance(grasps, list) else [grasps]:
-        _rename(grasp, ("poses", "displacement"), old, new)
-        for table_of_columns in (grasp.get("displacement"), grasp.get("wrench")):
-            if isinstance(table_of_columns, dict):
-                _rename(table_of_columns, ("file",), old, new)
-    _rename(table, ("file",), old, new)
-    _rename(table.get("markers", {}), ("file",), old, new)
-    for key, name in (("force", "file"), ("tendon", "tension"), ("pressure", "pressure")):
-        for each in table.get(key, []):
-            _rename(each, (name,), old, new)
-    return table
-
-
-def _rename(table: dict[str, Any], keys: tuple[str, ...], old: Path, new: Path) -> None:
-    for key in keys:
-        if isinstance(table.get(key), str):
-            table[key] = Path(os.path.relpath(old / table[key], new)).as_posix()
+def _seen_from(value: Any, old: Path, new: Path) -> Any:
+    """A table of a problem, its files named from another folder; columns are no files."""
+    if isinstance(value, list):
+        return [_seen_from(each, old, new) for each in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: Path(os.path.relpath(old / each, new)).as_posix()
+        if key in OF_FILES and isinstance(each, str)
+        else (each if key == "columns" else _seen_from(each, old, new))
+        for key, each in value.items()
+    }

@@ -163,21 +163,13 @@ class Bounds:
     @property
     def reach(self) -> tuple[Array, Array, Array]:
         """Size, rate and rate of the rate, each of shifts [m] and turns [rad]."""
-        given = self.limits
-        turns = (
-            given.rotation_deg,
-            given.angular_speed_deg_s,
-            given.angular_acceleration_deg_s2,
+        limits, farthest = self.limits, np.maximum(-self.low_m, self.high_m).max()
+        angular_rate, growth = limits.angular_speed_deg_s, limits.angular_acceleration_deg_s2
+        return (
+            np.array([farthest, np.radians(limits.rotation_deg)]),
+            np.array([limits.speed_m_s, np.radians(angular_rate)]),
+            np.array([limits.acceleration_m_s2, np.radians(growth)]),
         )
-        shifts = (
-            float(np.maximum(-self.low_m, self.high_m).max()),
-            given.speed_m_s,
-            given.acceleration_m_s2,
-        )
-        size, rate, growth = (
-            np.array([shift, np.radians(turn)]) for shift, turn in zip(shifts, turns, strict=True)
-        )
-        return size, rate, growth
 
     def shares(self, motion: Motion) -> dict[str, float]:
         """Largest values of a motion as shares of what is allowed, by the limits' names."""
@@ -186,22 +178,19 @@ class Bounds:
 
     def _of_shift(self, *course: Array) -> dict[str, float]:
         shift, rate, curvature = (each[:, :3] for each in course)
-        given = self.limits
+        limits = self.limits
         return {
             "workspace_m": float(np.maximum(shift / self.low_m, shift / self.high_m).max()),
-            "speed_m_s": _largest(rate) / given.speed_m_s,
-            "acceleration_m_s2": _largest(curvature) / given.acceleration_m_s2,
+            "speed_m_s": _largest(rate) / limits.speed_m_s,
+            "acceleration_m_s2": _largest(curvature) / limits.acceleration_m_s2,
         }
 
     def _of_turn(self, *course: Array) -> dict[str, float]:
-        turn, given = course[0][:, 3:], self.limits
-        velocity, acceleration = angular_motion(*(each[:, 3:] for each in course))
-        return {
-            "rotation_deg": np.degrees(_largest(turn)) / given.rotation_deg,
-            "angular_speed_deg_s": np.degrees(_largest(velocity)) / given.angular_speed_deg_s,
-            "angular_acceleration_deg_s2": np.degrees(_largest(acceleration))
-            / given.angular_acceleration_deg_s2,
-        }
+        turn, limits = course[0][:, 3:], self.limits
+        largest = map(_largest, (turn, *angular_motion(*(each[:, 3:] for each in course))))
+        names = "rotation_deg", "angular_speed_deg_s", "angular_acceleration_deg_s2"
+        pairs = zip(names, largest, strict=True)
+        return {name: np.degrees(peak) / getattr(limits, name) for name, peak in pairs}
 
     def within(self, motion: Motion) -> Motion:
         """The motion with its shifts, and its turns, made so small that every limit is kept.

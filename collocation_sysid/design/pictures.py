@@ -23,17 +23,17 @@ from .designing import Design
 from .motion import angular_motion
 
 
-def pictures(found: Design) -> dict[str, Figure]:
+def pictures(design: Design) -> dict[str, Figure]:
     """All of them, by file name."""
-    return {"motion": motion_picture(found), "error_bars": error_bars_picture(found)}
+    return {"motion": motion_picture(design), "error_bars": error_bars_picture(design)}
 
 
-def motion_picture(found: Design) -> Figure:
+def motion_picture(design: Design) -> Figure:
     """Draw shift and rotation vector over time, and how much of each limit they use."""
     figure = new_figure(PAGE_MM, 100)
     shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
-    t_s, limits = found.motion.grid_s, found.limits
-    place, rate, curvature = found.motion.derivatives(t_s)
+    t_s, limits = design.motion.grid_s, design.limits
+    place, rate, curvature = design.motion.derivatives(t_s)
     angular = angular_motion(place[:, 3:], rate[:, 3:], curvature[:, 3:])
     for axis, colour in zip(range(3), CYCLE, strict=False):
         style = {"color": colour, "lw": LINE_PT, "label": "xyz"[axis]}
@@ -63,17 +63,17 @@ def motion_picture(found: Design) -> Figure:
     return figure
 
 
-def error_bars_picture(found: Design) -> Figure:
+def error_bars_picture(design: Design) -> Figure:
     """Draw the relative error bars before and after; lines span those over the draws of θ."""
-    names = list(found.after.relative)
+    names = list(design.after.relative)
     figure = new_figure(PAGE_MM / 2, 14 + 9 * len(names))
     axes = figure.subplots()
     rows = np.arange(len(names))
-    before = "recordings so far" if found.added else "the problem's motion"
-    after = "with the designed one" if found.added else "designed motion"
+    before = "recordings so far" if design.added else "the problem's motion"
+    after = "with the designed one" if design.added else "designed motion"
     for bars, label, colour, shift in (
-        (found.before, before, VERMILION, -0.15),
-        (found.after, after, BLUE, 0.15),
+        (design.before, before, VERMILION, -0.15),
+        (design.after, after, BLUE, 0.15),
     ):
         if bars is None:
             continue

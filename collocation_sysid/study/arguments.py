@@ -20,6 +20,11 @@ MOST_RUNS = 10_000
 RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 
+def each_once(text: str) -> tuple[str, ...]:
+    """What stands between commas, in its order."""
+    return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
+
+
 def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     """Names of methods separated by commas, in their order, each once.
 
@@ -28,7 +33,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     InputError
         For an unknown name, with the one that was probably meant.
     """
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    names = each_once(text)
     if not names:
         raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
     for name in names:
@@ -40,13 +45,13 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
 
 
 def read_truth(
-    given: Sequence[str], known: Sequence[str], needed: Sequence[str]
+    sources: Sequence[str], known: Sequence[str], needed: Sequence[str]
 ) -> dict[str, float]:
     """True values of the parameters, by name.
 
     Parameters
     ----------
-    given : sequence of str
+    sources : sequence of str
         TOML files, or "name=value" separated by commas; later ones win.
     known, needed : sequences of str
         All parameters of the problem, and those that are estimated.
@@ -58,14 +63,14 @@ def read_truth(
         number, and when a needed one is missing.
     """
     truth: dict[str, float] = {}
-    for item in given:
+    for item in sources:
         source, table = _truth_table(item)
         for name, value in table.items():
             if name not in known:
                 expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
                 raise InputError(f"found {name!r}; {expected}", source, "--truth")
             truth[name] = _positive(name, value, source)
-    if missing := [name for name in needed if given and name not in truth]:
+    if missing := [name for name in needed if sources and name not in truth]:
         raise InputError(
             f"{', '.join(missing)} missing; expected the true value of every estimated parameter",
             None,
@@ -103,14 +108,9 @@ def _positive(name: str, value: Any, source: Path | None) -> float:
     except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not 0 < number < np.inf:
-        raise InputError(
-            f"found {name} = {_quoted(value)}; expected a positive number", source, "--truth"
-        )
+        quoted = value[:60] if isinstance(value, str) else short(value)
+        raise InputError(f"found {name} = {quoted}; expected a positive number", source, "--truth")
     return number
-
-
-def _quoted(value: Any) -> str:
-    return value[:60] if isinstance(value, str) else short(value)
 
 
 # Swept keys ---------------------------------------------------------------------------------------
@@ -140,7 +140,8 @@ def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
             )
         if key in over:
             raise InputError(f"{key} is given twice; put its values in one list", None, "--over")
-        over[key] = tuple(_range(key, values) if _is_range(values) else _items(values))
+        ranged = ":" in values and not values.startswith(('"', "'", "[", "{"))
+        over[key] = tuple(_range(key, values) if ranged else _items(values))
     if not over:
         raise InputError("missing; expected at least one key to sweep over", None, "--over")
     require_few(math.prod(map(len, over.values())), "--over", "runs")
@@ -156,12 +157,8 @@ def require_few(count: int, option: str, what: str) -> None:
         Naming the option and both numbers.
     """
     if count > MOST_RUNS:
-        found = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
-        raise InputError(f"asks for {found} {what}; expected at most {MOST_RUNS:,}", None, option)
-
-
-def _is_range(values: str) -> bool:
-    return ":" in values and not values.startswith(('"', "'", "[", "{"))
+        number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
+        raise InputError(f"asks for {number} {what}; expected at most {MOST_RUNS:,}", None, option)
 
 
 def _range(key: str, text: str) -> Iterable[str]:
@@ -185,18 +182,13 @@ def _range(key: str, text: str) -> Iterable[str]:
             None,
             "--over",
         )
-    if spacing == "log":
-        if not (low > 0 and high > 0):
-            raise InputError(
-                f"found {text} for {key}; a logarithmic range needs ends above 0", None, "--over"
-            )
-        return map(_plain, np.geomspace(low, high, number))
-    return map(_plain, np.linspace(low, high, number))
-
-
-def _plain(value: float) -> str:
-    """A number without the rounding errors of its computation."""
-    return f"{value:.12g}"
+    if spacing == "log" and not (low > 0 and high > 0):
+        raise InputError(
+            f"found {text} for {key}; a logarithmic range needs ends above 0", None, "--over"
+        )
+    spaced = np.geomspace if spacing == "log" else np.linspace
+    # Without the rounding errors of their computation.
+    return [f"{value:.12g}" for value in spaced(low, high, number)]
 
 
 def _items(text: str) -> list[str]:

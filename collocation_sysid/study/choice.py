@@ -35,9 +35,9 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     """One row for each model, in their order; None where there is no number."""
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
-        found = (records.get(run.key) or {}).get("model") or {}
-        of_model.setdefault(run.swept["model"], {})[run.held_out or ""] = found
-    rows = [_row(label, found) for label, found in of_model.items()]
+        fit = (records.get(run.key) or {}).get("model") or {}
+        of_model.setdefault(run.swept["model"], {})[run.held_out or ""] = fit
+    rows = [_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
     _add_ratios(rows)
     chosen = chosen_row(rows)
@@ -46,9 +46,10 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     return rows
 
 
-def _row(label: str, found: Mapping[str, Mapping[str, Any]]) -> Row:
-    whole = found.get("", {})
-    predictions = {name: each.get("prediction") or {} for name, each in found.items() if name}
+def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Of a model's fits, to all recordings and to all but each."""
+    whole = fits.get("", {})
+    predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
     evidence, free = whole.get("evidence"), whole.get("free")
     unit = next((each["unit"] for each in predictions.values() if each), "m")
     return {
@@ -61,10 +62,10 @@ def _row(label: str, found: Mapping[str, Mapping[str, Any]]) -> Row:
         "held_out_rms": _pooled([*predictions.values()]),
         "predictions": {name: each.get("rms") for name, each in predictions.items()},
         "blocks": {name: each.get("blocks") for name, each in predictions.items()},
-        "failures": {n: found[n]["failure"] for n in predictions if found[n].get("failure")},
+        "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
         "evidence": evidence,
         "parameters": whole.get("parameters") or {},
-        "total_s": sum(each.get("time_s") or 0.0 for each in found.values()),
+        "total_s": sum(each.get("time_s") or 0.0 for each in fits.values()),
     }
 
 

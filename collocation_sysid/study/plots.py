@@ -116,10 +116,10 @@ def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known:
     edges = np.geomspace(max(1.0, factors.min()), factors.max() * (1 + 1e-9), DISTANCE_BINS + 1)
     methods = _by_method(rows)
     for k, (method, (colour, runs)) in enumerate(methods.items()):
-        found = np.array([distance(row, centre) for row in runs])
+        off = np.array([distance(row, centre) for row in runs])
         places, rates, bars = [], [], []
         for low, high in itertools.pairwise(edges):
-            hits = [row["success"] for row, f in zip(runs, found, strict=True) if low <= f < high]
+            hits = [row["success"] for row, f in zip(runs, off, strict=True) if low <= f < high]
             if hits:
                 rate, (least, most) = np.mean(hits), wilson_interval(sum(hits), len(hits))
                 shift = (k + 0.5) / len(methods)
@@ -186,11 +186,6 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.2g}"))
 
 
-def _labelled(name: str) -> str:
-    symbol, unit = mathematical(name), unit_of(name)
-    return f"{symbol} [{unit}]" if unit else symbol
-
-
 # Answers ------------------------------------------------------------------------------------------
 
 
@@ -208,15 +203,13 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
         axes.yaxis.set_major_locator(MaxNLocator(5))
     for method, (colour, runs) in _by_method(rows).items():
         best = best_run(runs)
-        found = records[best["key"]]["tip"] if best is not None else {}
-        if not found.get("rolled_out_m"):
+        track = records[best["key"]]["tip"] if best is not None else {}
+        if not track.get("rolled_out_m"):
             continue
-        rolled = 1e3 * np.array(found["rolled_out_m"], dtype=float)
-        label = (
-            f"{method}, off by at most {1e3 * found['max_m']:.2g} mm" if found["max_m"] else method
-        )
+        rolled = 1e3 * np.array(track["rolled_out_m"], dtype=float)
+        off = f", off by at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
         for axis, axes in enumerate(panels):
-            axes.plot(found["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=label)
+            axes.plot(track["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=method + off)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper left", ncols=2, fontsize=TEXT_PT, frameon=False
@@ -246,7 +239,8 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
         for line, name in zip(panels, names, strict=True):
             for label, colour, shift, chosen in _groups(rows, swept, key, shorts):
                 _draw_estimates(line[column], rows, places + shift, name, chosen, colour, label)
-            dress(line[column], "", "", "" if column else _labelled(name))
+            unit = f" [{unit_of(name)}]" if unit_of(name) else ""
+            dress(line[column], "", "", "" if column else mathematical(name) + unit)
         bottom = panels[-1, column]
         bottom.set_xlabel(shorts[key], fontsize=TEXT_PT)
         shown = list(texts)[:: -(-len(texts) // MOST_TICKS)]

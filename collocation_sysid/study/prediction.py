@@ -68,8 +68,8 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
     rollout = roll_out(replace(known, rollout=RolloutOptions("scheme")), experiment, solution)
     if not isinstance(rollout, Rollout):
         return record | {"prediction": None, "failure": rollout}
-    given = next(e for e in problem.experiments if e.name == held_out)
-    return record | {"prediction": _missed(given, rollout, start_s)}
+    whole = next(e for e in problem.experiments if e.name == held_out)
+    return record | {"prediction": _missed(whole, rollout, start_s)}
 
 
 def without(problem: Problem, name: str) -> tuple[Problem, float]:

@@ -140,20 +140,19 @@ def _numbers(result: Result) -> Row:
 
 def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
     row: Row = {}
-    found = {} if result is None else result.parameters
+    estimates = {} if result is None else result.parameters
     for name, guess in run.guess.items():
-        known = found[name].guess if name in found else None
+        known = estimates[name].guess if name in estimates else None
         row[f"guess_{name}"] = known if guess is None else guess
     for name in run.guess:
-        estimate = found.get(name)
+        estimate = estimates.get(name)
         value = None if estimate is None else estimate.value
         row[f"value_{name}"] = value
         row[f"std_error_{name}"] = None if estimate is None else estimate.std_error
         interval = None if estimate is None else estimate.ci95
         row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
-            error = None if value is None else abs(value / truth[name] - 1)
-            row[f"error_{name}"] = error
+            row[f"error_{name}"] = None if value is None else abs(value / truth[name] - 1)
     return row
 
 

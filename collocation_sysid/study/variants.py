@@ -22,6 +22,7 @@ from ..fem.materials import MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
 from ..problem import Problem
 from ..problem.reading import read_problem_file
+from .arguments import each_once
 
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
@@ -55,7 +56,7 @@ def parse_materials(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the one that was probably meant.
     """
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    names = each_once(text)
     for name in names or ("",):
         if name not in MATERIALS:
             known = f"expected some of {', '.join(MATERIALS)}{hint_at(name, MATERIALS)}"
@@ -100,23 +101,23 @@ def models(
     InputError
         For less than two models, and what the files or variants refuse.
     """
-    found = file_variants(problems, overrides)
+    compared = file_variants(problems, overrides)
     if materials or branches:
         fitted = [e for e in problems[0].experiments if not e.validation]
         times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
-        files, found = found, []
+        files, compared = compared, []
         for file in files:
             of_file = variants(file.path, overrides, materials, branches, times_s, region)
             front = f"{file.label}: " * (len(files) > 1)
-            found += [replace(v, label=front + v.label, path=file.path) for v in of_file]
-    if len(found) < 2:
+            compared += [replace(v, label=front + v.label, path=file.path) for v in of_file]
+    if len(compared) < 2:
         raise InputError(
-            f"found the model {found[0].label} alone; expected two or more to compare, such as "
+            f"found the model {compared[0].label} alone; expected two or more to compare, such as "
             "neo-hookean,yeoh",
             None,
             "--materials" if materials else "--prony",
         )
-    return found
+    return compared
 
 
 def variants(
@@ -149,7 +150,7 @@ def variants(
     content = file.model_dump(mode="json", exclude_unset=True)
     body = content["object"]
     _refuse_region(body, region, bool(branches), path)
-    found = []
+    varied = []
     for material in materials or (None,):
         for count in branches or (None,):
             label, changes = [], {}
@@ -160,18 +161,18 @@ def variants(
                 parameters = _of_material(parameters, material, region)
             if count is not None:
                 label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
-                given = [t for t in body.get("prony", []) if t.get("region") == region]
+                own = [t for t in body.get("prony", []) if t.get("region") == region]
                 others = [t for t in body.get("prony", []) if t.get("region") != region]
-                tables = _branches(given, count, {t["name"] for t in others}, region)
+                tables = _branches(own, count, {t["name"] for t in others}, region)
                 if tables or body.get("prony"):
                     changes["object.prony"] = [*others, *tables]
-                old = [each["name"] for each in given]
+                old = [each["name"] for each in own]
                 parameters = _with_memory(parameters, old, tables, times_s)
             changes["parameters"] = parameters
             settings = tuple(f"{key}={toml(value)}" for key, value in changes.items())
             said = f"{region}: " * (region is not None) + ", ".join(label)
-            found.append(Variant(said, (*overrides, *settings), path))
-    return found
+            varied.append(Variant(said, (*overrides, *settings), path))
+    return varied
 
 
 def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[Variant]:
@@ -251,10 +252,9 @@ def _of_material(
     fronts = {name[: -len(bare(name))] for name in parameters if bare(name) in of_any}
     if region is not None:
         fronts = {f"{region}."}
-    found = dict(parameters)
     for front in sorted(fronts):  # what is shared is first
-        found = _of_part(found, front, material, of_any)
-    return found
+        parameters = _of_part(parameters, front, material, of_any)
+    return dict(parameters)
 
 
 def _of_part(
@@ -278,10 +278,10 @@ def _shear_pa(parameters: Mapping[str, Any], front: str) -> float | None:
     """The small-strain shear modulus where the file guesses its own constants."""
 
     def value(name: str) -> float:
-        given = parameters.get(front + name, parameters.get(name))
-        if isinstance(given, Mapping):
-            given = given.get("fixed", given.get("guess"))
-        return float("nan") if given is None else float(given)
+        stated = parameters.get(front + name, parameters.get(name))
+        if isinstance(stated, Mapping):
+            stated = stated.get("fixed", stated.get("guess"))
+        return float("nan") if stated is None else float(stated)
 
     linear = 0.0 if math.isnan(value("c01_pa")) else value("c01_pa")
     poisson = USUAL_POISSON if math.isnan(value("poisson")) else value("poisson")
@@ -300,10 +300,10 @@ def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
 
 
 def _branches(
-    given: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
+    own: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
 ) -> list[dict[str, Any]]:
     """The first branches of the file, and more up to a number."""
-    tables = [dict(each) for each in given[:count]]
+    tables = [dict(each) for each in own[:count]]
     taken = {each["name"] for each in tables} | others
     names = (f"prony_{k}" for k in range(1, count + len(taken) + 1))
     owner = {} if region is None else {"region": region}

@@ -44,8 +44,8 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
         problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
         held_out = planned.get("held_out")
         if held_out is not None:
-            found = model_record(problem, planned["method"], held_out)
-            return {"outcome": FINISHED, "message": found["status"], "model": found}
+            fit = model_record(problem, planned["method"], held_out)
+            return {"outcome": FINISHED, "message": fit["status"], "model": fit}
         finished = run(problem, planned["method"])
         return {
             "outcome": FINISHED,
