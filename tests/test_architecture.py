@@ -26,7 +26,7 @@ LAYERS = (
     | {"refine"},
     {"output", "synthesis", "beginning"},
     {"export"},
-    {"terminal", "heartbeat", "method_tables"},
+    {"terminal", "heartbeat"},
     {"run"},
     {"live"},
     {"design", "study"},

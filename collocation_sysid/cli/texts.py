@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ..console import PlainConsole
-from ..display import on_terminal
+from ..display import Shown, Table, on_terminal
 from .common import AsJson, errors, examples
 
 commands = typer.Typer()
+
+KINDS = {"number": "number", "integer": "whole number", "string": "text", "object": "table"}
 
 
 class Kind(StrEnum):
@@ -31,7 +34,6 @@ def methods(
     as_json: AsJson = False,
 ) -> None:
     """List the methods, or the options of one: defaults, values, and what they do."""
-    from ..method_tables import methods_table, options_table
     from ..methods import METHODS
     from ..methods.described import options_schema, require_method, summary
 
@@ -41,7 +43,7 @@ def methods(
         listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
-        parts = options_table(name) if name else methods_table()
+        parts = _options_table(name) if name else _methods_table()
         PlainConsole().print(on_terminal(parts))
 
 
@@ -78,3 +80,41 @@ def new(
     errors.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
     for command in ("check", "solve"):
         errors.print(f"  collocation-sysid {command} {shlex.quote(str(file))}", soft_wrap=True)
+
+
+def _methods_table() -> Table:
+    """The methods by name, with a line on each."""
+    from ..methods import METHODS
+    from ..methods.described import summary
+
+    return Table("", ("method", ""), tuple((name, summary(name)) for name in METHODS), texts=1)
+
+
+def _options_table(method: str) -> list[Shown]:
+    """A method's options: defaults, what they can be, and what they do."""
+    from ..methods.described import options_schema, summary
+    from ..problem.solver_schema import heading
+
+    rows = []
+    for name, option in options_schema(method)["properties"].items():
+        rows.append((name, _default(option), f"{_values(option)}\n{option['description']}"))
+    table = Table("", ("option", "default", ""), tuple(rows), names=2, texts=1)
+    return [summary(method), "", f"In the problem file, under {heading(method)}:", "", table]
+
+
+def _default(option: Mapping[str, Any]) -> str:
+    default = option["default"]
+    items = default if isinstance(default, tuple) else [default]
+    text = ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in items)
+    return f"[{text}]" if isinstance(default, tuple) else text
+
+
+def _values(option: Mapping[str, Any]) -> str:
+    """What an option can be, from its JSON schema."""
+    if "enum" in option:
+        return ", ".join(option["enum"])
+    if option["type"] == "array":
+        return f"list, each a {_values(option['items'])}"
+    limits = {"exclusiveMinimum": "above", "minimum": "of at least"}
+    ranges = [f" {word} {option[key]:g}" for key, word in limits.items() if key in option]
+    return KINDS[option["type"]] + "".join(ranges)
