@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -94,49 +94,6 @@ class Entries(NamedTuple):
     rows: Index
     columns: Index
     values: Array
-
-
-class Channel(Protocol):
-    """What is looked at."""
-
-    @property
-    def rows(self) -> Index:
-        """(T,) rows of the grid whose positions it takes."""
-        ...
-
-    @property
-    def count(self) -> int:
-        """How many times there are."""
-        ...
-
-    @property
-    def each(self) -> int:
-        """How many vectors at a time."""
-        ...
-
-    def operator(self, phi: Array) -> sp.csr_array:
-        """What it takes of a row of x, (p, 3n)."""
-        ...
-
-    def values(self, motion: Motion, phi: Array) -> Array:
-        """(n, e, 3), as far as the rows given go."""
-        ...
-
-    def linearised(
-        self, motion: Motion, phi: Array, columns: Index, size: int
-    ) -> tuple[Array, Slopes]:
-        """The same, and their slopes where the motion changes by the parameters at `columns`."""
-        ...
-
-    def pulled(self, motion: Motion, phi: Array, by_values: Array) -> Pulled:
-        """Slopes of a scalar from those by the values."""
-        ...
-
-    def carried(
-        self, grasp: Grasp, motion: Motion, phi: Array, shifts: Array, turns: Array
-    ) -> Array | float:
-        """Changes (n, e, 3, c) where poses of a grasp are off by (N, c, 3), the body held still."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,6 +59,17 @@ class Generated:
         found[ca.jacobian(y, u).sparsity().get_col()] = True
         return found
 
+    def takes(self, datum: int) -> bool:
+        """Whether any y depends on a number of the data."""
+        _, data, y = self._symbols
+        if datum not in self._taken:
+            self._taken[datum] = ca.depends_on(y, data[datum])
+        return self._taken[datum]
+
+    @cached_property
+    def _taken(self) -> dict[int, bool]:
+        return {}
+
     @cached_property
     def is_linear(self) -> bool:
         """Whether slopes by u are always the same."""

@@ -132,6 +132,8 @@ class MarkerReading(Reading):
 
     def later(self, by_s: float) -> MarkerReading:
         """The same of samples so much later."""
+        if not self._first.residual.takes(1):
+            return self
         other, data, instruments = copy(self), self._window.data.copy(), self._instruments
         data[1] += by_s
         moved = self._window._replace(data=data)

@@ -1,6 +1,6 @@
 """What is measured of a body: one expression of what is looked at and of φ, compared with data.
 
-A sample reads y(c, φ, data), c being a few vectors of its `Channel`, such as a place on the body at
+A sample reads y(c, φ, data), c being a few vectors of its channel, such as a place on the body at
 neighbouring times, and φ its own nuisance parameters. The residual is r = (y − ŷ) / σ, in groups of
 three, the loss Σ ρ(‖r‖) over the groups. All derivatives are generated.
 """
@@ -19,11 +19,15 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from .channel import Channel, Entries, Slopes
+from .channel import Entries, Points, Slopes
 from .generated import Generated
 from .nuisance import NuisanceMap
+from .wrench_channel import GraspWrench
 
 GROUP = 3
+
+# What can be looked at.
+Channel = Points | GraspWrench
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
@@ -173,6 +177,8 @@ class Reading(ABC):
     has_offsets : bool
         Whether it is off by what nothing else tells, such as its tare: where nothing is fitted yet
         that is allowed for.
+    has_fixed_windows : bool
+        Whether its windows do not depend on φ.
     """
 
     channel: Channel
@@ -186,6 +192,7 @@ class Reading(ABC):
     own: Index
 
     has_offsets: ClassVar[bool] = False
+    has_fixed_windows: ClassVar[bool] = True
 
     @abstractmethod
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
@@ -263,10 +270,8 @@ class Reading(ABC):
         if not len(values):
             samples = len(self.window(phi, 0).places), len(self.names), GROUP
             return np.zeros(samples), np.zeros((*samples, size))
-        instrument, window, u, data = self._at(values, phi)
-        residual, by_u = instrument.residual.slopes(u, data)
+        window, residual, by_u = self._read(values, phi)
         samples, each, vectors = window.places.shape
-        by_u = by_u.transpose(2, 3, 0, 1)
         by_looked, by_own = by_u[..., : GROUP * vectors], by_u[..., GROUP * vectors :]
         found, first = np.zeros((*by_u.shape[:3], size)), size - len(phi)
         found[..., slopes.columns] = by_looked @ _around(slopes.by, window.places)
@@ -277,9 +282,35 @@ class Reading(ABC):
             shape = samples, len(here), GROUP * vectors, slopes.own.shape[3]
             around = slopes.own[times, number].reshape(shape)
             _add(found, here, first + slopes.places, by_looked[:, here] @ around)
-        _add(found, np.arange(each), first + self.own, by_own)
+        if self.own.size:
+            _add(found, np.arange(each), first + self.own, by_own)
         shape = samples, len(self.names), GROUP
-        return self._grouped(residual), found.reshape(*shape, size)
+        return residual.reshape(shape), found.reshape(*shape, size)
+
+    def _read(self, values: Array, phi: Array) -> tuple[Window, Array, Array]:
+        """The window, residuals (s, E, m) and their slopes (s, E, m, u)."""
+        if self._linear is None or len(values) < self.channel.count:
+            instrument, window, u, data = self._at(values, phi)
+            residual, by_u = instrument.residual.slopes(u, data)
+            return window, residual.transpose(1, 2, 0), by_u.transpose(2, 3, 0, 1)
+        window, at_zero, by_u = self._linear
+        samples, each, vectors = window.places.shape
+        around = values.reshape(-1, GROUP)[window.places].reshape(samples, each, GROUP * vectors)
+        if self.own.size:
+            own = np.broadcast_to(phi[self.own], (samples, *self.own.shape))
+            around = np.concatenate([around, own], axis=2)
+        return window, at_zero + (by_u @ around[..., None])[..., 0], by_u
+
+    @cached_property
+    def _linear(self) -> tuple[Window, Array, Array] | None:
+        """The same where all is zero; None where slopes are not always the same."""
+        if not self.has_fixed_windows or not self._first.residual.is_linear:
+            return None
+        nothing = np.zeros((self.channel.count, self.channel.each, GROUP))
+        instrument, window, u, data = self._at(nothing, np.zeros(self.nuisance.size))
+        residual, by_u = instrument.residual.slopes(u, data)
+        by_u = np.ascontiguousarray(by_u.transpose(2, 3, 0, 1))
+        return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
     def changes(self, values: Array, by: Array, phi: Array) -> Array:
         """Changes (s, G, 3, c) of the residuals where what is looked at changes (n, e, 3, c)."""

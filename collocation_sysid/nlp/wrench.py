@@ -43,7 +43,7 @@ class WrenchReading(Reading):
     channel: GraspWrench
     wrench: Wrench
 
-    has_offsets = True
+    has_offsets, has_fixed_windows = True, False
 
     @classmethod
     def of(
