@@ -19,7 +19,8 @@ from scipy.optimize import lsq_linear
 from ..arrays import Array, Index
 
 # Triangles are so small that NumPy's checks would take longer than the work.
-_geqrf, _trtrs, _trcon = get_lapack_funcs(("geqrf", "trtrs", "trcon"), dtype=np.float64)
+_names = ("geqrf", "trtrs", "trtri", "trcon")
+_geqrf, _trtrs, _trtri, _trcon = get_lapack_funcs(_names, dtype=np.float64)
 # Eigenvalue of the information SᵀS, in units of its diagonal, that is zero up to rounding; and the
 # share of a parameter in such a direction that does not matter.
 SINGULAR, NEGLIGIBLE = 1e-12, 1e-3
@@ -120,7 +121,11 @@ class LeastSquares:
     def _split(self) -> tuple[Array, NDArray[np.bool_]]:
         units = np.linalg.norm(self.slope, axis=0)
         units[units == 0] = 1.0
-        _, found, vectors = np.linalg.svd(self.slope / units)
+        square, size = (self.slope / units)[: len(units)], len(units)
+        # So that no eigenvalue is zero up to rounding; much faster.
+        if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(SINGULAR):
+            return _trtri(square)[0] / units[:, None], np.zeros(size, dtype=bool)
+        _, found, vectors = np.linalg.svd(square)
         values = np.zeros(len(units))
         values[: len(found)] = found
         known = values**2 > SINGULAR
