@@ -5,23 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from checks import assert_derivative, relative_error
+from checks import relative_error
 from problems_small import (
     GUESS,
     TRUTH,
     as_theta,
     bar_in_two_hands,
-    bar_let_go,
-    bar_loaded,
-    cube_with_gaps,
     cube_with_nuisance,
-    driven_bar,
     hung_cube,
     measured,
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Markers, Nuisance
+from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.batched.combine import combine_with_numpy
 from collocation_sysid.fem.moduli import engineering as engineering_moduli
 from collocation_sysid.methods.start import initial_variables
@@ -100,33 +96,6 @@ def hessian(collocation: Collocation, z: np.ndarray, weight: float, y: np.ndarra
     return sp.csc_array(upper + sp.triu(upper, 1).T)
 
 
-def assert_derivatives(collocation: Collocation, rng: np.random.Generator) -> None:
-    """Jacobian, gradient and Hessian of the Lagrangian against central differences."""
-    z = some_point(collocation)
-    y, weight = rng.normal(size=collocation.constraints), 1.3
-
-    def slope(at: np.ndarray) -> np.ndarray:
-        return weight * collocation.gradient(at) + collocation.jacobian(at).T @ y
-
-    jacobian, gradient = collocation.jacobian(z), collocation.gradient(z)
-    second = hessian(collocation, z, weight, y)
-    constraints = collocation.constraint_values
-    assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=0.1)
-    assert_derivative(collocation.objective, lambda d: gradient @ d, z, rng, scale=0.1)
-    assert_derivative(slope, lambda d: second @ d, z, rng, scale=0.1)
-    if collocation.nq:  # their columns would drown among the others
-        only_q = np.concatenate([np.ones(collocation.nq), np.zeros(len(z) - collocation.nq)])
-        assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_q)
-        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_q)
-    if nphi := collocation.nphi:
-        only_phi = np.concatenate([np.zeros(len(z) - nphi), np.ones(nphi)])
-        assert_derivative(slope, lambda d: second @ d, z, rng, scale=only_phi)
-        if any(len(segment.nuisance.moving) for segment in collocation.segments):
-            assert_derivative(constraints, lambda d: jacobian @ d, z, rng, scale=only_phi)
-
-
-# Derivatives
-
 # Every scheme from every start, and every other pair of choices at least once.
 LAYOUTS = [
     (scheme, start, explicit == "rows", substeps)
@@ -141,98 +110,6 @@ LAYOUTS = [
     )
     for start, (explicit, substeps) in zip(("equilibrium", "undeformed", "given"), row, strict=True)
 ]
-
-
-@pytest.mark.parametrize(("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS)
-def test_derivatives_in_every_layout(
-    scheme: str, start: str, explicit_grasps: bool, substeps: int, rng
-):
-    collocation = Collocation([swung(start)], WITH_PRIOR, scheme, substeps, explicit_grasps)
-    assert_derivatives(collocation, rng)
-
-
-@pytest.mark.parametrize("samples", [-4, 4])
-def test_derivatives_where_the_clock_is_whole_samples_off(samples: int, rng):
-    nuisance = Nuisance.none(marker_offset_m=2e-3, time_shift_s=0.01)
-    collocation = Collocation([replace(swung(steps=8), nuisance=nuisance)], GUESS)
-    (segment,) = collocation.segments
-    phi = np.zeros(segment.nuisance.size)
-    phi[segment.nuisance.of_clock] = float(samples)
-    read, _ = collocation.following(np.concatenate([GUESS.guess_q, phi]))
-    assert read.segments[0].chart.samples == samples
-    assert_derivatives(read, rng)
-
-
-@pytest.mark.parametrize("parameters", [ENGINEERING, POISSON_FIXED, ALL_FIXED])
-def test_derivatives_in_other_parametrisations(parameters: Parameters, rng):
-    assert_derivatives(Collocation([swung()], parameters), rng)
-
-
-def test_derivatives_of_several_experiments(rng):
-    experiments = [swung(), swung("undeformed", steps=7), bar_in_two_hands(3), cube_with_gaps(2)]
-    assert_derivatives(Collocation(experiments, GUESS, "bdf2"), rng)
-
-
-@pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
-def test_derivatives_of_a_body_that_tendons_and_pressures_drive(scheme: str, rng):
-    assert_derivatives(Collocation([measured(driven_bar(4)), swung()], GUESS, scheme), rng)
-
-
-@pytest.mark.parametrize("explicit_grasps", [False, True])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_derivatives_where_a_hand_lets_go_and_a_mass_joins(scheme: str, explicit_grasps: bool, rng):
-    experiment = measured(bar_let_go(6))
-    assert_derivatives(Collocation([experiment], GUESS, scheme, 1, explicit_grasps), rng)
-
-
-@pytest.mark.parametrize("parameters", [GUESS, ALL_FIXED])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_derivatives_by_the_times_of_loads(scheme: str, parameters: Parameters, rng):
-    experiments = [bar_loaded(6), replace(bar_let_go(5), nuisance=Nuisance.none(joining_s=0.003))]
-    assert_derivatives(Collocation(experiments, parameters, scheme), rng)
-
-
-@pytest.mark.parametrize("substeps", [1, 2])
-def test_derivatives_by_the_experiments_nuisance_parameters(substeps: int, rng):
-    experiments = [seen_with_gaps(cube_with_nuisance(6)), swung(), cube_with_nuisance(3)]
-    assert_derivatives(Collocation(experiments, GUESS, "midpoint", substeps), rng)
-
-
-@pytest.mark.parametrize(
-    "nuisance",
-    [
-        Nuisance.none(marker_offset_m=0.002),
-        Nuisance.none(time_shift_s=0.002),
-        Nuisance.none(pose_turn_rad=0.02),
-        Nuisance.none(gravity_rad=0.02),
-        Nuisance.none(hand_eye_m=0.002),
-        Nuisance.none(hand_eye_rad=0.02),
-        Nuisance.none(camera_offset_m=0.002),
-    ],
-    ids=["place", "time", "turn", "tilt", "grasp-shift", "grasp-turn", "offset"],
-)
-@pytest.mark.parametrize("parameters", [GUESS, ALL_FIXED])
-def test_derivatives_by_one_kind_of_nuisance(nuisance: Nuisance, parameters: Parameters, rng):
-    assert_derivatives(Collocation([replace(swung(), nuisance=nuisance)], parameters), rng)
-
-
-@pytest.mark.parametrize("huber", [1e-3, 4.0, 1e3])
-def test_derivatives_of_hubers_loss(huber: float, rng):
-    assert_derivatives(Collocation([swung(), cube_with_nuisance(3)], GUESS, huber=huber), rng)
-
-
-def test_derivatives_of_a_body_nobody_holds(rng):
-    flying = replace(swung("given"), grasps=())
-    assert_derivatives(Collocation([flying], GUESS, explicit_grasps=True), rng)
-
-
-def test_derivatives_with_the_papers_start_rule(rng):
-    experiment = swung("undeformed", start_rule="paper")
-    assert_derivatives(Collocation([experiment], GUESS, "backward-euler"), rng)
-
-
-def test_derivatives_of_an_experiment_shorter_than_the_schemes_reach(rng):
-    assert_derivatives(Collocation([swung(steps=2)], GUESS, "bdf2"), rng)
 
 
 # Feasibility
@@ -317,25 +194,6 @@ def test_structures_are_compressed_columns_with_ascending_rows(
     indptr, indices = collocation.hessian_structure
     column = np.repeat(np.arange(collocation.variables), np.diff(indptr))
     assert (indices <= column).all()
-
-
-@pytest.mark.parametrize("huber", [None, 2.0])
-def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(huber: float | None):
-    cube = swung_cube_without_places()
-    collocation = Collocation([cube], GUESS, huber=huber)
-    z = some_point(collocation)
-    exact = collocation.hessian(z, 1.0, np.zeros(collocation.constraints)).toarray()
-    convex = np.linalg.eigvalsh(collocation.hessian(z, 1.0, None).toarray())
-    assert np.linalg.eigvalsh(exact)[0] < -1e-6 * convex[-1]
-    assert convex[0] > -1e-12 * convex[-1]
-
-
-def swung_cube_without_places() -> Experiment:
-    experiment = cube_with_nuisance(4)
-    marked = measured(experiment).markers
-    rng = np.random.default_rng(3)
-    tracks = marked.positions_m + 5e-3 * rng.normal(size=marked.positions_m.shape)
-    return replace(experiment, markers=Markers(marked.t_s, tracks, marked.sigma_m, marked.names))
 
 
 def test_gauss_newtons_model_of_wild_samples_is_nowhere_below_their_loss(rng):

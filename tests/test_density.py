@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import cycle, product
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -102,25 +102,6 @@ def test_derivatives_of_the_forces_of_a_body_by_its_densities(rng):
 
     along = found.velocity_theta[0]
     assert_derivative(by_velocity, lambda d: along @ d, theta, rng, scale=0.1 * theta)
-
-
-@pytest.mark.parametrize(("name", "scheme"), [*product(MADE, ["midpoint"]), ("let go", "bdf2")])
-def test_derivatives_of_the_program_by_densities(name, scheme, rng):
-    experiment = measured_with(MADE[name](), TRUTH)
-    collocation = Collocation([experiment], parameters(), scheme=scheme)
-    z = METHODS["reduced-space"](max_iterations=2)(collocation).z
-    scale = np.concatenate([np.full(collocation.nq, 0.1), np.full(len(z) - collocation.nq, 0.01)])
-    jacobian = collocation.jacobian(z)
-    assert_derivative(
-        collocation.constraint_values, lambda d: jacobian @ d, z, rng, tolerance=1e-7, scale=scale
-    )
-    weights = rng.standard_normal(collocation.constraints)
-    hessian = collocation.hessian(z, 1.0, weights)
-
-    def slope(at: np.ndarray) -> np.ndarray:
-        return collocation.gradient(at) + collocation.jacobian(at).T @ weights
-
-    assert_derivative(slope, lambda d: hessian @ d, z, rng, tolerance=1e-7, scale=scale)
 
 
 # The same optimum ---------------------------------------------------------------------------

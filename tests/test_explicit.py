@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from checks import assert_derivative, relative_error
-from memories_small import ONE, TWO, guesses, recorded, remembering, truth
+from checks import relative_error
+from memories_small import ONE, guesses, recorded, truth
 from problems_small import GUESS, box, hung_cube, measured_with, with_markers
 
-from collocation_sysid.experiment import Experiment, Nuisance
+from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods.casadi_nlp import SqpMethod
@@ -20,19 +20,6 @@ from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.nlp.collocation import Collocation, carried_over
-
-KINDS = {
-    "relaxed": ("hung-cube", {}),
-    "loaded": ("hung-cube", {"loaded_since_s": 0.04}),
-    "undeformed": ("released-cube", {}),
-    "let-go": ("bar-let-go", {}),
-    "nuisance": ("bar-with-nuisance", {}),
-}
-LAYOUTS = [(kind, "midpoint") for kind in KINDS] + [
-    ("loaded", "bdf2"),
-    ("undeformed", "backward-euler"),
-]
-
 
 CORE = Region("core", np.arange(6), prony=["slow"])
 REGIONS = ONE | {"core.slow.share": 0.7, "core.slow.tau_s": 0.08}
@@ -70,55 +57,6 @@ def explicit(collocation: Collocation) -> Collocation:
     found = collocation.made_explicit()
     assert found.explicit
     return found
-
-
-def some_point(program: Collocation, rng: np.random.Generator) -> np.ndarray:
-    """Variables that satisfy nothing, the recursion of the memory neither."""
-    positions = []
-    for segment in program.segments:
-        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
-        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    p, nq = program.guess_p, program.nq
-    p[:nq] += 0.1 * rng.normal(size=nq)
-    p[nq:] = 0.5 * rng.normal(size=program.nphi)
-    lags = np.array(["lag of" in name for name in program.names])
-    p[lags] = np.abs(p[lags]) + 0.1
-    z = program.pack(p, positions)
-    for memory in program.carried:
-        z[memory.variables] += 0.01 * rng.normal(size=memory.count)
-    return z
-
-
-def assert_derivatives(program: Collocation, rng: np.random.Generator) -> None:
-    z, y = some_point(program, rng), rng.normal(size=program.constraints)
-
-    def slope(at: np.ndarray) -> np.ndarray:
-        return 1.3 * program.gradient(at) + program.jacobian(at).T @ y
-
-    jacobian, hessian = program.jacobian(z), program.hessian(z, 1.3, y)
-    of_m, of_q = np.zeros(len(z)), np.zeros(len(z))
-    of_q[: program.nq] = 0.1
-    for memory in program.carried:
-        of_m[memory.variables] = 0.1
-    for scale in (0.1, of_q, of_m):  # some columns would drown among the others
-        values = program.constraint_values
-        assert_derivative(values, lambda d: jacobian @ d, z, rng, scale=scale, directions=1)
-        assert_derivative(slope, lambda d: hessian @ d, z, rng, scale=scale, directions=1)
-
-
-@pytest.mark.parametrize(("kind", "scheme"), LAYOUTS, ids="-".join)
-def test_derivatives(kind: str, scheme: str, rng):
-    name, changes = KINDS[kind]
-    collocation = Collocation([remembering(name, 4, 2, **changes)], guesses(TWO, 1.1), scheme)
-    assert_derivatives(explicit(collocation), rng)
-
-
-def test_derivatives_of_regions_and_of_several_experiments(rng):
-    one = swung(of_regions(), REGIONS, 3)
-    forgetful = replace(hung_cube(3, (1, 1, 2)), name="forgetful")
-    tilted = replace(one, name="tilted", nuisance=Nuisance.none(gravity_rad=0.1))
-    collocation = Collocation([one, forgetful, tilted], guesses(REGIONS, 1.1))
-    assert_derivatives(explicit(collocation), rng)
 
 
 def test_the_recursion_holds_where_the_memory_follows_from_the_motion():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from memories_small import ONE, TWO, guesses, recorded
 from problems_small import GUESS, TRUTH, bar_let_go, bar_loaded, driven_bar, hung_cube
-from test_explicit import assert_derivatives, explicit, of_branches, some_point
+from test_explicit import explicit, of_branches
 from test_static import ELASTIC_ONLY, HANGING, block
 from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
 
@@ -78,24 +78,6 @@ MADE: dict[str, Callable[[], Collocation]] = {
     "memory let go": lambda: Collocation([felt_memory("bar-let-go", 8)], guesses(TWO, 1.1)),
     "several": lambda: Collocation(several(), guesses(TWO, 1.1)),
 }
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_derivatives(name: str, rng):
-    program = explicit(MADE[name]())
-    assert_derivatives(program, rng)
-    for indptr, rows in (program.jacobian_structure, program.hessian_structure):
-        columns = np.repeat(np.arange(program.variables), np.diff(indptr))
-        entries = columns * max(program.variables, program.constraints) + rows
-        assert (np.diff(entries) > 0).all(), "an entry twice, or out of order"
-
-
-@pytest.mark.parametrize("name", ["all unknown", "huber"])
-def test_gauss_newtons_hessian_is_convex_however_far_wrenches_are_off(name: str, rng):
-    program = explicit(MADE[name]())
-    z = some_point(program, rng)
-    found = np.linalg.eigvalsh(program.hessian(z, 1.0, None).toarray())
-    assert found[0] > -1e-12 * found[-1]
 
 
 def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):

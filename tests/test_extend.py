@@ -8,17 +8,14 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from checks import assert_derivative
 from problem_files import AT_TRUTH, both, replace_text, run_command, settings, write
 from problems_small import GUESS, TRUTH, hung_cube
-from test_collocation import assert_derivatives
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.fem.refinement import refined
 from collocation_sysid.methods import METHODS
-from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.forces import Forces
 from collocation_sysid.nlp.simulation import simulate, with_markers
 
@@ -28,16 +25,6 @@ DRAG = 40.0
 def drag(x, v, at, drag_coefficient):
     """Of a thick fluid, so that it is felt: half its density, the share of the surface, speed."""
     return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
-
-
-def smooth_drag(x, v, at, drag_coefficient):
-    """The same with a corner that differences do not see."""
-    return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1.0) * v
-
-
-def whirled(x, v, at, whirl_n_m3):
-    """It has no potential."""
-    return whirl_n_m3 * at.volume_m3 * ca.vertcat(at.rest_m[1] - x[1], x[0] - at.rest_m[0], 0)
 
 
 def in_fluid(steps: int = 10, law=drag, **changes) -> Experiment:
@@ -57,39 +44,6 @@ def seen(experiment: Experiment, integrator: str = "midpoint", sigma: float = 0.
     tracks = simulate(experiment, {**TRUTH, "drag_coefficient": DRAG}, integrator).markers_m
     noise = sigma * np.random.default_rng(4).normal(size=tracks.shape)
     return with_markers(experiment, tracks + noise)
-
-
-@pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
-@pytest.mark.parametrize("law", [smooth_drag, whirled])
-def test_programs_with_a_users_force_have_exact_derivatives(law, scheme, rng):
-    cube = hung_cube(5, (1, 1, 2))
-    (name,) = (constant.name for constant in cs.NodeForce.of(law).constants)
-    body = cs.Body(cube.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.of(law)])
-    own = cs.Parameters.of({name: cs.Unknown(DRAG)})
-    known = cs.Parameters((*GUESS.items, *own.items))
-    assert_derivatives(Collocation([replace(cube, body=body)], known, scheme), rng)
-
-
-def test_so_have_those_of_a_body_with_memory(rng):
-    experiment = in_fluid(4, law=smooth_drag, prony=["prony_1"])
-    memory = cs.Parameters.of({"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)})
-    known = cs.Parameters((*parameters(DRAG).items, *memory.items))
-    program = Collocation([experiment], known).made_explicit()
-    z = program.plain.pack(program.guess_p, [seen_rows(s) for s in program.segments])
-    z = program.pack(*program.plain.unpack(z))
-    y = rng.normal(size=program.constraints)
-    jacobian, second = program.jacobian(z), program.hessian(z, 1.0, y)
-    assert_derivative(program.constraint_values, lambda d: jacobian @ d, z, rng, scale=0.05)
-
-    def slope(at: np.ndarray) -> np.ndarray:
-        return program.gradient(at) + program.jacobian(at).T @ y
-
-    assert_derivative(slope, lambda d: second @ d, z, rng, scale=0.05)
-
-
-def seen_rows(segment) -> np.ndarray:
-    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
-    return rigid + 1e-3 * np.random.default_rng(3).normal(size=rigid.shape)
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if not m.startswith("casadi:")])

@@ -8,7 +8,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
-from test_collocation import assert_derivatives
 from test_static import HANGING, block
 from test_wrench import assert_slopes
 
@@ -17,7 +16,7 @@ from collocation_sysid.experiment import Experiment, Gauge, Look, Markers
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import simulate, with_markers, with_readings
+from collocation_sysid.nlp.simulation import simulate, with_readings
 from collocation_sysid.problem import Problem
 from collocation_sysid.run import run
 
@@ -79,17 +78,6 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
     inside = slice(3, -3)
     error = np.abs(found - expected - [0, 0, 9.81])[inside].max()
     assert error < 0.05 * np.abs(expected[inside]).max()
-
-
-@pytest.mark.parametrize("huber", [None, 1e3])
-def test_derivatives_of_a_program_with_readings_of_ones_own(huber: float | None, rng):
-    made = with_markers(hung_cube(7, (1, 1, 2)), hung_cube(7, (1, 1, 2)).markers.positions_m)
-    made = instrumented(made, accelerometer(made.t_s[2:]), strain_gauge(made.t_s))
-    # So that what is known of the markers is not drowned.
-    blunt = [replace(gauge, sigma=100 * gauge.sigma) for gauge in noisy(made).readings]
-    collocation = Collocation([replace(made, readings=blunt)], GUESS, huber=huber)
-    assert collocation.made_explicit() is collocation
-    assert_derivatives(collocation, rng)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problem_files import replace_text, run_command, write
-from problems_small import GUESS, TRUTH, bar_with_nuisance, cube_with_gaps, hung_cube
-from test_collocation import assert_derivatives
+from problems_small import GUESS, TRUTH, cube_with_gaps, hung_cube
 from test_nuisance import seen_with
 
 import collocation_sysid as cs
@@ -68,14 +67,6 @@ def test_a_clock_that_drifts_is_later_and_later():
     for k in (0, 4, 9):
         at_once = seen_with(shifted, np.array([0.05 * cube.t_s[k]])).markers.positions_m
         np.testing.assert_allclose(late[k], at_once[k], atol=1e-12)
-
-
-def test_derivatives_beside_all_others_and_shared(rng):
-    bar = bar_with_nuisance(5)
-    own = replace(bar.nuisance, time_shift_s=0.003, own=tuple(ROWS.values()))
-    shared = replace(own, scope={"sag": "shared", "camera_scale": "shared"})
-    pair = replace(bar, nuisance=shared), replace(bar, name="second", nuisance=shared)
-    assert_derivatives(Collocation(pair, GUESS, huber=2.0), rng)
 
 
 # Every one by one method; by the others one of them.

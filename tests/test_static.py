@@ -227,14 +227,6 @@ def test_static_and_dynamic_experiments_share_their_parameters():
     assert found["gamma_r_s"] == pytest.approx(TRUTH["gamma_r_s"], rel=0.3)
 
 
-@pytest.mark.parametrize("platen", ["z", "xyz"])
-def test_derivatives_of_static_experiments_are_those_of_differences(platen):
-    experiment = measured(block(platen, gravity_m_s2=HANGING))
-    collocation = Collocation([experiment], GUESS, explicit_grasps=platen == "z")
-    z, _ = initial_variables(collocation)
-    assert max(derivative_errors(collocation, z)) < 1e-6
-
-
 def test_the_zero_of_a_displacement_is_found_with_its_derivatives():
     true, experiment = 0.5e-3, block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3))
     top = experiment.grasps[1]

@@ -88,18 +88,6 @@ def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Col
     np.testing.assert_allclose(change, -values, atol=1e-9 * np.abs(values).max())
 
 
-def test_sensitivities_keep_the_linearised_constraints(collocation: Collocation):
-    z, positions = disturbed(collocation)
-    jacobian = collocation.jacobian(z)
-    (found,) = forward(collocation, positions)
-    (moving,) = (segment.moving for segment in collocation.segments)
-    for k, place in enumerate(moving):
-        p = np.eye(collocation.nq + collocation.nphi)[place]
-        change = jacobian @ collocation.pack(p, [found.by_p[:, :, k]])
-        forced = jacobian @ collocation.pack(p, [np.zeros_like(found.step)])
-        assert np.abs(change).max() < 1e-9 * np.abs(forced).max()
-
-
 def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation: Collocation):
     collocation = replace(collocation, experiments=[*map(measured, collocation.experiments)])
     z, _ = disturbed(collocation)

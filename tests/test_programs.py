@@ -1,0 +1,358 @@
+"""Every kind of program by one table: its matrices, its convex Hessian, and slopes along motions.
+
+A kind of force, reading, nuisance or memory that is added gets a line here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import chain
+
+import casadi as ca
+import numpy as np
+import pytest
+from checks import assert_derivative
+from memories_small import TWO, guesses, remembering
+from problems_small import (
+    GUESS,
+    bar_in_two_hands,
+    bar_let_go,
+    bar_loaded,
+    bar_with_nuisance,
+    cube_with_gaps,
+    cube_with_nuisance,
+    driven_bar,
+    hung_cube,
+    measured,
+)
+from test_collocation import ALL_FIXED, ENGINEERING, LAYOUTS, POISSON_FIXED, WITH_PRIOR, swung
+from test_density import MADE as DENSE
+from test_density import parameters as free_densities
+from test_explicit import REGIONS, of_regions
+from test_explicit_wrench import ALL_UNKNOWN, felt_memory, free_density, several, weighed
+from test_gauge import accelerometer, instrumented, noisy, strain_gauge
+from test_own_nuisance import ROWS
+from test_sharing import sharing, swung_again
+from test_static import HANGING, block
+from wrenches_small import sensing, wristed_cube
+
+import collocation_sysid as cs
+from collocation_sysid.experiment import Experiment, Markers, Nuisance
+from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.nlp.schemes import SCHEMES
+from collocation_sysid.nlp.tangent import BlockSolver
+
+Make = Callable[[], Collocation]
+
+
+def program(*experiments: Experiment, scheme: str = "midpoint", **options) -> Collocation:
+    return Collocation([*experiments], options.pop("parameters", GUESS), scheme, **options)
+
+
+def several_kinds() -> list[Experiment]:
+    return [swung(), swung("undeformed", steps=7), bar_in_two_hands(3), cube_with_gaps(2)]
+
+
+def cleared_clock(samples: int) -> Collocation:
+    """Read whole samples away from where its recording says."""
+    nuisance = Nuisance.none(marker_offset_m=2e-3, time_shift_s=0.01)
+    collocation = program(replace(swung(steps=8), nuisance=nuisance))
+    (segment,) = collocation.segments
+    phi = np.zeros(segment.nuisance.size)
+    phi[segment.nuisance.of_clock] = float(samples)
+    read, _ = collocation.following(np.concatenate([GUESS.guess_q, phi]))
+    assert read.segments[0].chart.samples == samples
+    return read
+
+
+def with_gaps(experiment: Experiment) -> Experiment:
+    tracks = measured(experiment).markers.positions_m.copy()
+    tracks[np.random.default_rng(3).random(tracks.shape[:2]) < 0.3] = np.nan
+    return cs.with_markers(experiment, tracks)
+
+
+def without_places() -> Experiment:
+    """A cube with everything unknown, of whose markers nobody knows where they sit."""
+    experiment = cube_with_nuisance(4)
+    marked = measured(experiment).markers
+    tracks = marked.positions_m + 5e-3 * np.random.default_rng(3).normal(
+        size=marked.positions_m.shape
+    )
+    return replace(experiment, markers=Markers(marked.t_s, tracks, marked.sigma_m, marked.names))
+
+
+def smooth_drag(x, v, at, drag_coefficient):
+    return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1.0) * v
+
+
+def whirled(x, v, at, whirl_n_m3):
+    """It has no potential."""
+    return whirl_n_m3 * at.volume_m3 * ca.vertcat(at.rest_m[1] - x[1], x[0] - at.rest_m[0], 0)
+
+
+def in_field(law: Callable, scheme: str = "midpoint", **memory) -> Collocation:
+    """With a force of a user."""
+    force, cube = cs.NodeForce.of(law), hung_cube(5, (1, 1, 2))
+    body = cs.Body(
+        cube.body.mesh, density_kg_m3=30.0, forces=[force], prony=["prony_1"] if memory else []
+    )
+    own = Parameters.of({force.constants[0].name: cs.Unknown(40.0), **memory})
+    known = Parameters((*GUESS.items, *own.items))
+    return program(replace(cube, body=body), parameters=known, scheme=scheme)
+
+
+def instruments(huber: float | None = None) -> Collocation:
+    """Of a user's own, so blunt that what is known of the markers is not drowned."""
+    cube = hung_cube(7, (1, 1, 2))
+    made = cs.with_markers(cube, cube.markers.positions_m)
+    made = noisy(instrumented(made, accelerometer(made.t_s[2:]), strain_gauge(made.t_s)))
+    blunt = [replace(gauge, sigma=100 * gauge.sigma) for gauge in made.readings]
+    return program(replace(made, readings=blunt), huber=huber)
+
+
+def users_nuisances() -> Collocation:
+    """Beside all others, and shared by two recordings."""
+    bar = bar_with_nuisance(5)
+    own = replace(bar.nuisance, time_shift_s=0.003, own=tuple(ROWS.values()))
+    shared = replace(own, scope={"sag": "shared", "camera_scale": "shared"})
+    pair = replace(bar, nuisance=shared), replace(bar, name="second", nuisance=shared)
+    return program(*pair, huber=2.0)
+
+
+def shared_by_four() -> Collocation:
+    """What is shared stands among each one's own, in another order, and moves the bodies too."""
+    cube = cube_with_nuisance(4)
+    shared = "marker_offset_m", "camera_offset_m", "time_shift_s", "pose_turn_rad", "gravity_rad"
+    second, third = (swung_again(cube, name) for name in ("second", "third"))
+    fourth = replace(bar_with_nuisance(4), nuisance=Nuisance.none(marker_offset_m=0.003))
+    return program(
+        sharing(cube, "hand_eye_m"),
+        sharing(second, *shared),
+        fourth,
+        sharing(third, *shared, "hand_eye_m"),
+    )
+
+
+def shared_sensors() -> Collocation:
+    nuisance = Nuisance(tare=10.0, sensor_lag_s=0.003, tool_kg=0.01, tool_m=0.02, gravity_rad=0.03)
+    one = wristed_cube(4, nuisance)
+    names = "tare", "sensor_time_s", "sensor_lag_s", "tool_kg", "tool_m", "gravity_rad"
+    return program(*(sharing(each, *names) for each in (one, swung_again(one, "second"))))
+
+
+def regions_and_several() -> Collocation:
+    one = replace(hung_cube(3, (1, 1, 2)), body=of_regions())
+    forgetful = replace(hung_cube(3, (1, 1, 2)), name="forgetful")
+    tilted = replace(one, name="tilted", nuisance=Nuisance.none(gravity_rad=0.1))
+    return program(one, forgetful, tilted, parameters=guesses(REGIONS, 1.1))
+
+
+def memory(name: str, scheme: str = "midpoint", **changes) -> Collocation:
+    experiment = remembering(name, 4, 2, **changes)
+    return program(experiment, parameters=guesses(TWO, 1.1), scheme=scheme)
+
+
+ONE_OF = {
+    "place": Nuisance.none(marker_offset_m=0.002),
+    "time": Nuisance.none(time_shift_s=0.002),
+    "turn": Nuisance.none(pose_turn_rad=0.02),
+    "tilt": Nuisance.none(gravity_rad=0.02),
+    "grasp-shift": Nuisance.none(hand_eye_m=0.002),
+    "grasp-turn": Nuisance.none(hand_eye_rad=0.02),
+    "offset": Nuisance.none(camera_offset_m=0.002),
+}
+PROGRAMS: dict[str, Make] = {
+    **{
+        f"{start}, {scheme}": lambda layout=(start, scheme, rows, steps): program(
+            swung(layout[0]),
+            parameters=WITH_PRIOR,
+            scheme=layout[1],
+            explicit_grasps=layout[2],
+            substeps=layout[3],
+        )
+        for scheme, start, rows, steps in LAYOUTS
+    },
+    "engineering moduli": lambda: program(swung(), parameters=ENGINEERING),
+    "some fixed": lambda: program(swung(), parameters=POISSON_FIXED),
+    "all fixed": lambda: program(swung(), parameters=ALL_FIXED),
+    "several": lambda: program(*several_kinds(), scheme="bdf2"),
+    "nobody holds": lambda: program(replace(swung("given"), grasps=()), explicit_grasps=True),
+    "paper's start": lambda: program(
+        swung("undeformed", start_rule="paper"), scheme="backward-euler"
+    ),
+    "shorter than its reach": lambda: program(swung(steps=2), scheme="bdf2"),
+    "static": lambda: program(measured(block("z", gravity_m_s2=HANGING)), explicit_grasps=True),
+    "static, a displacement's zero": lambda: program(
+        measured(block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3)))
+    ),
+    **{
+        f"driven, {scheme}": lambda scheme=scheme: program(
+            measured(driven_bar(4)), swung(), scheme=scheme
+        )
+        for scheme in ("midpoint", "bdf2")
+    },
+    **{
+        f"let go, {scheme}": lambda scheme=scheme: program(measured(bar_let_go(6)), scheme=scheme)
+        for scheme in SCHEMES
+    },
+    "let go, rows": lambda: program(measured(bar_let_go(6)), explicit_grasps=True),
+    **{
+        f"loads, {scheme}": lambda scheme=scheme: program(
+            bar_loaded(6),
+            replace(bar_let_go(5), nuisance=Nuisance.none(joining_s=0.003)),
+            scheme=scheme,
+        )
+        for scheme in SCHEMES
+    },
+    "loads, all fixed": lambda: program(bar_loaded(6), parameters=ALL_FIXED),
+    **{
+        f"nuisance, {steps}": lambda steps=steps: program(
+            with_gaps(cube_with_nuisance(6)), swung(), cube_with_nuisance(3), substeps=steps
+        )
+        for steps in (1, 2)
+    },
+    **{
+        f"{kind}": lambda one=one: program(replace(swung(), nuisance=one))
+        for kind, one in ONE_OF.items()
+    },
+    "turn, all fixed": lambda: program(
+        replace(swung(), nuisance=ONE_OF["turn"]), parameters=ALL_FIXED
+    ),
+    "clock before": lambda: cleared_clock(-4),
+    "clock behind": lambda: cleared_clock(4),
+    **{
+        f"huber, {huber:g}": lambda huber=huber: program(
+            swung(), cube_with_nuisance(3), huber=huber
+        )
+        for huber in (1e-3, 4.0, 1e3)
+    },
+    "places unknown": lambda: program(without_places()),
+    "places unknown, huber": lambda: program(without_places(), huber=2.0),
+    **{
+        f"density, {name}": lambda make=make: program(make(), parameters=free_densities())
+        for name, make in DENSE.items()
+    },
+    "density, let go, bdf2": lambda: program(
+        DENSE["let go"](), parameters=free_densities(), scheme="bdf2"
+    ),
+    "shared": shared_by_four,
+    "shared sensors": shared_sensors,
+    "a user's nuisances": users_nuisances,
+    "a user's drag": lambda: in_field(smooth_drag),
+    "a user's drag, bdf2": lambda: in_field(smooth_drag, "bdf2"),
+    "a user's whirl": lambda: in_field(whirled),
+    "a user's drag, memory": lambda: in_field(
+        smooth_drag, **{"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)}
+    ),
+    "instruments": instruments,
+    "instruments, huber": lambda: instruments(1e3),
+    "memory, relaxed": lambda: memory("hung-cube"),
+    "memory, loaded": lambda: memory("hung-cube", loaded_since_s=0.04),
+    "memory, loaded, bdf2": lambda: memory("hung-cube", "bdf2", loaded_since_s=0.04),
+    "memory, undeformed": lambda: memory("released-cube"),
+    "memory, undeformed, backward-euler": lambda: memory("released-cube", "backward-euler"),
+    "memory, let go": lambda: memory("bar-let-go"),
+    "memory, nuisance": lambda: memory("bar-with-nuisance"),
+    "memory, regions": regions_and_several,
+    "wrench": lambda: program(wristed_cube(5)),
+    "wrench, unknown": lambda: program(wristed_cube(6, ALL_UNKNOWN, frame="grasp")),
+    "wrench, huber": lambda: program(wristed_cube(6, ALL_UNKNOWN), huber=1.5),
+    "wrench, bdf2": lambda: program(wristed_cube(6, ALL_UNKNOWN), scheme="bdf2"),
+    "wrench, substeps": lambda: program(wristed_cube(3), scheme="backward-euler", substeps=2),
+    "wrench, rows": lambda: program(wristed_cube(5), explicit_grasps=True),
+    "wrench, density": lambda: program(
+        weighed(wristed_cube(5, ALL_UNKNOWN)), parameters=free_density()
+    ),
+    "wrench, loads": lambda: program(sensing(bar_loaded(6))),
+    "wrench, let go": lambda: program(sensing(bar_let_go(8))),
+    "wrench, driven": lambda: program(sensing(driven_bar(5))),
+    "wrench, static": lambda: program(sensing(block("xyz", gravity_m_s2=HANGING))),
+    "wrench, driven, memory": lambda: program(
+        felt_memory("driven-bar", 4), parameters=guesses(TWO, 1.1)
+    ),
+    "wrench, memory": lambda: program(
+        felt_memory("cube-with-nuisance"), parameters=guesses(TWO, 1.1)
+    ),
+    "wrench, memory, let go": lambda: program(
+        felt_memory("bar-let-go", 8), parameters=guesses(TWO, 1.1)
+    ),
+    "wrench, several": lambda: program(*several(), parameters=guesses(TWO, 1.1)),
+}
+
+
+def some_point(made: Collocation, rng: np.random.Generator) -> np.ndarray:
+    """Variables that satisfy nothing, what is carried neither."""
+    positions = []
+    for segment in made.segments:
+        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
+    p, nq = made.guess_p, made.nq
+    p[:nq] += 0.1 * rng.normal(size=nq)
+    p[nq:] += 0.5 * rng.normal(size=made.nphi)
+    lags = np.array(["lag of" in name for name in made.names], dtype=bool)
+    p[lags] = np.abs(p[lags]) + 0.1
+    z = made.pack(p, positions)
+    for carried in made.carried:
+        z[carried.variables] += 0.01 * rng.normal(size=carried.count)
+    return z
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_matrices_are_those_of_differences_and_laid_out_in_order(name: str, rng):
+    made = PROGRAMS[name]().made_explicit()
+    z, y = some_point(made, rng), rng.normal(size=made.constraints)
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return 1.3 * made.gradient(at) + made.jacobian(at).T @ y
+
+    jacobian, hessian, gradient = made.jacobian(z), made.hessian(z, 1.3, y), made.gradient(z)
+    assert_derivative(made.objective, lambda d: gradient @ d, z, rng, 1e-7, 0.1, 1)
+    for own in (slice(None), slice(made.nq), made.of_phi, slice(made.of_phi.stop, None)):
+        scale = np.zeros(len(z))  # some columns would drown among the others
+        scale[own] = 0.1
+        if scale.any():
+            values = made.constraint_values
+            if np.abs(jacobian @ scale).max() > 0:
+                assert_derivative(values, lambda d: jacobian @ d, z, rng, 1e-7, scale, 1)
+            assert_derivative(slope, lambda d: hessian @ d, z, rng, 1e-7, scale, 1)
+    for indptr, rows in (made.jacobian_structure, made.hessian_structure):
+        columns = np.repeat(np.arange(made.variables), np.diff(indptr))
+        entries = columns * max(made.variables, made.constraints) + rows
+        assert (np.diff(entries) > 0).all(), "an entry twice, or out of order"
+
+
+@pytest.mark.parametrize("name", ["places unknown", "places unknown, huber", "wrench, huber"])
+def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(name: str, rng):
+    made = PROGRAMS[name]().made_explicit()
+    z = some_point(made, rng)
+    convex = np.linalg.eigvalsh(made.hessian(z, 1.0, None).toarray())
+    assert convex[0] > -1e-12 * convex[-1]
+    if not made.explicit:
+        exact = made.hessian(z, 1.0, np.zeros(made.constraints)).toarray()
+        assert np.linalg.eigvalsh(exact)[0] < -1e-6 * convex[-1]
+
+
+# Where nothing but the last rows is left out: what moves the body moves it along its equations.
+ALONG = [name for name in PROGRAMS if not PROGRAMS[name]().remembers and "fixed" not in name]
+
+
+@pytest.mark.parametrize("name", ALONG)
+def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
+    made = PROGRAMS[name]()
+    z = some_point(made, rng)
+    jacobian, found = made.jacobian(z), []
+    for part in made.parts(z):
+        found.append(BlockSolver(part.segment).forward(part.x, part.setting).by_p)
+    moving = [segment.places[segment.moving].tolist() for segment in made.segments]
+    for place in sorted(set(chain(*moving))):
+        p = np.eye(made.nq + made.nphi)[place]
+        still = [np.zeros(by_p.shape[:2]) for by_p in found]
+        moved = [
+            by_p[..., own.index(place)] if place in own else none
+            for by_p, own, none in zip(found, moving, still, strict=True)
+        ]
+        change = jacobian @ made.pack(p, moved)
+        forced = jacobian @ made.pack(p, still)
+        assert np.abs(change).max() <= 1e-9 * np.abs(forced).max()
