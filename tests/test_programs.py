@@ -42,7 +42,7 @@ from collocation_sysid.experiment import Experiment, Markers, Nuisance
 from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.nlp.parameters import Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.tangent import BlockSolver
+from collocation_sysid.nlp.sweep import Sweep
 
 Make = Callable[[], Collocation]
 
@@ -344,7 +344,7 @@ def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
     z = some_point(made, rng)
     jacobian, found = made.jacobian(z), []
     for part in made.parts(z):
-        found.append(BlockSolver(part.segment).forward(part.x, part.setting).by_p)
+        found.append(Sweep(part.segment).forward(part.x, part.setting).by_p)
     moving = [segment.places[segment.moving].tolist() for segment in made.segments]
     for place in sorted(set(chain(*moving))):
         p = np.eye(made.nq + made.nphi)[place]
