@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
+from html import escape as escape_html
 from io import StringIO
 from pathlib import Path
 
@@ -239,6 +239,11 @@ def as_html(part: Shown) -> str:
             if part.style:
                 return f"<div{_class(part.style)}>\n{inner}</div>\n"
             return f"<h{part.level}>{escape(part.title)}</h{part.level}>\n{inner}"
+
+
+def escape(text: str) -> str:
+    """Text as HTML holds it."""
+    return escape_html(text).replace("&#x27;", "&#39;")
 
 
 def _class(style: str) -> str:

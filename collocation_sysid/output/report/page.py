@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 
-from ...display import Section, as_html, as_markdown
+from ...display import Section, as_html, as_markdown, escape
 from ...files import is_own
 
 
