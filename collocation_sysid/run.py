@@ -26,8 +26,7 @@ from .statistics.diagnostics import diagnose
 from .statistics.linearised import linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import pose_noise_draws
-from .statistics.profile import Profile
-from .statistics.profiling import profile_of
+from .statistics.profile import Profile, profile_of
 from .statistics.uncertainty import uncertainty_of
 
 if TYPE_CHECKING:

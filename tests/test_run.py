@@ -17,7 +17,7 @@ from collocation_sysid.output.record import result
 from collocation_sysid.result import Result
 from collocation_sysid.rollout import Rollout
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.profiling import profile_of
+from collocation_sysid.statistics.profile import profile_of
 from collocation_sysid.tree import as_json, content, read
 
 NUISANCE = """

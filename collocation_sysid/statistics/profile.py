@@ -8,20 +8,28 @@ loss; where it never rises so far, the interval is open.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import root_scalar
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution
+from ..nlp.parameters import Parameter
 from .distributions import chi2_isf
+from .linearised import LinearisedFit
+from .uncertainty import Uncertainty, uncertainty_of
 
 SolveFixed = Callable[[str, float], float]
 
 THRESHOLD = float(chi2_isf(0.05, 1))
 # The ends are found to this share of their distance from the best value, in the logarithm.
 PRECISION = 0.02
-MOST_SOLVES = 20
+MOST_DOUBLINGS = 20
+# No rise counts for more thresholds than this, not even one to no solution at all.
+HIGHEST = 16.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,110 +91,129 @@ def profile(
             f"best value {value:g} of {parameter} is not within its bounds "
             f"[{bounds[0]:g}, {bounds[1]:g}]"
         )
-    known = {value: loss}
+    known, threshold = {value: loss}, THRESHOLD * noise_scale
 
-    def rise(logarithm: float) -> float:
-        at = float(np.clip(np.exp(logarithm), *bounds))
+    def rise(way: float) -> float:
+        """By how much the root of the loss rises, over what it may; this is nearly straight."""
+        at = float(np.clip(value * np.exp(way), *bounds))
         if at not in known:
             try:
                 known[at] = solve_fixed(parameter, at)
             except SimulationError:
                 known[at] = np.inf
-        return known[at] - loss - THRESHOLD * noise_scale
+        above = float(np.sqrt(np.clip((known[at] - loss) / threshold, 0.0, HIGHEST))) - 1.0
+        return above if abs(above) > PRECISION / 2 else 0.0
 
     step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
-    ends = [
-        _end(rise, np.log(value), side * step, float(np.log(bound)))
+    lower, upper = (
+        None
+        if (way := _end(rise, side * step, float(np.log(bound / value)))) is None
+        else float(value * np.exp(way))
         for side, bound in zip((-1, 1), bounds, strict=True)
-    ]
-    interval = (_exponential(ends[0]), _exponential(ends[1]))
+    )
     values = np.array(sorted(known))
     losses = np.array([known[at] for at in values.tolist()])
-    return Profile(
-        parameter,
-        values,
-        losses,
-        THRESHOLD * noise_scale,
-        interval,
-        _sentence(parameter, values, losses, loss, interval, bounds),
-    )
+    said = _sentence(parameter, (lower, upper), bounds)
+    if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
+        better = values[int(np.argmin(losses))]
+        said += f"; at {better:.4g} the loss is lower than at the answer: solve again from there"
+    return Profile(parameter, values, losses, threshold, (lower, upper), said)
 
 
-def _end(rise: Callable[[float], float], start: float, step: float, bound: float) -> float | None:
+def _end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
     """Where the loss has risen enough, on one side; None if it has not at the bound."""
-    sign = np.sign(step)
-    inside, outside, height = start, start, rise(start)
-    heights = [height, height]
-    for _ in range(MOST_SOLVES):
-        if sign * (bound - outside) <= 0:
+    inside, nearer = 0.0, min if step > 0 else max
+    for _ in range(MOST_DOUBLINGS):
+        if inside == bound:
             return None
-        inside, heights[0] = outside, heights[1]
-        outside = start + step if sign * (bound - start - step) > 0 else bound
-        heights[1] = rise(outside)
-        if heights[1] >= 0:
-            return _between(rise, start, (inside, outside), (heights[0], heights[1]))
-        step *= 2
+        outside = nearer(inside + step, bound)
+        if rise(outside) >= 0:
+            within = PRECISION * abs(outside)
+            return root_scalar(rise, bracket=(inside, outside), xtol=within).root
+        inside, step = outside, 2 * step
     return None
-
-
-def _between(
-    rise: Callable[[float], float],
-    start: float,
-    ends: tuple[float, float],
-    heights: tuple[float, float],
-) -> float:
-    """Root of the rise, taken as quadratic in the distance from the best value."""
-    inside, outside = ends
-    low, high = heights
-    base = rise(start)
-    for _ in range(MOST_SOLVES):
-        if abs(outside - inside) <= PRECISION * abs(outside - start):
-            break
-        # The square root of the loss is nearly straight, unless the loss is infinite or falls.
-        near, far = np.sqrt(max(low - base, 0.0)), np.sqrt(max(high - base, 0.0))
-        share = (np.sqrt(-base) - near) / (far - near) if np.isfinite(far) and far > near else 0.5
-        middle = inside + float(np.clip(share, 0.02, 0.98)) * (outside - inside)
-        height = rise(middle)
-        if abs(height) <= PRECISION * abs(base):
-            return middle
-        if height < 0:
-            inside, low = middle, height
-        else:
-            outside, high = middle, height
-    return (inside + outside) / 2
-
-
-def _exponential(logarithm: float | None) -> float | None:
-    return None if logarithm is None else float(np.exp(logarithm))
 
 
 def _sentence(
     parameter: str,
-    values: Array,
-    losses: Array,
-    loss: float,
     interval: tuple[float | None, float | None],
     bounds: tuple[float, float],
 ) -> str:
     lower, upper = interval
+    how = "(95 %, profile likelihood)"
     if lower is not None and upper is not None:
-        said = f"{parameter} lies between {lower:.4g} and {upper:.4g} (95 %, profile likelihood)"
-    elif upper is not None:
-        said = (
-            f"{parameter} is at most {upper:.4g} (95 %, profile likelihood); downwards the data "
-            f"do not limit it within its bound {bounds[0]:.4g}"
-        )
-    elif lower is not None:
-        said = (
-            f"{parameter} is at least {lower:.4g} (95 %, profile likelihood); upwards the data "
-            f"do not limit it within its bound {bounds[1]:.4g}"
-        )
-    else:
-        said = (
+        return f"{parameter} lies between {lower:.4g} and {upper:.4g} {how}"
+    if lower is None and upper is None:
+        return (
             f"{parameter} is not identifiable: the loss hardly changes between {bounds[0]:.4g} "
             f"and {bounds[1]:.4g}; fix it, give it a prior, or move the body differently"
         )
-    if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
-        better = values[int(np.argmin(losses))]
-        said += f"; at {better:.4g} the loss is lower than at the answer: solve again from there"
-    return said
+    least = lower is not None
+    return (
+        f"{parameter} is at {'least' if least else 'most'} {lower if least else upper:.4g} {how}; "
+        f"{'upwards' if least else 'downwards'} the data do not limit it within its bound "
+        f"{bounds[least]:.4g}"
+    )
+
+
+def profile_of(
+    solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, name: str
+) -> Profile:
+    """Profile likelihood of an estimated parameter.
+
+    Raises
+    ------
+    InputError
+        If the parameter is not among those estimated.
+    """
+    parameters = solution.collocation.parameters
+    free = [item.name for item in parameters.free]
+    if name not in free:
+        raise InputError(
+            f"found {name!r}; expected one of the estimated parameters {', '.join(free)}",
+            None,
+            "uncertainty.profile",
+        )
+    k = free.index(name)
+    variance = float(uncertainty.covariance[k, k])
+    item = parameters.free[k]
+
+    def solve_fixed(_: str, value: float) -> float:
+        return _loss_with(solution, item, value)
+
+    return profile(
+        solve_fixed,
+        name,
+        (solution.parameters[name], _loss(solution)),
+        (item.lower, item.upper),
+        float(np.sqrt(variance)),
+        _noise_scale(solution, fit, uncertainty, k),
+    )
+
+
+def _loss(solution: Solution) -> float:
+    return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
+
+
+def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
+    """Smallest loss with one parameter at a value, the search starting at the answer."""
+    before = solution.collocation
+    started = before.parameters.with_guess(solution.parameters)
+    held = started.with_fixed({item.name: value})
+    found = ReducedSpace()(replace(before, parameters=held)).unless_interrupted()
+    if not found.status.converged:
+        return float("inf")
+    prior = 0.0
+    if item.prior is not None:
+        mean, deviation = item.prior
+        away = np.log(value / mean) if item.scale == "log" else value - mean
+        prior = (away / deviation) ** 2
+    return _loss(found) + float(prior)
+
+
+def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
+    """Variance of the estimate over what the σ given would make it."""
+    parameters, q = solution.collocation.parameters, solution.q
+    given = uncertainty_of(fit, parameters, q, "given", "independent").covariance[k, k]
+    scale = float(uncertainty.covariance[k, k] / given)
+    return scale if np.isfinite(scale) else 1.0
