@@ -20,7 +20,7 @@ from collocation_sysid.nlp.overstress import Overstress
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.memory_notes import memory_notes
+from collocation_sysid.statistics.notes import memory_notes
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
 NOISE_M = 2e-4

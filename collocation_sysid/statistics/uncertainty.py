@@ -39,9 +39,15 @@ from .estimates import (
     user_estimates,
 )
 from .information import Information, information
-from .linearised import AT_BOUND, LinearisedFit, linearised_fit
-from .memory_notes import memory_notes
+from .linearised import LinearisedFit, linearised_fit
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
+from .notes import (
+    correlation_notes,
+    memory_notes,
+    parameter_notes,
+    scatter_notes,
+    size_notes,
+)
 from .outliers import Outlier, set_apart
 from .pose_noise import pose_noise_draws
 from .scatter import Scatter, recordings_of, scatter_of, single_fits
@@ -65,8 +71,6 @@ ErrorsOption = Literal["auto", "independent", "autocorrelated"]
 
 # A damping that ended at its bound is not told at all if it may be this many times the usual.
 UNINFORMED = 100.0
-# Residuals this many times sigma, or one over it, are worth a word.
-NOTEWORTHY = 1.1
 # With σ given, correlation that widens no error bar by this factor is of no consequence.
 CONSEQUENCE = 1.05
 # Simulations of the residuals that tell how dependent they may be by chance.
@@ -196,43 +200,20 @@ def uncertainty_of(
         If the noise is to be estimated from fewer measurements than parameters.
     """
     _check(noise, errors)
-    factored = information(fit)
+    factored, shared = information(fit), fit.shared
     freedom = fit.measurements - round(factored.fitted, 9)
     if noise == "estimated" and freedom < 1:
         raise InputError(
             f"the noise cannot be estimated from {fit.measurements} measurements of "
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
-    level = noise_level(fit, factored, extra)
-    rest, outliers = set_apart(fit)
-    found, dependent = _dependence(rest, extra)
-    correlated = errors == "autocorrelated" or (errors == "auto" and dependent)
-    kind = _kind(noise, level, correlated)
-    of_all, quantiles = _independent(fit, factored, kind, level)
-    used: Errors = "independent"
-    if correlated:
-        persistent = _autocorrelated(fit, factored, kind, level)
-        if errors == "autocorrelated" or kind != "given" or _widens(fit, persistent, of_all):
-            (of_all, quantiles), used = persistent, "autocorrelated"
-    shared = fit.shared
-    silent = _no_information(parameters, q, np.diag(of_all)[:shared])
-    at_bound = fit.at_bound.copy()
-    at_bound[:shared] &= ~silent
-    of_all[at_bound] = of_all[:, at_bound] = np.nan
-    of_q, bounded = of_all[:shared, :shared], at_bound[:shared]
-    lost = np.flatnonzero((np.diag(of_q) > UNDETERMINED**2) | (silent & fit.at_bound[:shared]))
-    of_q[lost] = of_q[:, lost] = np.nan
-    of_q[lost, lost] = np.inf
+    bars = _error_bars(fit, factored, noise, errors, extra)
+    of_all, bounded = _known(bars.covariance, fit, parameters, q)
     scatter = _scatter(fit, parameters, q, noise, errors, extra)
-    if scatter is not None:
-        with np.errstate(invalid="ignore"):
-            factors = np.sqrt(scatter.widened(np.diag(of_q)) / np.diag(of_q))
-        factors = np.where(scatter.disagreeing, factors, 1.0)
-        of_q *= np.outer(factors, factors)
-        of_few = student_ppf(0.975, np.maximum(scatter.freedom, 1))
-        quantiles = np.where(scatter.disagreeing, np.maximum(quantiles, of_few), quantiles)
+    of_q, quantiles = _widened(of_all[:shared, :shared], bars.quantiles, scatter)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
-    sizes = relative_slopes(parameters, q)
+    longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
+    sizes, deviations = relative_slopes(parameters, q), np.sqrt(np.diag(of_all)[shared:]).tolist()
     return Uncertainty(
         names=fit.names[:shared],
         covariance=of_q * np.outer(sizes, sizes),
@@ -240,26 +221,94 @@ def uncertainty_of(
         quantiles=quantiles,
         estimates=estimates,
         derived=derived_estimates(fit.derived, of_q, bounded, quantiles),
-        nuisance=dict(
-            zip(fit.names[shared:], np.sqrt(np.diag(of_all)[shared:]).tolist(), strict=True)
-        ),
+        nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
-        noise=kind,
-        errors=used,
-        level=level,
-        dependence=found,
+        noise=bars.noise,
+        errors=bars.errors,
+        level=bars.level,
+        dependence=bars.dependence,
         chi_squared=fit.chi_squared,
         degrees_of_freedom=freedom,
         notes=(
-            *_parameter_notes(parameters, q, bounded, estimates),
-            *memory_notes(estimates, max((float(np.ptp(b.t_s)) for b in fit.blocks), default=0.0)),
-            *_size_notes(noise, kind, level, used),
-            *_correlation_notes(used, found, forced=errors == "independent"),
-            *_scatter_notes(fit, scatter),
+            *parameter_notes(parameters, estimates),
+            *memory_notes(estimates, longest_s),
+            *size_notes(noise, bars.noise, bars.level, bars.errors),
+            *correlation_notes(errors, bars.errors, bars.dependence),
+            *scatter_notes(fit, scatter),
         ),
         scatter=scatter,
-        outliers=outliers,
+        outliers=bars.outliers,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _ErrorBars:
+    """Covariance of all parameters, quantiles of the shared ones, and what they are based on."""
+
+    covariance: Array
+    quantiles: Array
+    noise: Noise
+    errors: Errors
+    level: NoiseLevel
+    dependence: Dependence
+    outliers: tuple[Outlier, ...]
+
+
+def _error_bars(
+    fit: LinearisedFit,
+    factored: Information,
+    noise: NoiseOption,
+    errors: ErrorsOption,
+    extra: Extra | None,
+) -> _ErrorBars:
+    level = noise_level(fit, factored, extra)
+    rest, outliers = set_apart(fit)
+    found, dependent = _dependence(rest, extra)
+    correlated = errors == "autocorrelated" or (errors == "auto" and dependent)
+    kind: Noise = level.kind if noise == "auto" else noise
+    if noise == "auto" and correlated and level.pooled < 1:
+        kind = "given"
+    of_score, freedom = level.score_covariance(kind, factored, fit.shared)
+    covariance, used = factored.fit.covariance(of_score), "independent"
+    if correlated:
+        of_score, of_few = _autocorrelated(fit, factored, kind, level)
+        persistent = factored.fit.covariance(of_score)
+        before, after = (np.diag(each)[: fit.shared] for each in (covariance, persistent))
+        widens = (after > CONSEQUENCE**2 * before).any()
+        if errors == "autocorrelated" or kind != "given" or widens:
+            covariance, freedom, used = persistent, of_few, "autocorrelated"
+    quantiles = student_ppf(0.975, freedom)
+    return _ErrorBars(covariance, quantiles, kind, used, level, found, outliers)
+
+
+def _known(
+    covariance: Array, fit: LinearisedFit, parameters: Parameters, q: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Covariance of all parameters as it is told, and which of the shared ones are at a bound.
+
+    It is NaN of those at a bound, and infinite of shared ones that the data do not determine.
+    """
+    told, shared = covariance.copy(), fit.shared
+    silent = _no_information(parameters, q, np.diag(covariance)[:shared])
+    at_bound = fit.at_bound.copy()
+    at_bound[:shared] &= ~silent
+    told[at_bound] = told[:, at_bound] = np.nan
+    of_q, bounded = told[:shared, :shared], at_bound[:shared]
+    lost = np.flatnonzero((np.diag(of_q) > UNDETERMINED**2) | (silent & fit.at_bound[:shared]))
+    of_q[lost] = of_q[:, lost] = np.nan
+    of_q[lost, lost] = np.inf
+    return told, bounded
+
+
+def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Array, Array]:
+    """Covariance and quantiles, both larger where recordings disagree."""
+    if scatter is None:
+        return of_q, quantiles
+    with np.errstate(invalid="ignore"):
+        factors = np.sqrt(scatter.widened(np.diag(of_q)) / np.diag(of_q))
+    factors = np.where(scatter.disagreeing, factors, 1.0)
+    of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.freedom, 1)))
+    return of_q * np.outer(factors, factors), np.where(scatter.disagreeing, of_few, quantiles)
 
 
 def _scatter(
@@ -303,21 +352,6 @@ def _check(noise: str, errors: str) -> None:
     ):
         if value not in known:
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(known)}")
-
-
-def _kind(noise: NoiseOption, level: NoiseLevel, correlated: bool) -> Noise:
-    """What the size of the errors is taken from."""
-    if noise != "auto":
-        return noise
-    return "given" if correlated and level.pooled < 1 else level.kind
-
-
-def _independent(
-    fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
-) -> tuple[Array, Array]:
-    """Covariance of all parameters, and the quantiles of the shared ones."""
-    of_score, freedom = level.score_covariance(kind, factored, fit.shared)
-    return factored.fit.covariance(of_score), student_ppf(0.975, freedom)
 
 
 def _dependence(fit: LinearisedFit, extra: Extra | None) -> tuple[Dependence, bool]:
@@ -366,6 +400,7 @@ def _expected(
 def _autocorrelated(
     fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
+    """Covariance of the score of correlated errors, and its degrees of freedom."""
     of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared)
     if kind == "given" or level.extra.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
@@ -376,128 +411,4 @@ def _autocorrelated(
         values, vectors = np.linalg.eigh((over + over.T) / 2)
         wide = root @ vectors
         of_score = (wide * np.maximum(values, 1.0)) @ wide.T
-    return factored.fit.covariance(of_score), student_ppf(0.975, freedom)
-
-
-def _widens(fit: LinearisedFit, correlated: tuple[Array, Array], independent: Array) -> bool:
-    before, after = (np.diag(each)[: fit.shared] for each in (independent, correlated[0]))
-    return bool((after > CONSEQUENCE**2 * before).any())
-
-
-def _scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
-    if scatter is None:
-        return []
-    return [
-        f"the recordings disagree on {fit.names[k]} (χ² {scatter.chi_squared[k]:.3g} for "
-        f"{scatter.freedom[k]} degrees of freedom): model error decides, and its interval holds "
-        "what they disagree by"
-        for k in np.flatnonzero(scatter.disagreeing).tolist()
-    ]
-
-
-def _parameter_notes(
-    parameters: Parameters,
-    q: Array,
-    bounded: NDArray[np.bool_],
-    estimates: Mapping[str, Estimate],
-) -> list[str]:
-    notes, reasons = [], {}
-    for k, item in enumerate(parameters.free):
-        estimate = estimates[item.name]
-        if bounded[k]:
-            side = "lower" if q[k] - parameters.bounds_q[0][k] < AT_BOUND else "upper"
-            notes.append(
-                f"{item.name} ended at its {side} bound {getattr(item, side):g}: it has no error "
-                "bar, and the others' allow for other values of it; widen the bound, or fix it "
-                "if it is known"
-            )
-        elif estimate.ci95 is None and is_damping(item.name):
-            notes.append(
-                f"{item.name} is not determined: no information on damping in these data; fix it, "
-                "give it a prior, or move the body"
-            )
-        elif estimate.ci95 is None:
-            notes.append(
-                f"{item.name} is not determined by these data; fix it, give it a prior, or move "
-                "the body differently"
-            )
-        elif estimate.std_error is None:
-            reasons[item.name] = str(estimate.reason)
-    return [*notes, *_unidentifiable(reasons)]
-
-
-def _unidentifiable(reasons: Mapping[str, str]) -> list[str]:
-    """One sentence a parameter, and one for two that are confounded with each other."""
-    notes, told = [], set()
-    for name, reason in reasons.items():
-        because, other = reason, reason.removeprefix("confounded with ").split(" ")[0]
-        which, pronoun = f"{name} is", "it"
-        if reasons.get(other, "").startswith(f"confounded with {name} "):
-            which, pronoun = f"{name} and {other} are", "one of them"
-            because = reason.replace(other, "each other", 1)
-        if other not in told:
-            notes.append(
-                f"{which} not identifiable from these data: {because}; fix {pronoun}, give it a "
-                "prior, or move the body differently"
-            )
-        told.add(name)
-    return notes
-
-
-def _size_notes(noise: NoiseOption, kind: Noise, level: NoiseLevel, errors: Errors) -> list[str]:
-    """On residuals larger or smaller than σ as stated."""
-    if noise == "estimated" or level.kind == "given":
-        return []
-    factor = float(np.sqrt(level.pooled))
-    low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
-    ratio = level.factors[high] / level.factors[low]
-    if level.unequal and ratio > NOTEWORTHY**2:
-        size = (
-            f"the residuals are between {level.factors[low]:.2g} ({low}) and "
-            f"{level.factors[high]:.2g} ({high}) times as large as {level.stated} says"
-        )
-    elif factor > NOTEWORTHY:
-        size = f"the residuals are {factor:.2g} times as large as {level.stated} says"
-    elif factor < 1 / NOTEWORTHY:
-        size = (
-            f"the residuals are only {factor:.2g} times as large as {level.stated} says: it seems "
-            f"{1 / factor:.2g} times too large"
-        )
-    else:
-        return []
-    return [f"{size}; {_consequence(noise, kind, factor, errors, level.stated)}"]
-
-
-def _consequence(
-    noise: NoiseOption, kind: Noise, factor: float, errors: Errors, stated: str
-) -> str:
-    if kind != "given" or (factor > 1 and errors == "autocorrelated"):
-        return f"the error bars follow the residuals. Check {stated} and the model"
-    if factor > 1:
-        return (
-            f"the error bars are too small by about that much; check {stated} and the model, or "
-            "use noise = 'auto'"
-        )
-    if noise == "given":
-        return f"the error bars keep to {stated}, as asked for"
-    return f"the residuals are not independent, so the error bars keep to {stated}"
-
-
-def _correlation_notes(errors: Errors, found: Dependence, forced: bool) -> list[str]:
-    """On residuals that hang together."""
-    if found.in_time:
-        pattern = f"persist from sample to sample (autocorrelation {found.lag1:.2f})"
-    else:
-        pattern = "have parts that markers or axes share"
-    if errors == "autocorrelated" and found.found:
-        return [
-            f"the residuals {pattern}: noise seldom does, so something is missing in the "
-            "model or in the experiment's description. The error bars are widened by a model of "
-            "autocorrelated errors; a bias is not covered"
-        ]
-    if forced and found.found:
-        return [
-            f"the residuals {pattern}, but error bars for independent errors were asked for: too "
-            "small"
-        ]
-    return []
+    return of_score, freedom
