@@ -11,10 +11,11 @@ from pydantic import TypeAdapter
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.continuation import Continuation
-from collocation_sysid.methods.options import built, documented
+from collocation_sysid.methods.options import built
 from collocation_sysid.methods.penalty import Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.stated import documented
 
 each_method = pytest.mark.parametrize("name", METHODS)
 

@@ -8,9 +8,9 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from ..errors import InputError, hint_at
+from ..stated import documented
 from . import METHODS
 from .casadi_nlp import why_not
-from .options import documented
 
 
 def require_method(name: str, option: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -58,24 +57,6 @@ def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
         return kind(**given)
     except InputError as error:
         raise InputError(error.message, None, f"{where}.{error.where}") from error
-
-
-def attributes(kind: type) -> dict[str, tuple[str, str]]:
-    """What "Attributes" in the docstrings of a class say of each name: its type, and what it is."""
-    said: dict[str, tuple[str, str]] = {}
-    for base in reversed(kind.__mro__):
-        _, _, section = inspect.cleandoc(base.__doc__ or "").partition("Attributes\n----------\n")
-        for names, form, text in re.findall(
-            r"^(\w[\w, ]*) : (.*)\n((?: +.*(?:\n|$))+)", section, re.M
-        ):
-            said |= dict.fromkeys(names.split(", "), (form, " ".join(text.split())))
-    return said
-
-
-def documented(kind: type) -> dict[str, str]:
-    """Descriptions of the options of a method by name."""
-    said = attributes(kind)
-    return {field.name: said[field.name][1] for field in fields(kind)}
 
 
 @cache

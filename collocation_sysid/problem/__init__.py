@@ -1,5 +1,6 @@
 """Problems, and the problem file: schema, validation, reading."""
 
-from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
+from .options import Origin, RolloutOptions, UncertaintyOptions
+from .problem import Problem
 
 __all__ = ["Origin", "Problem", "RolloutOptions", "UncertaintyOptions"]

@@ -1,11 +1,11 @@
-"""From a problem file to a `Problem`: its body, experiments and parameters."""
+"""What a problem file holds: a body, experiments, parameters, and how it is to be solved."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ..errors import InputError
 from ..experiment.nuisance import NuisanceRow
@@ -20,7 +20,7 @@ from ..statistics.plausible import oddities
 from .code import load_force, load_material, load_row
 from .densities import completed, guessed
 from .nuisance_schema import OwnRow
-from .problem import Origin, Problem, RolloutOptions, UncertaintyOptions
+from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file, selection
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
@@ -28,15 +28,14 @@ from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, 
 T = TypeVar("T")
 
 
-def read_problem(
-    path: str | Path,
+def contents_of(
+    path: Path,
     overrides: Sequence[str],
     allow_code: bool,
     simulation: bool,
     folder: str | Path | None = None,
-) -> Problem:
-    """Read a problem file and the files it names, see `Problem.read`."""
-    path = Path(path)
+) -> dict[str, Any]:
+    """The arguments of a `Problem` by a file and the files it names, see `Problem.read`."""
     file, text = read_problem_file(path, overrides)
     if not simulation and all(section.validation for section in file.experiment):
         raise InputError(
@@ -63,22 +62,19 @@ def read_problem(
         with _blamed_on(odd):
             experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
         notes += reader.notes
-    try:
-        return Problem(
-            experiments,
-            parameters,
-            **file.transcription.model_dump(),
-            huber=file.solver.huber,
-            method=file.solver.method,
-            methods=file.solver.methods,
-            rollout=RolloutOptions(**file.rollout.model_dump()),
-            uncertainty=UncertaintyOptions(**file.uncertainty.model_dump()),
-            title=file.title,
-            notes=notes,
-            origin=Origin(path, text, _named_files(file, folder)),
-        )
-    except InputError as error:
-        raise error.located(path) from error
+    return {
+        "experiments": experiments,
+        "parameters": parameters,
+        **file.transcription.model_dump(),
+        "huber": file.solver.huber,
+        "method": file.solver.method,
+        "methods": file.solver.methods,
+        "rollout": RolloutOptions(**file.rollout.model_dump()),
+        "uncertainty": UncertaintyOptions(**file.uncertainty.model_dump()),
+        "title": file.title,
+        "notes": notes,
+        "origin": Origin(path, text, _named_files(file, folder)),
+    }
 
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:

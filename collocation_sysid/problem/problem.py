@@ -3,84 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Literal
 
-from ..checked import Positive
 from ..errors import InputError
 from ..experiment import Experiment
 from ..fem.body import Body
 from ..methods import METHODS
 from ..methods.described import require_method
 from ..methods.method import Method
-from ..methods.options import Options
 from ..nlp.collocation import Collocation
 from ..nlp.parameters import Parameters, Tied, Unknown
 from ..nlp.schemes import Scheme, as_scheme
 from ..nlp.sharing import locals_of
 from ..nlp.simulation import require_steps
+from ..stated import key, stated
 from ..statistics.plausible import oddities
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
-from ..statistics.uncertainty import ErrorsOption, NoiseOption
+from .loading import contents_of
+from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
-@dataclass(frozen=True)
-class RolloutOptions(Options):
-    """The forward simulation that checks the answer.
-
-    Attributes
-    ----------
-    integrator : {"newmark", "scheme"}
-    timestep_s : float, optional
-        Newmark's step; a quarter of the sample interval by default.
-    """
-
-    integrator: Literal["newmark", "scheme"] = "newmark"
-    timestep_s: Positive | None = None
+def _as_parameters(given: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
+    return given if isinstance(given, Parameters) else Parameters.of(given)
 
 
-@dataclass(frozen=True)
-class UncertaintyOptions(Options):
-    """How the error bars are found.
-
-    Attributes
-    ----------
-    noise : {"auto", "given", "estimated"}
-        Trust the markers' sigma_m, or scale it by the residuals; "auto" does the latter where the
-        residuals ask for it.
-    errors : {"auto", "independent", "autocorrelated"}
-        What to assume of the errors; "auto" tests the residuals.
-    profile : tuple of str
-        Parameters whose profile likelihood is wanted.
-    numerical : bool
-        Solve again with half the step and on a mesh twice as fine, and tell what that changes.
-    """
-
-    noise: NoiseOption = "auto"
-    errors: ErrorsOption = "auto"
-    profile: tuple[str, ...] = ()
-    numerical: bool = False
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where a problem came from.
-
-    Attributes
-    ----------
-    path : Path of the problem file
-    text : str, the problem as run, with what was overridden
-    files : tuple of Path, those it names
-    """
-
-    path: Path
-    text: str = field(repr=False)
-    files: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
+@stated
 class Problem:
     """Experiments that share parameters, and how these are to be found.
 
@@ -117,57 +67,27 @@ class Problem:
         body has.
     """
 
-    experiments: tuple[Experiment, ...]
-    parameters: Parameters
-    scheme: str | Scheme
-    substeps: int | Literal["auto"]
-    explicit_grasps: bool
-    huber: float | None
-    method: str | Method
-    methods: Mapping[str, Method]
-    rollout: RolloutOptions
-    uncertainty: UncertaintyOptions
-    title: str
-    notes: tuple[str, ...]
-    origin: Origin | None
+    experiments: tuple[Experiment, ...] = key(converter=tuple[Experiment, ...])
+    parameters: Parameters = key(converter=_as_parameters)
+    _: KW_ONLY
+    scheme: str | Scheme = "midpoint"
+    substeps: int | Literal["auto"] = "auto"
+    explicit_grasps: bool = False
+    huber: float | None = None
+    method: str | Method = "reduced-space"
+    methods: Mapping[str, Method] = key(converter=dict[str, Method], default_factory=dict)
+    rollout: RolloutOptions = RolloutOptions()
+    uncertainty: UncertaintyOptions = UncertaintyOptions()
+    title: str = ""
+    notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
+    origin: Origin | None = None
 
-    def __init__(
-        self,
-        experiments: Iterable[Experiment],
-        parameters: Parameters | Mapping[str, Unknown | Tied | float],
-        *,
-        scheme: str | Scheme = "midpoint",
-        substeps: int | Literal["auto"] = "auto",
-        explicit_grasps: bool = False,
-        huber: float | None = None,
-        method: str | Method = "reduced-space",
-        methods: Mapping[str, Method] | None = None,
-        rollout: RolloutOptions = RolloutOptions(),
-        uncertainty: UncertaintyOptions = UncertaintyOptions(),
-        title: str = "",
-        notes: Iterable[str] = (),
-        origin: Origin | None = None,
-    ) -> None:
-        if not isinstance(parameters, Parameters):
-            parameters = Parameters.of(parameters)
-        vars(self).update(
-            experiments=_weighed(experiments, parameters),
-            parameters=parameters,
-            scheme=scheme,
-            substeps=substeps,
-            explicit_grasps=explicit_grasps,
-            huber=huber,
-            method=method,
-            methods=dict(methods or {}),
-            rollout=rollout,
-            uncertainty=uncertainty,
-            title=title,
-            origin=origin,
-        )
+    def __post_init__(self) -> None:
+        vars(self)["experiments"] = _weighed(self.experiments, self.parameters)
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
         odd = (oddity.sentence for body in self.bodies for oddity in oddities(body))
         still = stillness_notes(self.experiments, self.parameters)
-        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *notes)))
+        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *self.notes)))
         self._check()
         unscaled = scale_notes(self.experiments, self.parameters)
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
@@ -205,9 +125,12 @@ class Problem:
         InputError
             One clear message for the first thing that is wrong.
         """
-        from .loading import read_problem  # files are one way to make a problem
-
-        return read_problem(path, overrides, allow_code, simulation, folder)
+        path = Path(path)
+        contents = contents_of(path, overrides, allow_code, simulation, folder)
+        try:
+            return cls(**contents)
+        except InputError as error:
+            raise error.located(path) from error
 
     @property
     def path(self) -> Path | None:

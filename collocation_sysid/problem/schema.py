@@ -11,17 +11,20 @@ from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..nlp.schemes import MOST_STEPS, SCHEMES
+from .options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection, Nodes
-from .section import Section, Unit, given_keys, require_one
+from .section import Section, Unit, given_keys, require_one, section_of
 from .solver_schema import SolverSection
 
 if TYPE_CHECKING:
     MaterialName = DampingName = ElementName = SchemeName = str
+    RolloutSection = UncertaintySection = Section
 else:
     MaterialName = Literal[tuple(MATERIALS)]
     DampingName = Literal[tuple(DAMPINGS)]
     ElementName = Literal[tuple(ELEMENTS)]
     SchemeName = Literal[tuple(SCHEMES)]
+    RolloutSection, UncertaintySection = map(section_of, (RolloutOptions, UncertaintyOptions))
 
 
 class CodeSection(Section):
@@ -251,35 +254,6 @@ class TranscriptionSection(Section):
     explicit_grasps: Flag = Field(
         default=False,
         description="Grasped nodes as constraint rows (the paper's c^g) instead of bounds.",
-    )
-
-
-class UncertaintySection(Section):
-    """How the error bars are found."""
-
-    noise: Literal["auto", "given", "estimated"] = Field(
-        default="auto",
-        description="Trust sigma_m, or scale it by the residuals; auto where they ask for it.",
-    )
-    errors: Literal["auto", "independent", "autocorrelated"] = Field(
-        default="auto", description="What to assume of the errors; auto tests the residuals."
-    )
-    profile: list[Text] = Field(
-        default_factory=list,
-        description="List of the parameters whose profile likelihood is wanted.",
-    )
-    numerical: bool = Field(
-        default=False,
-        description="Solve again with half the step and on a finer mesh: the numerical error.",
-    )
-
-
-class RolloutSection(Section):
-    """The forward simulation that checks the answer."""
-
-    integrator: Literal["newmark", "scheme"] = "newmark"
-    timestep_s: Positive | None = Field(
-        default=None, description="Newmark's step; a quarter of the sample interval by default."
     )
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import inspect
+from dataclasses import fields
+from typing import Any, Literal, get_type_hints
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from ..checked import Boundless, Finite
+from ..stated import documented
 
 Vector = tuple[Finite, Finite, Finite]
 Corner = tuple[Boundless, Boundless, Boundless]
@@ -17,6 +20,22 @@ class Section(BaseModel):
     """A table of the problem file; messages quote the fields' descriptions as what is expected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def section_of(kind: type) -> Any:
+    """The table of a dataclass of options: its types, its defaults, what its docstring says."""
+    types, said = get_type_hints(kind, include_extras=True), documented(kind)
+    keys: dict[str, Any] = {
+        each.name: (types[each.name], Field(each.default, description=said.get(each.name)))
+        for each in fields(kind)
+    }
+    title = f"{kind.__name__.removesuffix('Options')}Section"
+    return create_model(
+        title,
+        __base__=Section,
+        __doc__=inspect.cleandoc(kind.__doc__ or "").partition("\n")[0],
+        **keys,
+    )
 
 
 def given_keys(section: Section, *names: str) -> list[str]:

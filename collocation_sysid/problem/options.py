@@ -1,0 +1,64 @@
+"""How a problem's answer is checked and its error bars are found; and where it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ..checked import Positive, Text
+from ..methods.options import Options
+from ..statistics.uncertainty import ErrorsOption, NoiseOption
+
+
+@dataclass(frozen=True)
+class RolloutOptions(Options):
+    """The forward simulation that checks the answer.
+
+    Attributes
+    ----------
+    integrator : {"newmark", "scheme"}
+    timestep_s : float, optional
+        Newmark's step; a quarter of the sample interval by default.
+    """
+
+    integrator: Literal["newmark", "scheme"] = "newmark"
+    timestep_s: Positive | None = None
+
+
+@dataclass(frozen=True)
+class UncertaintyOptions(Options):
+    """How the error bars are found.
+
+    Attributes
+    ----------
+    noise : {"auto", "given", "estimated"}
+        Trust sigma_m, or scale it by the residuals; auto where they ask for it.
+    errors : {"auto", "independent", "autocorrelated"}
+        What to assume of the errors; auto tests the residuals.
+    profile : tuple of str
+        List of the parameters whose profile likelihood is wanted.
+    numerical : bool
+        Solve again with half the step and on a finer mesh: the numerical error.
+    """
+
+    noise: NoiseOption = "auto"
+    errors: ErrorsOption = "auto"
+    profile: tuple[Text, ...] = ()
+    numerical: bool = False
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a problem came from.
+
+    Attributes
+    ----------
+    path : Path of the problem file
+    text : str, the problem as run, with what was overridden
+    files : tuple of Path, those it names
+    """
+
+    path: Path
+    text: str = field(repr=False)
+    files: tuple[Path, ...] = ()
