@@ -15,7 +15,7 @@ PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
     {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
-    | {"tree", "display", "stated"},
+    | {"tree", "display", "section", "stated"},
     {"fem"},
     {"experiment"},
     {"nlp"},

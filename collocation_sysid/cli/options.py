@@ -18,8 +18,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import typer
 from typer.models import OptionInfo, ParameterInfo
 
-from ..methods.options import attributes
 from ..problem import Problem
+from ..stated import attributes
 from .common import AllowCode, AsJson, Overrides, ProblemPath, Quiet, examples
 
 T = TypeVar("T")

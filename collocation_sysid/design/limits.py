@@ -13,7 +13,7 @@ from ..checked import AtLeastOne, Positive
 from ..errors import InputError
 from ..problem.explaining import explain
 from ..problem.reading import parse_toml, read_text
-from ..problem.section import Section, Vector
+from ..section import Section, Vector
 from .motion import Motion, angular_motion
 
 # Peaks are sought on a grid; between its points they may be this much larger.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 from ..arrays import Array
@@ -26,7 +26,6 @@ class Placed(Generic[S]):
     measure: S
 
 
-@dataclass(frozen=True, eq=False)
 class Actuator(ABC, Generic[S]):
     """A tendon or a pressure; what is stated of it may be off by a factor and an amount.
 
@@ -46,7 +45,8 @@ class Actuator(ABC, Generic[S]):
     t_s: Array | None
     factor: float
     placed: Placed[S] | None
-    course: Course = field(init=False, repr=False)
+    course: Course
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     unit: ClassVar[str]  # of the tension or pressure
     lost: ClassVar[str]  # the field of what is lost

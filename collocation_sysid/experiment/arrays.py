@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..fem.selection import Selection
-
-if TYPE_CHECKING:
-    from ..fem.body import Body
 
 
 def read_only_floats(
@@ -35,6 +31,13 @@ def read_only_floats(
         raise InputError(f"{name}{list(index)} is {array[index]}; it must be a finite number")
     array.setflags(write=False)
     return array
+
+
+def floats(
+    shape: tuple[int | None, ...], name: str, finite: bool = True
+) -> Callable[[ArrayLike], Array]:
+    """`read_only_floats` of a field."""
+    return lambda values: read_only_floats(values, shape, name, finite)
 
 
 def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
@@ -66,28 +69,6 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
         raise InputError(f"{name} must hold node numbers from 0 upwards, not {nodes.min()}")
     nodes.setflags(write=False)
     return nodes
-
-
-def some_nodes(given: ArrayLike | Selection, what: str) -> Index | Selection:
-    """Return node numbers as a sorted read-only array without repeats; a selection as it is.
-
-    Raises
-    ------
-    InputError
-        If there are none, or see `read_only_nodes`.
-    """
-    if isinstance(given, Selection):
-        return given
-    chosen = np.unique(read_only_nodes(given, (None,), f"nodes of {what}"))
-    if chosen.size == 0:
-        raise InputError(f"{what} needs at least one node; its selection found none")
-    chosen.setflags(write=False)
-    return chosen
-
-
-def on_body(nodes: Index | Selection, body: Body) -> Index:
-    """Return the nodes of a body that are selected; node numbers as they are."""
-    return body.select(nodes) if isinstance(nodes, Selection) else nodes
 
 
 def _require_shape(found: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:

@@ -15,21 +15,26 @@ from .clock import TIME_TOLERANCE_S, first_time_fault
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Values (m,) at times (m,), or one without times.
+    """Values (m, ...) at times (m,), or one without times.
 
     Parameters
     ----------
-    values : float or (m,) array
+    values : (...) or (m, ...) array
     t_s : (m,) array, optional
     what : str
         The key and whose it is, for messages.
+    shape : tuple of int
+        Of a value.
     """
 
     values: Array
     t_s: Array | None
 
-    def __init__(self, values: ArrayLike, t_s: ArrayLike | None, what: str) -> None:
-        rows = read_only_floats(np.atleast_1d(np.asarray(values)), (None,), what)
+    def __init__(
+        self, values: ArrayLike, t_s: ArrayLike | None, what: str, shape: tuple[int, ...] = ()
+    ) -> None:
+        rows = np.reshape(values, (-1, *shape)) if np.ndim(values) <= len(shape) else values
+        rows = read_only_floats(rows, (None, *shape), what)
         if t_s is None and len(rows) != 1:
             raise InputError(f"{len(rows)} rows of {what} without times; expected t_s")
         if t_s is not None:

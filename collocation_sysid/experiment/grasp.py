@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.selection import Selection
-from .arrays import on_body, some_nodes
 from .clock import TIME_TOLERANCE_S
 from .poses import PoseSequence
+from .selected import on_body, some_nodes
 from .wrench import Wrench
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Grasp:
                 raise InputError(
                     f"{name} of a grasp is {given!r}; expected one of {', '.join(AXES)}"
                 )
-        held = some_nodes(nodes, "the grasp")
+        held = some_nodes("the grasp")(nodes)
         for name, value in (("sigma_m", sigma_m), ("sigma_rad", sigma_rad)):
             if value is not None and not value >= 0:
                 raise InputError(f"{name} of a grasp is {value:g}; expected 0 or more")

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
+from ..checked import Finite, Positive, Text
 from ..errors import InputError
 from ..fem.selection import Selection
-from .arrays import on_body, read_only_floats, some_nodes
-from .clock import first_time_fault
+from ..section import Vector
+from ..stated import Key, key, stated
+from .course import Course
+from .force_files import read_forces
+from .selected import Nodes, on_body, selection, some_nodes
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -30,54 +34,46 @@ def ramp(u: Any) -> Any:
     return (abs(u) < 1) * (0.5 + u - 0.5 * u * abs(u)) + (u >= 1)
 
 
-def _refuse_times(from_s: float, until_s: float, what: str) -> None:
-    if not from_s < until_s:
+def _begin(load: PointMass | Force, what: str) -> None:
+    """Check the times of a load, and note what selected its nodes."""
+    if not load.from_s < load.until_s:
         raise InputError(
-            f"a {what} is there from {from_s:g} s until {until_s:g} s; expected from_s < until_s"
+            f"a {what} is there from {load.from_s:g} s until {load.until_s:g} s; "
+            "expected from_s < until_s"
         )
+    if isinstance(load.nodes, Selection):
+        vars(load)["selection"] = load.nodes
 
 
-@dataclass(frozen=True, eq=False)
+@stated
 class PointMass:
-    """A rigid mass tied to nodes, in equal parts.
+    """A rigid point mass tied to nodes: inertia and weight.
 
-    It adds inertia and weight, and like all mass that moves it is damped by γ_m.
+    Like all mass that moves it is damped by γ_m.
 
     Parameters
     ----------
     nodes : (k,) int array or Selection
-        An experiment looks a selection up.
+        Nodes that carry it in equal parts, selected as in a grasp.
     mass_kg : float
-        Of all nodes together.
-    from_s, until_s : float
-        When it joins the body, at the body's velocity, and leaves it; always there by default. See
-        `Experiment.share`.
+    from_s : float
+        When it joins the body, as well as nuisance.joining knows; always there by default.
+    until_s : float
+        When it leaves the body, likewise.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
     """
 
-    nodes: Index
-    mass_kg: float
-    from_s: float
-    until_s: float
-    selection: Selection | None
+    nodes: Index = key(Nodes, converter=some_nodes("the point mass"), read=selection)
+    mass_kg: float = key(Positive)
+    from_s: float = key(Finite, default=-np.inf)
+    selection: Selection | None = None
+    until_s: float = key(Finite, default=np.inf)
 
-    def __init__(
-        self,
-        nodes: ArrayLike | Selection,
-        mass_kg: float,
-        from_s: float = -np.inf,
-        selection: Selection | None = None,
-        until_s: float = np.inf,
-    ) -> None:
-        if not (np.isfinite(mass_kg) and mass_kg > 0):
-            raise InputError(f"mass_kg of a point mass is {mass_kg:g}; expected more than 0")
-        _refuse_times(from_s, until_s, "point mass")
-        tied = some_nodes(nodes, "the point mass")
-        chosen = tied if isinstance(tied, Selection) else selection
-        vars(self).update(
-            nodes=tied, mass_kg=mass_kg, from_s=from_s, until_s=until_s, selection=chosen
-        )
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.mass_kg) and self.mass_kg > 0):
+            raise InputError(f"mass_kg of a point mass is {self.mass_kg:g}; expected more than 0")
+        _begin(self, "point mass")
 
     def on(self, body: Body) -> PointMass:
         """The same mass on the nodes of a body that are selected."""
@@ -91,58 +87,42 @@ class PointMass:
         return mass
 
 
-@dataclass(frozen=True, eq=False)
+_TABLE = Key("file", Text, read_forces, "force_n", "CSV with the columns t_s, fx_n, fy_n, fz_n.")
+
+
+@stated
 class Force:
-    """A force on nodes, in equal parts: constant, or linear between the rows of a table.
+    """A force on nodes besides gravity.
+
+    It is constant, or linear between the rows of a table.
 
     Parameters
     ----------
     nodes : (k,) int array or Selection
-        An experiment looks a selection up.
-    force_n : (m, 3) array
-        Total force [N], in the frame of the measurements.
+        Nodes that it acts on in equal parts, selected as in a grasp.
+    force_n : (3,) or (m, 3) array
+        Constant force [x, y, z].
     t_s : (m,) array, optional
-        Times of the rows; the force is zero outside them. A single row without a time is constant.
+        Times of the rows of `force_n`, where it is not constant; it is zero outside them.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
-    from_s, until_s : float
-        When it begins and ends to act; always by default. See `Experiment.share`.
+    from_s : float
+        When it begins to act, as well as nuisance.joining knows; always by default.
+    until_s : float
+        When it ends, likewise.
     """
 
-    nodes: Index
-    force_n: Array
-    t_s: Array | None
-    selection: Selection | None
-    from_s: float
-    until_s: float
+    nodes: Index = key(Nodes, converter=some_nodes("the force"), read=selection)
+    force_n: Array = key(Vector, converter=np.atleast_2d)
+    t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
+    selection: Selection | None = None
+    from_s: float = key(Finite, default=-np.inf)
+    until_s: float = key(Finite, default=np.inf)
 
-    def __init__(
-        self,
-        nodes: ArrayLike | Selection,
-        force_n: ArrayLike,
-        t_s: ArrayLike | None = None,
-        selection: Selection | None = None,
-        from_s: float = -np.inf,
-        until_s: float = np.inf,
-    ) -> None:
-        _refuse_times(from_s, until_s, "force")
-        pulled = some_nodes(nodes, "the force")
-        rows = read_only_floats(np.atleast_2d(force_n), (None, 3), "force_n")
-        if t_s is None and len(rows) != 1:
-            raise InputError(f"{len(rows)} rows of force_n without times; expected t_s")
-        if t_s is not None:
-            t_s = read_only_floats(t_s, (len(rows),), "t_s of the force")
-            if fault := first_time_fault(t_s):
-                raise InputError(fault[1], where=f"row {fault[0] + 1}")
-        chosen = pulled if isinstance(pulled, Selection) else selection
-        vars(self).update(
-            nodes=pulled,
-            force_n=rows,
-            t_s=t_s,
-            selection=chosen,
-            from_s=from_s,
-            until_s=until_s,
-        )
+    def __post_init__(self) -> None:
+        _begin(self, "force")
+        course = Course(self.force_n, self.t_s, "force_n", (3,))
+        vars(self).update(force_n=course.values, t_s=course.t_s)
 
     def on(self, body: Body) -> Force:
         """The same force on the nodes of a body that are selected."""

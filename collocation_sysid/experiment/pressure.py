@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
+from ..checked import Finite, Text
 from ..errors import InputError
 from ..fem.refinement import faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.volume import Volume
+from ..stated import Key, key, stated
 from .actuator import Actuator, Placed
 from .course import Course
+from .force_files import read_pressure
+from .selected import Nodes, selection
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -23,9 +27,30 @@ if TYPE_CHECKING:
 PLANE = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+def _faces(given: Selection | ArrayLike) -> Selection | Index:
+    if isinstance(given, Selection):
+        return given
+    faces = np.array(given)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise InputError(
+            f"faces of a pressure are {faces.dtype} {faces.shape}; expected a selection or a "
+            "(F, 3) array of node numbers"
+        )
+    return faces
+
+
+_TABLE = Key(
+    "pressure",
+    Text,
+    read_pressure,
+    "pressure_pa",
+    "CSV with the columns t_s and pressure_pa, over all of the recording.",
+)
+
+
+@stated
 class Pressure(Actuator[Volume]):
-    """A pressure on faces of a body's boundary, above that on the rest of it.
+    """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall.
 
     Its force follows the faces as they move. It has an energy, and a symmetric stiffness, where
     the faces are closed, as a cavity's wall is, or where their rim is held.
@@ -33,53 +58,33 @@ class Pressure(Actuator[Volume]):
     Parameters
     ----------
     faces : Selection or (F, 3) array
-        Triangles of the boundary, in any orientation. A selection takes those in a face set of the
-        mesh, or those whose corners it holds.
+        Faces with all their corners in box_m, ball_m or indices; or the name of a physical group
+        or cell array of triangles, or of a point array.
     pressure_pa : float or (m,) array
-        Constant, or linear between the rows of a table; negative where it sucks.
+        Constant pressure; negative sucks.
     t_s : (m,) array, optional
-        Times of the rows, which must reach over the recording.
+        Times of the rows of `pressure_pa`, between which it is linear; over all of the recording.
     name : str
+        Name; pressure_1, pressure_2 and so on by default.
     factor, lost_pa : float
         How the pressure in the body differs: factor · pressure − lost.
     """
 
-    faces: Selection | Index
-    pressure_pa: Array
-    lost_pa: float
+    faces: Selection | Index = key(Nodes, converter=_faces, read=selection)
+    pressure_pa: Array = key(Finite, converter=np.asarray)
+    t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
+    name: str = key(Text, default="pressure")
+    _: KW_ONLY
+    factor: float = 1.0
+    lost_pa: float = 0.0
+    placed: Placed[Volume] | None = None
 
     unit: ClassVar[str] = "Pa"
     lost: ClassVar[str] = "lost_pa"
 
-    def __init__(
-        self,
-        faces: Selection | ArrayLike,
-        pressure_pa: ArrayLike,
-        t_s: ArrayLike | None = None,
-        name: str = "pressure",
-        *,
-        factor: float = 1.0,
-        lost_pa: float = 0.0,
-        placed: Placed[Volume] | None = None,
-    ) -> None:
-        pressure = Course(pressure_pa, t_s, f"pressure_pa of {name}")
-        if not isinstance(faces, Selection):
-            faces = np.array(faces)
-            if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-                raise InputError(
-                    f"{name}: faces are {faces.dtype} {faces.shape}; expected a selection or a "
-                    "(F, 3) array of node numbers"
-                )
-        vars(self).update(
-            faces=faces,
-            pressure_pa=pressure.values,
-            t_s=pressure.t_s,
-            course=pressure,
-            name=name,
-            factor=factor,
-            lost_pa=lost_pa,
-            placed=placed,
-        )
+    def __post_init__(self) -> None:
+        pressure = Course(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
+        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, course=pressure)
 
     def _measure_on(self, body: Body) -> Volume:
         mesh = body.mesh

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import KW_ONLY
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from pydantic import Field
 
 from ..arrays import Array
+from ..checked import NotNegative, Text
 from ..errors import InputError
 from ..fem.length import Length
+from ..section import Vector
+from ..stated import Key, key, stated
 from .actuator import Actuator, Placed
-from .arrays import read_only_floats
+from .arrays import floats
 from .course import Course
+from .force_files import read_tension
 from .placement import Shape
 
 if TYPE_CHECKING:
@@ -23,9 +27,18 @@ if TYPE_CHECKING:
 FARTHEST = 1.0
 
 
-@dataclass(frozen=True, eq=False)
+_TABLE = Key(
+    "tension",
+    Text,
+    read_tension,
+    "tension_n",
+    "CSV with the columns t_s and tension_n, over all of the recording.",
+)
+
+
+@stated
 class Tendon(Actuator[Length]):
-    """A thread through points of a body, straight between them, under a tension.
+    """A thread through points of the body, straight between them, that pulls itself shorter.
 
     It slides through its points without friction. A sheath has as many points as it needs to
     follow the body; what a few rings guide has those of the rings.
@@ -33,35 +46,34 @@ class Tendon(Actuator[Length]):
     Parameters
     ----------
     points_m : (P, 3) array
-        On the undeformed body, from base to end; P > 1. They may lie a little outside.
+        List of points [x, y, z] on the undeformed body, from base to end.
     tension_n : float or (m,) array
-        Constant, or linear between the rows of a table. Not negative.
+        Constant tension.
     t_s : (m,) array, optional
-        Times of the rows, which must reach over the recording.
+        Times of the rows of `tension_n`, between which it is linear; over all of the recording.
     name : str
+        Name; tendon_1, tendon_2 and so on by default.
     factor, lost_n : float
         How the tension at the body differs: max(0, factor · tension − lost).
     """
 
-    points_m: Array
-    tension_n: Array
-    lost_n: float
+    points_m: Array = key(
+        Annotated[list[Vector], Field(min_length=2)],
+        converter=floats((None, 3), "points_m of the tendon"),
+    )
+    tension_n: Array = key(NotNegative, converter=np.asarray)
+    t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
+    name: str = key(Text, default="tendon")
+    _: KW_ONLY
+    factor: float = 1.0
+    lost_n: float = 0.0
+    placed: Placed[Length] | None = None
 
     unit: ClassVar[str] = "N"
     lost: ClassVar[str] = "lost_n"
 
-    def __init__(
-        self,
-        points_m: ArrayLike,
-        tension_n: ArrayLike,
-        t_s: ArrayLike | None = None,
-        name: str = "tendon",
-        *,
-        factor: float = 1.0,
-        lost_n: float = 0.0,
-        placed: Placed[Length] | None = None,
-    ) -> None:
-        points = read_only_floats(points_m, (None, 3), f"points_m of {name}")
+    def __post_init__(self) -> None:
+        points, name = self.points_m, self.name
         if len(points) < 2:
             raise InputError(
                 f"{name} has {len(points)} points_m; expected at least two, from base to end"
@@ -72,23 +84,14 @@ class Tendon(Actuator[Length]):
                 f"{name}: the points {same[0] + 1} and {same[0] + 2} are at the same place; "
                 "expected different ones, in their order from base to end"
             )
-        tension = Course(tension_n, t_s, f"tension_n of {name}")
+        tension = Course(self.tension_n, self.t_s, f"tension_n of {name}")
         if (tension.values < 0).any():
             row = int(np.argmax(tension.values < 0))
             raise InputError(
                 f"{name}: tension_n is {tension.values[row]:g} N in row {row + 1}; expected 0 or "
                 "more: a tendon only pulls"
             )
-        vars(self).update(
-            points_m=points,
-            tension_n=tension.values,
-            t_s=tension.t_s,
-            course=tension,
-            name=name,
-            factor=factor,
-            lost_n=lost_n,
-            placed=placed,
-        )
+        vars(self).update(tension_n=tension.values, t_s=tension.t_s, course=tension)
 
     def _measure_on(self, body: Body) -> Length:
         shape = Shape(body.nodes_m, body)

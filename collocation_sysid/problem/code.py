@@ -10,11 +10,12 @@ from typing import Any, cast
 
 from ..errors import InputError, hint_at
 from ..experiment.nuisance import NuisanceRow
+from ..experiment.selected import selection
 from ..fem.materials import Energy, Material
 from ..fem.node_force import NodeForce
 from ..files import reason
 from .nuisance_schema import OwnRow
-from .recording import existing_file, selection
+from .recording import existing_file
 from .schema import CodeSection, NodeForceSection
 
 

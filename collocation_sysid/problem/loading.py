@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from ..errors import InputError
 from ..experiment.nuisance import NuisanceRow
+from ..experiment.selected import selection
 from ..fem.body import Body
 from ..fem.constants import constant_named
 from ..fem.materials import Material
@@ -16,13 +17,15 @@ from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..nlp.parameters import Parameters, Tied, Unknown
+from ..stated import keys_of
 from ..statistics.plausible import oddities
 from .code import load_force, load_material, load_row
 from .densities import completed, guessed
 from .nuisance_schema import OwnRow
 from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
-from .recording import RecordingReader, existing_file, selection
+from .recording import RecordingReader, existing_file
+from .recording_schema import LOADS
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 
 T = TypeVar("T")
@@ -85,9 +88,9 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
         for grasp in section.grasps:
             moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
             names += [grasp.poses or moved, sensed]
-        names += [force.file for force in section.force]
-        names += [tendon.tension for tendon in section.tendon]
-        names += [pressure.pressure for pressure in section.pressure]
+        for word, kind in LOADS.items():
+            keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
+            names += [getattr(table, key) for table in getattr(section, word) for key in keys]
     return tuple(folder / name for name in names if name is not None)
 
 

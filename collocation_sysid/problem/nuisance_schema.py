@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, create_model, mo
 from ..checked import Positive, Text
 from ..experiment import Nuisance
 from ..experiment.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
-from .section import Section, given_keys
+from ..section import Section, given_keys
 
 KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,55 +15,42 @@ from ..arrays import Array
 from ..errors import InputError, hint_at
 from ..experiment import (
     Experiment,
-    Force,
     Grasp,
     Markers,
     MarkerTable,
-    PointMass,
     PoseSequence,
-    Pressure,
-    Tendon,
     Wrench,
     align,
     displaced_axes,
     held_dofs,
     read_displacement,
-    read_forces,
     read_poses,
-    read_pressure,
-    read_tension,
     read_wrench,
 )
 from ..experiment.clock import TIME_TOLERANCE_S
 from ..experiment.coverage import refuse_untold
-from ..experiment.loads import Change
 from ..experiment.nuisance import NuisanceRow
+from ..experiment.selected import NodesSection, selection
 from ..experiment.wrench_files import within
 from ..fem.body import Body
-from ..fem.selection import Ball, Box, Indices, Named, Selection
 from ..files import require_regular
 from ..methods.scan import usual_constants
 from ..nlp.parameters import Parameters
+from ..section import Section
+from ..stated import keys_of
 from ..statistics.modal import doubts
 from .nuisance_schema import OwnRow, nuisance_of
 from .recording_schema import (
+    LOADS,
     ExperimentSection,
-    ForceSection,
     GraspSection,
     MarkersSection,
-    MassSection,
-    NodesSection,
-    PressureSection,
     TableSection,
-    TendonSection,
     WrenchSection,
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
-A = TypeVar("A", Tendon, Pressure)
 Build = Callable[[Markers], Experiment]
-
-TIMES = get_args(Change)
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
@@ -87,20 +74,6 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
             f"{file} {found}; expected a file, named from the problem file's folder{see}", None, key
         )
     return file
-
-
-def selection(section: NodesSection | str) -> Selection:
-    """The node selection that a table, or the name of a point array, describes."""
-    if isinstance(section, str):
-        return Named(section)
-    if section.box_m is not None:
-        return Box(*section.box_m)
-    if section.ball_m is not None:
-        return Ball(*section.ball_m)
-    if section.indices is not None:
-        return Indices(section.indices)
-    assert section.name is not None  # by the schema
-    return Named(section.name)
 
 
 class RecordingReader:
@@ -139,10 +112,10 @@ class RecordingReader:
             self._grasp(k, grasp, sequence, t_s)
             for k, (grasp, sequence) in enumerate(zip(section.grasps, poses, strict=True))
         )
-        masses = tuple(self._mass(k, mass) for k, mass in enumerate(section.mass))
-        forces = tuple(self._force(k, force) for k, force in enumerate(section.force))
-        tendons = tuple(self._tendon(k, tendon) for k, tendon in enumerate(section.tendon))
-        pressures = tuple(self._pressure(k, given) for k, given in enumerate(section.pressure))
+        masses = self._made("mass")
+        forces = self._made("force")
+        tendons = self._made("tendon")
+        pressures = self._made("pressure")
 
         def build(markers: Markers) -> Experiment:
             return Experiment(
@@ -287,43 +260,29 @@ class RecordingReader:
         except InputError as error:
             raise error.located(None, key) from error
 
-    def _mass(self, k: int, mass: MassSection) -> PointMass:
-        nodes = self._nodes(mass.nodes, f"mass.{k}.nodes")
-        given = mass.model_dump(include={"mass_kg", *TIMES}, exclude_none=True)
-        return PointMass(nodes, **given, selection=selection(mass.nodes))
+    def _made(self, word: str) -> tuple[Any, ...]:
+        """What the tables of a kind state, on the body."""
+        return tuple(
+            self._one_made(LOADS[word], table, f"{word}.{k}", f"{word}_{k + 1}")
+            for k, table in enumerate(getattr(self.section, word))
+        )
 
-    def _force(self, k: int, force: ForceSection) -> Force:
-        nodes, chosen = self._nodes(force.nodes, f"force.{k}.nodes"), selection(force.nodes)
-        times = force.model_dump(include={*TIMES}, exclude_none=True)
-        if force.force_n is not None:
-            return Force(nodes, np.array(force.force_n), selection=chosen, **times)
-        assert force.file is not None  # by the schema
-        t_s, force_n = read_forces(existing_file(self.folder, force.file, f"force.{k}.file"))
-        return Force(nodes, force_n, t_s, chosen, **times)
-
-    def _tendon(self, k: int, tendon: TendonSection) -> Tendon:
-        t_s, tension_n = None, tendon.tension_n
-        if tendon.tension is not None:
-            file = existing_file(self.folder, tendon.tension, f"tendon.{k}.tension")
-            t_s, tension_n = read_tension(file)
-        assert tension_n is not None  # by the schema
-        name = tendon.name or f"tendon_{k + 1}"
-        return self._on_body(f"tendon.{k}", lambda: Tendon(tendon.points_m, tension_n, t_s, name))
-
-    def _pressure(self, k: int, given: PressureSection) -> Pressure:
-        t_s, pressure_pa = None, given.pressure_pa
-        if given.pressure is not None:
-            file = existing_file(self.folder, given.pressure, f"pressure.{k}.pressure")
-            t_s, pressure_pa = read_pressure(file)
-        assert pressure_pa is not None  # by the schema
-        faces, name = selection(given.faces), given.name or f"pressure_{k + 1}"
-        return self._on_body(f"pressure.{k}", lambda: Pressure(faces, pressure_pa, t_s, name))
-
-    def _on_body(self, key: str, make: Callable[[], A]) -> A:
+    def _one_made(self, kind: type, table: Section, where: str, name: str) -> Any:
+        given: dict[str, Any] = {"name": name} if "name" in type(table).model_fields else {}
+        for field, key in keys_of(kind):
+            if (said := getattr(table, key.name)) is None:
+                continue
+            if key.constant is not None and key.read is not None:
+                file = existing_file(self.folder, said, f"{where}.{key.name}")
+                given[field], given[key.constant] = key.read(file)
+            else:
+                given[field] = key.read(said) if key.read else said
         try:
-            return make().on(self.body)
+            made = kind(**given)
+            where = f"{where}.nodes" if "nodes" in given else where
+            return made.on(self.body)
         except InputError as error:
-            raise error.located(None, key) from error
+            raise error.located(None, where) from error
 
     def _nodes(self, nodes: NodesSection | str, key: str) -> NDArray[np.int64]:
         try:

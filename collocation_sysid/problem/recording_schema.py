@@ -10,47 +10,12 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text, Whole
+from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text
+from ..experiment import Force, PointMass, Pressure, Tendon
 from ..experiment.poses import QUATERNION_NORM_TOLERANCE
+from ..experiment.selected import Nodes
+from ..section import Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
-from .section import Corner, Section, Unit, Vector, given_keys, require_one
-
-
-class NodesSection(Section):
-    """A selection of mesh nodes, by exactly one of these."""
-
-    box_m: tuple[Corner, Corner] | None = Field(
-        None, description="Lowest and highest corner [[x, y, z], [x, y, z]]."
-    )
-    ball_m: tuple[Vector, Positive] | None = Field(
-        None, description="Centre and radius [[x, y, z], radius]."
-    )
-    indices: list[Whole] | None = Field(
-        None, description="List of node numbers as in the mesh file, counted from 0."
-    )
-    name: Text | None = Field(
-        None,
-        description="A point array of the mesh, 1 where selected, or a physical group of elements "
-        "of any dimension.",
-    )
-
-    @model_validator(mode="after")
-    def _one(self) -> NodesSection:
-        require_one(self, *type(self).model_fields)
-        return self
-
-
-# Where a key takes one of two forms, a tag in <> tells them apart; messages leave the tag out.
-
-
-def _nodes_form(value: Any) -> str:
-    return "<name>" if isinstance(value, str) else "<table>"
-
-
-Nodes = Annotated[
-    Annotated[NodesSection, Tag("<table>")] | Annotated[Text, Tag("<name>")],
-    Discriminator(_nodes_form),
-]
 
 
 class TransformSection(Section):
@@ -362,77 +327,19 @@ def _file_name(name: str) -> str:
     return name
 
 
-class MassSection(Section):
-    """A rigid point mass tied to nodes: inertia and weight."""
-
-    nodes: Nodes = Field(description="Nodes that carry it in equal parts, selected as in a grasp.")
-    mass_kg: Positive
-    from_s: Finite | None = Field(
-        None,
-        description="When it joins the body, as well as nuisance.joining knows; always there by "
-        "default.",
+# What acts on a body, by the word of its tables.
+LOADS: dict[str, Any] = {
+    "mass": PointMass,
+    "force": Force,
+    "tendon": Tendon,
+    "pressure": Pressure,
+}
+if TYPE_CHECKING:
+    MassSection = ForceSection = TendonSection = PressureSection = Section
+else:
+    MassSection, ForceSection, TendonSection, PressureSection = (
+        section_of(kind, f"{word.title()}Section") for word, kind in LOADS.items()
     )
-    until_s: Finite | None = Field(None, description="When it leaves the body, likewise.")
-
-
-class ForceSection(Section):
-    """A force on nodes besides gravity."""
-
-    nodes: Nodes = Field(
-        description="Nodes that it acts on in equal parts, selected as in a grasp."
-    )
-    force_n: Vector | None = Field(None, description="Constant force [x, y, z].")
-    file: Text | None = Field(None, description="CSV with the columns t_s, fx_n, fy_n, fz_n.")
-    from_s: Finite | None = Field(
-        None,
-        description="When it begins to act, as well as nuisance.joining knows; always by default.",
-    )
-    until_s: Finite | None = Field(None, description="When it ends, likewise.")
-
-    @model_validator(mode="after")
-    def _one(self) -> ForceSection:
-        require_one(self, "force_n", "file")
-        return self
-
-
-class TendonSection(Section):
-    """A thread through points of the body, straight between them, that pulls itself shorter."""
-
-    name: Text | None = Field(None, description="Name; tendon_1, tendon_2 and so on by default.")
-    points_m: list[Vector] = Field(
-        description="List of points [x, y, z] on the undeformed body, from base to end.",
-        min_length=2,
-    )
-    tension: Text | None = Field(
-        None, description="CSV with the columns t_s and tension_n, over all of the recording."
-    )
-    tension_n: NotNegative | None = Field(None, description="Constant tension.")
-
-    @model_validator(mode="after")
-    def _one(self) -> TendonSection:
-        require_one(self, "tension", "tension_n")
-        return self
-
-
-class PressureSection(Section):
-    """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall."""
-
-    name: Text | None = Field(
-        None, description="Name; pressure_1, pressure_2 and so on by default."
-    )
-    faces: Nodes = Field(
-        description="Faces with all their corners in box_m, ball_m or indices; or the name of a "
-        "physical group or cell array of triangles, or of a point array."
-    )
-    pressure: Text | None = Field(
-        None, description="CSV with the columns t_s and pressure_pa, over all of the recording."
-    )
-    pressure_pa: Finite | None = Field(None, description="Constant pressure; negative sucks.")
-
-    @model_validator(mode="after")
-    def _one(self) -> PressureSection:
-        require_one(self, "pressure", "pressure_pa")
-        return self
 
 
 def _grasp_form(value: Any) -> str:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..checked import Finite, Flag, Positive, Text, Whole
+from ..experiment.selected import Nodes
 from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
 from ..fem.materials import MATERIALS
 from ..nlp.schemes import MOST_STEPS, SCHEMES
+from ..section import Section, Unit, given_keys, require_one, section_of
 from .options import RolloutOptions, UncertaintyOptions
-from .recording_schema import ExperimentSection, Nodes
-from .section import Section, Unit, given_keys, require_one, section_of
+from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ else:
     DampingName = Literal[tuple(DAMPINGS)]
     ElementName = Literal[tuple(ELEMENTS)]
     SchemeName = Literal[tuple(SCHEMES)]
-    RolloutSection, UncertaintySection = map(section_of, (RolloutOptions, UncertaintyOptions))
+    RolloutSection = section_of(RolloutOptions, "RolloutSection")
+    UncertaintySection = section_of(UncertaintyOptions, "UncertaintySection")
 
 
 class CodeSection(Section):

@@ -23,7 +23,7 @@ from ..methods.casadi_nlp import why_not
 from ..methods.described import options_schema
 from ..methods.method import Method
 from ..methods.options import built
-from .section import Section
+from ..section import Section
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"

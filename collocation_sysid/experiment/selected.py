@@ -1,0 +1,97 @@
+"""Nodes that a user selects: by numbers, by what selects them, or by a table in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from ..arrays import Index
+from ..checked import Positive, Text, Whole
+from ..errors import InputError
+from ..fem.selection import Ball, Box, Indices, Named, Selection
+from ..section import Corner, Section, Vector, require_one
+from .arrays import read_only_nodes
+
+if TYPE_CHECKING:
+    from ..fem.body import Body
+
+
+class NodesSection(Section):
+    """A selection of mesh nodes, by exactly one of these."""
+
+    box_m: tuple[Corner, Corner] | None = Field(
+        None, description="Lowest and highest corner [[x, y, z], [x, y, z]]."
+    )
+    ball_m: tuple[Vector, Positive] | None = Field(
+        None, description="Centre and radius [[x, y, z], radius]."
+    )
+    indices: list[Whole] | None = Field(
+        None, description="List of node numbers as in the mesh file, counted from 0."
+    )
+    name: Text | None = Field(
+        None,
+        description="A point array of the mesh, 1 where selected, or a physical group of elements "
+        "of any dimension.",
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> NodesSection:
+        require_one(self, *type(self).model_fields)
+        return self
+
+
+# Where a key takes one of two forms, a tag in <> tells them apart; messages leave the tag out.
+
+
+def _nodes_form(value: Any) -> str:
+    return "<name>" if isinstance(value, str) else "<table>"
+
+
+Nodes = Annotated[
+    Annotated[NodesSection, Tag("<table>")] | Annotated[Text, Tag("<name>")],
+    Discriminator(_nodes_form),
+]
+
+
+def selection(section: NodesSection | str) -> Selection:
+    """What a table selects, or the name of a point array."""
+    if isinstance(section, str):
+        return Named(section)
+    if section.box_m is not None:
+        return Box(*section.box_m)
+    if section.ball_m is not None:
+        return Ball(*section.ball_m)
+    if section.indices is not None:
+        return Indices(section.indices)
+    assert section.name is not None  # by the schema
+    return Named(section.name)
+
+
+def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:
+    """To node numbers, sorted and without repeats; a selection stays until there is a body.
+
+    Raises
+    ------
+    InputError
+        If there are none, or see `read_only_nodes`.
+    """
+
+    def chosen(given: Any) -> Any:
+        if isinstance(given, Selection):
+            return given
+        nodes = np.unique(read_only_nodes(given, (None,), f"nodes of {what}"))
+        if nodes.size == 0:
+            raise InputError(f"{what} needs at least one node; its selection found none")
+        nodes.setflags(write=False)
+        return nodes
+
+    return chosen
+
+
+def on_body(nodes: Index | Selection, body: Body) -> Index:
+    """Return the nodes of a body that are selected; node numbers as they are."""
+    return body.select(nodes) if isinstance(nodes, Selection) else nodes
