@@ -43,7 +43,7 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
         for key in stated
     }
     checks: dict[str, Any] = {
-        f"_{key.name}_or": model_validator(mode="after")(_either(key.name, key.constant))
+        f"_{key.name}_or": model_validator(mode="after")(_either(key.constant, key.name))
         for key in stated
         if key.constant is not None
     }

@@ -135,7 +135,7 @@ SLIPS = {
     "no file": ((TENDON, TENDON.replace("tension.csv", "t.csv")), "t.csv does not exist"),
     "both": (
         (TENDON, TENDON.replace('"tension.csv"', '"tension.csv"\ntension_n = 1.0')),
-        "found tension and tension_n; expected exactly one",
+        "found tension_n and tension; expected exactly one",
     ),
     "neither": ((TENDON, TENDON.replace('tension = "tension.csv"', "")), "expected exactly one"),
     "one point": (
