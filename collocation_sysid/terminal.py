@@ -28,10 +28,10 @@ from .output.remedies import remedies_for
 from .problem import Problem
 from .rollout import Rollout
 from .statistics.concern import Concern
+from .statistics.estimates import Estimate
 from .statistics.numerical import Refinement
 from .statistics.places import Place
 from .statistics.scale import relative_sentence
-from .statistics.uncertainty import Estimate
 
 SHOWN_ITERATIONS = 12
 SHOWN_DIAGNOSES = 2

@@ -25,11 +25,8 @@ from collocation_sysid.nlp.parameters import Parameter, Parameters
 from collocation_sysid.nlp.schemes import SCHEMES
 from collocation_sysid.nlp.segment import Segment
 from collocation_sysid.nlp.simulation import with_markers
-from collocation_sysid.statistics.uncertainty import (
-    covariance,
-    marker_sensitivities,
-    sensitivities,
-)
+from collocation_sysid.statistics.sensitivity import marker_sensitivities, sensitivities
+from collocation_sysid.statistics.uncertainty import covariance
 
 AT_TRUTH = GUESS.with_guess(TRUTH)
 NAMES = tuple(TRUTH)

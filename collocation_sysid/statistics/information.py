@@ -56,3 +56,9 @@ def least_squares(fit: LinearisedFit) -> LeastSquares:
         residual, slope, _ = block.channels
         found = found.add(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
     return found
+
+
+def best_step(fit: LinearisedFit) -> Array:
+    """(p,) step of all parameters to the least squares of what is linearised."""
+    free = np.full(len(fit.names), np.inf)
+    return least_squares(fit).best(-free, free)

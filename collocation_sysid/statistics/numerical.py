@@ -28,7 +28,7 @@ with the p-th power of their number.
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
@@ -36,6 +36,7 @@ import numpy as np
 from ..arrays import Array
 from ..fem.constants import bare
 from .estimates import Estimate
+from .information import best_step
 from .linearised import FitBlock, LinearisedFit
 
 # Roache's factor of safety for an observed order.
@@ -263,16 +264,20 @@ def changes_towards(fit: LinearisedFit, apart: Sequence[Array]) -> Array:
     apart : of each block (T, M, 3), in units of σ
     """
     free = np.flatnonzero(~fit.at_bound)
-    rows = [np.diag(fit.prior_slope[free])]
-    right = [np.zeros(len(free))]
-    for block, way in zip(fit.blocks, apart, strict=True):
-        rows.append(block.slope[..., free][block.seen])
-        right.append((way * _weight(block))[block.seen])
-    matrix = np.concatenate(rows)
-    units = np.linalg.norm(matrix, axis=0)
-    units[units == 0] = 1.0
+    blocks = tuple(
+        replace(block, residual=way * _weight(block), slope=block.slope[..., free])
+        for block, way in zip(fit.blocks, apart, strict=True)
+    )
     change = np.zeros(len(fit.names))
-    change[free] = -np.linalg.lstsq(matrix / units, np.concatenate(right))[0] / units
+    change[free] = best_step(
+        replace(
+            fit,
+            blocks=blocks,
+            names=tuple(fit.names[k] for k in free),
+            prior_residual=np.zeros(len(free)),
+            prior_slope=fit.prior_slope[free],
+        )
+    )
     return change
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from .distributions import chi2_sf
+from .information import best_step
 from .linearised import LinearisedFit
 
 # Probability that recordings without such an error are said to disagree, for all parameters.
@@ -90,37 +91,30 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, 
     blocks.
     """
     for name, numbers in recordings_of(fit).items():
-        blocks = [fit.blocks[k] for k in numbers]
-        local = fit.names[fit.shared :]
         # What recordings share they have to find alone, too.
-        mine = [other.startswith((f"{name}: ", "shared")) for other in local]
-        own = fit.shared + np.flatnonzero(mine)
-        columns = np.concatenate([np.arange(fit.shared), own])
-        prior = np.where(columns < fit.shared, 0.0, fit.prior_slope[columns])
-        slopes = [block.slope[..., columns] for block in blocks]
-        of_data = [slope.reshape(-1, len(columns)) for slope in slopes]
-        rows = np.concatenate([*of_data, np.diag(prior)])
-        residuals = [block.residual.ravel() for block in blocks]
-        right = np.concatenate([*residuals, _prior_residual(fit, columns)])
-        units = np.linalg.norm(rows, axis=0)
-        units[units == 0] = 1.0
-        step = -np.linalg.lstsq(rows / units, right)[0] / units
+        mine = [other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared :]]
+        columns = np.r_[np.arange(fit.shared), fit.shared + np.flatnonzero(mine)]
+        prior_residual, prior_slope = (
+            np.where(columns < fit.shared, 0.0, prior[columns])
+            for prior in (fit.prior_residual, fit.prior_slope)
+        )
+        blocks = [fit.blocks[k] for k in numbers]
         alone = replace(
             fit,
-            blocks=tuple(
-                replace(block, residual=block.residual + slope @ step, slope=slope)
-                for block, slope in zip(blocks, slopes, strict=True)
-            ),
+            blocks=tuple(replace(each, slope=each.slope[..., columns]) for each in blocks),
             names=tuple(fit.names[k] for k in columns),
-            prior_residual=_prior_residual(fit, columns) + prior * step,
-            prior_slope=prior,
+            prior_residual=prior_residual,
+            prior_slope=prior_slope,
             at_bound=np.zeros(len(columns), dtype=bool),
         )
-        yield numbers, alone, step[: fit.shared]
-
-
-def _prior_residual(fit: LinearisedFit, columns: NDArray[np.int64]) -> Array:
-    return np.where(columns < fit.shared, 0.0, fit.prior_residual[columns])
+        step = best_step(alone)
+        moved = [replace(b, residual=b.residual + b.slope @ step) for b in alone.blocks]
+        at_best = prior_residual + prior_slope * step
+        yield (
+            numbers,
+            replace(alone, blocks=tuple(moved), prior_residual=at_best),
+            step[: fit.shared],
+        )
 
 
 def scatter_of(names: Sequence[str], steps: Sequence[Array], variances: Sequence[Array]) -> Scatter:

@@ -51,19 +51,6 @@ from .notes import (
 from .outliers import Outlier, set_apart
 from .pose_noise import pose_noise_draws
 from .scatter import Scatter, recordings_of, scatter_of, single_fits
-from .sensitivity import marker_sensitivities, sensitivities
-
-__all__ = [
-    "Errors",
-    "Estimate",
-    "Noise",
-    "NoiseOption",
-    "Uncertainty",
-    "covariance",
-    "marker_sensitivities",
-    "sensitivities",
-    "uncertainty_of",
-]
 
 NoiseOption = Literal["auto", "given", "estimated"]
 Errors = Literal["independent", "autocorrelated"]
