@@ -15,8 +15,8 @@ from ..errors import InputError
 from ..folders import require_possible, run_name
 from ..output.writers import require_replaceable
 from ..tree import as_json
-from .common import EXIT_INTERRUPTED, OneExperiment, Out, errors, show
-from .options import OfProblem, Told, command
+from .common import EXIT_INTERRUPTED, errors, show
+from .options import OfProblem, OneExperiment, Out, Told, command
 
 commands = typer.Typer()
 

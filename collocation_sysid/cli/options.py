@@ -2,7 +2,7 @@
 
 What it is stands under "Attributes" in the docstring, as of the options of a method. In place of
 its type may stand how it is written: names other than the field's, as -v, and what help shows for
-its value, as FILE. Options that many commands share are annotated instead, in `common`. Own options
+its value, as FILE. Options that several commands share are annotated with both instead. Own options
 are told before those of the bases.
 """
 
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
@@ -20,15 +21,32 @@ from typer.models import OptionInfo, ParameterInfo
 
 from ..problem import Problem
 from ..stated import attributes
-from .common import AllowCode, AsJson, Overrides, ProblemPath, Quiet, examples
 
 T = TypeVar("T")
 
+ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Override a key, such as parameters.mu_pa.guess=200."
+    ),
+]
+AllowCode = Annotated[
+    bool, typer.Option("--allow-code", help="Run Python files that the problem names.")
+]
+OneExperiment = Annotated[
+    str | None,
+    typer.Option("--experiment", metavar="NAME", help="Experiment; by default the first."),
+]
+Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where to write.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 
-def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[T], None]], Any]:
+
+def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]], Any]:
     """A function of a dataclass of options becomes a command, with examples below its help."""
 
-    def registered(function: Callable[[T], None]) -> Callable[[T], None]:
+    def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
         (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
         parameters = [*_parameters(kind)]
 
@@ -38,7 +56,8 @@ def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[T], None]], 
         called.__name__, called.__doc__ = function.__name__, function.__doc__
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         called.__annotations__ = {each.name: each.annotation for each in parameters}
-        group.command(epilog=examples(*shown))(called)
+        lines = "".join(f"\n  collocation-sysid {each}" for each in shown)
+        group.command(epilog=f"\b\nExamples:{lines}")(called)  # kept as they are
         return function
 
     return registered
@@ -112,6 +131,19 @@ class OfProblem:
     def read(self, simulation: bool = False) -> Problem:
         """The problem."""
         return Problem.read(self.problem, self.set_ or (), self.allow_code, simulation=simulation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfRun:
+    """A run that was made.
+
+    Attributes
+    ----------
+    run_folder : RUN
+        A run folder.
+    """
+
+    run_folder: Annotated[Path, typer.Argument()]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,12 +21,10 @@ from .common import (
     EXIT_DOUBTFUL,
     EXIT_INTERRUPTED,
     EXIT_NOT_CONVERGED,
-    Out,
-    Scheduler,
     errors,
     show,
 )
-from .options import OfProblem, Told, command
+from .options import OfProblem, Out, Told, command
 
 commands = typer.Typer()
 
@@ -41,6 +39,8 @@ class Solve(OfProblem, Told):
         Method, instead of the problem's.
     start : RUN
         Start from the answer in this run folder.
+    scheduler : ADDRESS
+        A dask.distributed scheduler to run on.
     verbose : -v
         A line per iteration.
     strict : bool
@@ -50,7 +50,7 @@ class Solve(OfProblem, Told):
     method: str | None = None
     out: Out = None
     start: Path | None = None
-    scheduler: Scheduler = None
+    scheduler: str | None = None
     verbose: bool = False
     strict: bool = False
 

@@ -29,19 +29,25 @@ from ..study.arguments import parse_methods, parse_over, read_truth
 from ..study.table import Yardstick
 from ..study.variants import models, parse_branches, parse_materials
 from ..tree import as_json
-from .common import EXIT_INTERRUPTED, DryRun, Out, errors, show
-from .options import OfProblem, Told, command
+from .common import EXIT_INTERRUPTED, errors, show
+from .options import OfProblem, Out, Told, command
 
 commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Many(OfProblem, Told):
-    """Options of commands that do many runs."""
+    """Options of commands that do many runs.
+
+    Attributes
+    ----------
+    dry_run : bool
+        Only list the runs.
+    """
 
     limits: Limits
     out: Out = None
-    dry_run: DryRun = False
+    dry_run: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

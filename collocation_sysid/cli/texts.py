@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,8 @@ import typer
 
 from ..console import PlainConsole
 from ..display import Shown, Table, on_terminal
-from .common import AsJson, errors, examples
+from .common import errors
+from .options import AsJson, command
 
 commands = typer.Typer()
 
@@ -28,18 +30,30 @@ class Kind(StrEnum):
     SWING = "swing"
 
 
-@commands.command(epilog=examples("methods", "methods interior-point"))
-def methods(
-    name: Annotated[str | None, typer.Argument(help="Tell this method's options.")] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Methods:
+    """Options of `methods`.
+
+    Attributes
+    ----------
+    name : str
+        Tell this method's options.
+    """
+
+    name: Annotated[str | None, typer.Argument()] = None
+    as_json: AsJson = False
+
+
+@command(commands, "methods", "methods interior-point")
+def methods(options: Methods) -> None:
     """List the methods, or the options of one: defaults, values, and what they do."""
     from ..methods import METHODS
     from ..methods.described import options_schema, require_method, summary
 
+    name = options.name
     if name is not None:
         require_method(name, "NAME")
-    if as_json:
+    if options.as_json:
         listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
@@ -55,31 +69,40 @@ def schema() -> None:
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
 
 
-@commands.command(
-    epilog=examples(
-        "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
-    )
+@dataclass(frozen=True, kw_only=True)
+class New:
+    """Options of `new`.
+
+    Attributes
+    ----------
+    name : str
+        Name of the new folder.
+    kind : str
+        With a simulated recording of this kind, so that it runs as it is.
+    """
+
+    name: Annotated[str, typer.Argument()]
+    kind: Kind | None = None
+
+
+@command(
+    commands, "new my_object", "new silicone --kind compression", "check silicone/problem.toml"
 )
-def new(
-    name: Annotated[str, typer.Argument(help="Name of the new folder.")],
-    kind: Annotated[
-        Kind | None,
-        typer.Option(help="With a simulated recording of this kind, so that it runs as it is."),
-    ] = None,
-) -> None:
+def new(options: New) -> None:
     """Write a commented problem file to start from."""
     from ..beginning import begin
     from ..problem.template import write_template
 
-    file, *data = [write_template(Path(name))] if kind is None else begin(Path(name), kind.value)
+    folder, kind = Path(options.name), options.kind
+    file, *data = [write_template(folder)] if kind is None else begin(folder, kind.value)
     typer.echo(file)
     for each in data:
         typer.echo(each)
     yours = "put your mesh, poses and marker tracks beside it and name them in it"
     example = "it runs as it is, on data simulated here; then put your own in their place"
     errors.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
-    for command in ("check", "solve"):
-        errors.print(f"  collocation-sysid {command} {shlex.quote(str(file))}", soft_wrap=True)
+    for next_ in ("check", "solve"):
+        errors.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
 
 
 def _methods_table() -> Table:
