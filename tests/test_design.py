@@ -428,9 +428,9 @@ def test_ctrl_c_keeps_the_best_motion():
             raise KeyboardInterrupt
 
     found = design(problem(), LIMITS, 0.08, options=FEW, watch=interrupt)
-    assert found.found.interrupted
-    assert len(found.found.history) == 4
-    assert found.found.value == min(tried)
+    assert found.best.interrupted
+    assert len(found.best.history) == 4
+    assert found.best.value == min(tried)
 
 
 def test_no_motion_in_view_and_none_that_can_be_simulated_are_told():

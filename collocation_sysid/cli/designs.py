@@ -80,7 +80,7 @@ def design(options: Design) -> None:
     require_replaceable(folder, mark=DESIGN_FILE, what="design")
     with DesignProgress(errors, options.search.evaluations, options.quiet) as progress:
         try:
-            found = designed(
+            answer = designed(
                 problem,
                 limits,
                 options.duration,
@@ -94,9 +94,9 @@ def design(options: Design) -> None:
         except InputError as error:
             key = error.where in Limits.model_fields and error.source is None
             raise (error.located(options.limits) if key else error) from error
-        write_design(found, folder, options.film, progress.say)
+        write_design(answer, folder, options.film, progress.say)
     if options.as_json:
-        typer.echo(as_json(as_dict(found)))
+        typer.echo(as_json(as_dict(answer)))
     else:
-        show(design_summary(found, folder))
-    raise typer.Exit(EXIT_INTERRUPTED if found.found.interrupted else 0)
+        show(design_summary(answer, folder))
+    raise typer.Exit(EXIT_INTERRUPTED if answer.best.interrupted else 0)

@@ -23,7 +23,7 @@ from .information import Recording, Told, shared_information
 from .limits import REACHED, Bounds, Limits
 from .linear import LinearRecording
 from .motion import Motion
-from .search import Found, Watch, search
+from .search import Best, Watch, search
 
 Say = Callable[[str], None]
 
@@ -108,7 +108,7 @@ class Design:
         Whether the recordings there are count.
     limits : Limits
     shares : by name of a limit, largest value over what is allowed
-    found : Found
+    best : Best
         How the search went.
     draws : number of θ
     """
@@ -123,7 +123,7 @@ class Design:
     added: bool
     limits: Limits
     shares: Mapping[str, float]
-    found: Found
+    best: Best
     draws: int
 
     @property
@@ -139,7 +139,7 @@ class Design:
     @property
     def size(self) -> float:
         """The error bar that was made small."""
-        return float(np.exp(self.found.value))
+        return float(np.exp(self.best.value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,19 +188,19 @@ class Judge:
         parameters = self.recording.problem.parameters
         return Errors.of(self.known + information, parameters, self.constants, q)
 
-    def first_guess(self, options: DesignOptions, say: Say) -> Found:
+    def first_guess(self, options: DesignOptions, say: Say) -> Best:
         """Where to begin: the best to first order.
 
         Nowhere where a wrench is measured too, or that would take too much memory.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
-            return Found()
+            return Best()
         middle, count = self.draws[0], TO_FIRST_ORDER * options.evaluations
         try:
             linear = LinearRecording.of(self.recording, middle)
         except SimulationError:
-            return Found()
+            return Best()
 
         def told(number: int, size: float) -> None:
             if number % NEWS == 0:
@@ -296,18 +296,18 @@ def design(
     first = judge.first_guess(options, say)
     say("seeking a motion")
     tried = 1 if first.interrupted else options.evaluations
-    found = search(judge.value, Motion.size(options.waves), tried, options.seed, watch, first.at)
-    found.interrupted |= first.interrupted
-    if found.at is None or found.value >= FORBIDDEN:
-        raise InputError(_no_motion(found), problem.path)
+    best = search(judge.value, Motion.size(options.waves), tried, options.seed, watch, first.at)
+    best.interrupted |= first.interrupted
+    if best.at is None or best.value >= FORBIDDEN:
+        raise InputError(_no_motion(best), problem.path)
     say("simulating the best motion")
-    return _designed(judge, found, add)
+    return _designed(judge, best, add)
 
 
-def _designed(judge: Judge, found: Found, add: bool) -> Design:
+def _designed(judge: Judge, best: Best, add: bool) -> Design:
     """The best motion with its error bars."""
-    assert found.at is not None
-    recording, motion = judge.recording, judge.motion(found.at)
+    assert best.at is not None
+    recording, motion = judge.recording, judge.motion(best.at)
     experiment = recording.experiment(recording.poses(motion))
     told = [recording.told(experiment, q) for q in judge.draws]
     after = _bars(judge, told)
@@ -325,7 +325,7 @@ def _designed(judge: Judge, found: Found, add: bool) -> Design:
         add,
         judge.limits,
         judge.bounds.shares(motion),
-        found,
+        best,
         len(judge.draws),
     )
 
@@ -396,9 +396,9 @@ def _require_guesses(problem: Problem) -> None:
         )
 
 
-def _no_motion(found: Found) -> str:
-    tried = f"none of the {len(found.history)} motions that were tried"
-    if found.value >= 2 * FORBIDDEN:
+def _no_motion(best: Best) -> str:
+    tried = f"none of the {len(best.history)} motions that were tried"
+    if best.value >= 2 * FORBIDDEN:
         return (
             f"{tried} could be simulated to its end; lower acceleration and speed in the limits, "
             "or raise transcription.substeps"

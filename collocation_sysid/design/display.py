@@ -35,22 +35,22 @@ class DesignProgress(Watched):
         self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
 
 
-def design_summary(found: Design, folder: Path) -> list[Shown]:
+def design_summary(design: Design, folder: Path) -> list[Shown]:
     """A design on one screen."""
-    tried = len(found.found.history)
+    tried = len(design.best.history)
     interrupted = Line(f"interrupted: the best of {tried} motions", "check")
     return [
-        *[interrupted] * found.found.interrupted,
-        _table(found),
-        _meaning(found),
-        f"limits reached: {', '.join(found.reached) or 'none'}",
+        *[interrupted] * design.best.interrupted,
+        _table(design),
+        _meaning(design),
+        f"limits reached: {', '.join(design.reached) or 'none'}",
         f"written to {folder}",
     ]
 
 
-def _table(found: Design) -> Table:
+def _table(design: Design) -> Table:
     heads = ("", "value", "error before", "error after", "over the draws", "smaller by")
-    before, after, rows = found.before, found.after, []
+    before, after, rows = design.before, design.after, []
     for name, relative in after.relative.items():
         earlier = before.relative[name] if before is not None else np.nan
         rows.append(
@@ -72,13 +72,13 @@ def _percent(share: float) -> str:
     return f"{100 * share:.3g} %" if share < 10 else "not told"
 
 
-def _meaning(found: Design) -> str:
+def _meaning(design: Design) -> str:
     """What the columns are."""
-    duration = f"{found.experiment.duration_s:.4g} s"
+    duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
-    if found.added:
+    if design.added:
         return f"before: the recordings there are; {after} besides them"
-    if found.before is None:
+    if design.before is None:
         return after
-    shipped = f"{found.recording.template.duration_s:.4g} s"
+    shipped = f"{design.recording.template.duration_s:.4g} s"
     return f"before: the problem's own motion of {shipped}; {after}, alone"

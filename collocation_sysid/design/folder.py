@@ -97,7 +97,7 @@ def write_design(
 
 def as_dict(design: Design) -> dict[str, Any]:
     """What design.json holds."""
-    search, limits = design.found, design.limits
+    search, limits = design.best, design.limits
     return {
         "schema": SCHEMA,
         "experiment": design.recording.template.name,

@@ -27,7 +27,7 @@ Watch = Callable[[int, float], None]
 
 
 @dataclass(eq=False)
-class Found:
+class Best:
     """The best there is, also while the search goes on.
 
     Attributes
@@ -51,7 +51,7 @@ def search(
     seed: int = 0,
     watch: Watch | None = None,
     start: Array | None = None,
-) -> Found:
+) -> Best:
     """Minimise a function of coefficients that are about as large as one.
 
     Ctrl-C ends the search and keeps the best.
@@ -65,15 +65,15 @@ def search(
     start : (d,), optional
         Where to begin, in place of the best of draws.
     """
-    found, rng = Found(), np.random.default_rng(seed)
+    best, rng = Best(), np.random.default_rng(seed)
 
     def evaluated(at: Array, bar: float) -> float:
         size = value(at, bar)
-        if found.at is None or size < found.value:
-            found.at, found.value = at, size
-        found.history.append(found.value)
+        if best.at is None or size < best.value:
+            best.at, best.value = at, size
+        best.history.append(best.value)
         if watch is not None:
-            watch(len(found.history), found.value)
+            watch(len(best.history), best.value)
         return size
 
     try:
@@ -81,22 +81,22 @@ def search(
             evaluated(start, np.inf)
         else:
             for _ in range(max(1, round(EXPLORED * evaluations))):
-                evaluated(rng.normal(size=dimension), found.value)
-        assert found.at is not None
-        strategy = Strategy(found.at, FIRST_DEVIATION if start is None else NEAR)
+                evaluated(rng.normal(size=dimension), best.value)
+        assert best.at is not None
+        strategy = Strategy(best.at, FIRST_DEVIATION if start is None else NEAR)
         bar = np.inf
-        while len(found.history) < evaluations:
-            count = min(strategy.offspring, evaluations - len(found.history))
+        while len(best.history) < evaluations:
+            count = min(strategy.offspring, evaluations - len(best.history))
             steps = rng.normal(size=(count, dimension))
             sizes = np.array([evaluated(strategy.point(step), bar) for step in steps])
             if count == strategy.offspring:
                 strategy.learn(steps[np.argsort(sizes, kind="stable")])
             bar = float(np.median(sizes))
     except KeyboardInterrupt:
-        if found.at is None:
+        if best.at is None:
             raise
-        found.interrupted = True
-    return found
+        best.interrupted = True
+    return best
 
 
 class Strategy:
