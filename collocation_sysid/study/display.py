@@ -41,6 +41,8 @@ class StudyProgress(Watched):
             self.line(f"{skipped} of {self.total} runs are finished already")
         super().__enter__()
         self.update(Text(f"{skipped}/{self.total} runs", style="dim"))
+        if self._live is not None:
+            self._live.refresh()  # the first run may take less time than a frame
         return self
 
     def done(self, record: Record, slots: int) -> None:
