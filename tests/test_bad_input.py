@@ -680,7 +680,7 @@ def test_a_damaged_run_cannot_be_drawn(tiny):
     np.savez(tiny / "trajectory.npz", t_s=np.zeros(3))
     assert_refused(tiny, ("damaged", "run what wrote it again"), "plot", ".")
     (tiny / "result.json").write_text('{"schema": 2}')
-    assert_refused(tiny, ("damaged", "rollout"), "plot", ".")
+    assert_refused(tiny, ("damaged", "solve the problem again"), "plot", ".")
 
 
 @pytest.mark.parametrize("command", ["solve", "solve problem.toml --colour red", "identify", ""])

@@ -18,7 +18,6 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from ..arrays import Array, Index
 from ..experiment.grasp import Grasp
@@ -367,24 +366,32 @@ def _by_dof(by_node: Array) -> Array:
     return np.ascontiguousarray(by_node).reshape(*by_node.shape[:2], -1)
 
 
+def _accumulated(e: float, given: Array) -> Array:
+    """y_k = e y_{k−1} + given_k (n, …)."""
+    found = np.array(given)  # `scipy.signal` would cost every command a third of a second
+    for k in range(1, len(found)):
+        found[k] += e * found[k - 1]
+    return found
+
+
 def smoothed(e_a_b: Array, value: Array) -> Array:
     """y_k = e y_{k−1} + a W_{k−1} + b W_k of W (n, …), steady before."""
-    e, a, b = e_a_b
-    read, _ = lfilter([b, a], [1.0, -e], value, axis=0, zi=(1 - b) * value[:1])
-    return read
+    given = stepped(e_a_b, value, np.zeros_like(value))
+    given[0] = value[0]
+    return _accumulated(e_a_b[0], given)
 
 
 def smoothed_slope(coefficients: Array, value: Array, read: Array) -> Array:
     """The slope of y by T, from W and y."""
     change = np.zeros_like(value)
     change[1:] = stepped(coefficients[:, 1], value, read)[1:]
-    return np.asarray(lfilter([1.0], [1.0, -coefficients[0, 0]], change, axis=0))
+    return _accumulated(coefficients[0, 0], change)
 
 
 def pulled_through(e_a_b: Array, by_read: Array) -> Array:
     """Slopes of a scalar by W (n, …), from those by y."""
     e, a, b = e_a_b
-    through = np.asarray(lfilter([1.0], [1.0, -e], by_read[::-1], axis=0))[::-1]
+    through = _accumulated(e, by_read[::-1])[::-1]
     found = b * through
     found[0] = through[0]
     found[:-1] += a * through[1:]
