@@ -68,7 +68,7 @@ from collocation_sysid.output.style import (
 )
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.profiling import profile_of
+from collocation_sysid.statistics.profile import profile_of
 from collocation_sysid.statistics.uncertainty import uncertainty_of
 
 mpl.rcParams["figure.dpi"] = 110
