@@ -12,23 +12,6 @@ from . import starting as _starting  # noqa: F401  (before all that takes time t
 from importlib.metadata import version
 
 from .errors import InputError, SimulationError
-from .experiment import (
-    Experiment,
-    Force,
-    Gauge,
-    Grasp,
-    Look,
-    Markers,
-    Nuisance,
-    NuisanceRow,
-    Placement,
-    PointMass,
-    PoseSequence,
-    Pressure,
-    Tendon,
-    Wrench,
-    place_markers,
-)
 from .fem.body import Body
 from .fem.constants import Constant
 from .fem.materials import Material
@@ -45,13 +28,30 @@ from .methods.penalty import AugmentedLagrangian, Penalty
 from .methods.reduced_space import ReducedSpace
 from .methods.shooting import Shooting
 from .methods.solution import Iteration, Solution, Status
-from .nlp.collocation import Collocation
-from .nlp.parameters import Parameter, Parameters, Tied, Unknown
-from .nlp.schemes import Scheme, Stencil
-from .nlp.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
+from .model.parameters import Parameter, Parameters, Tied, Unknown
+from .model.schemes import Scheme, Stencil
+from .pipeline import Run, run, solve
 from .problem import Problem, RolloutOptions, UncertaintyOptions
-from .refine import refine
-from .run import Run, run, solve
+from .program.collocation import Collocation
+from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
+from .recording import (
+    Experiment,
+    Force,
+    Gauge,
+    Grasp,
+    Look,
+    Markers,
+    Nuisance,
+    NuisanceRow,
+    Placement,
+    PointMass,
+    PoseSequence,
+    Pressure,
+    Tendon,
+    Wrench,
+    place_markers,
+)
+from .runs.refine import refine
 
 from . import live  # isort: skip  (after `starting`, which is before all)
 

@@ -20,10 +20,10 @@ from benchmark_methods import PAPER_SIZE, PARAMETERS, TRUTH, experiment_of
 
 from collocation_sysid import Body, Collocation
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.stopwatch import Stopwatch
-from collocation_sysid.nlp.sweep import Sweep
+from collocation_sysid.model.dynamics import Dynamics
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.stopwatch import Stopwatch
+from collocation_sysid.program.sweep import Sweep
 
 LAWS = ("rayleigh", "kelvin-voigt")
 

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid.fem.batched import available_threads
 from collocation_sysid.fem.body import Body
-from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.fem.kernels import available_threads
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "table1" / "problem.toml"
 PAPER_MS = 57.0

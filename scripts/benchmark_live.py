@@ -25,8 +25,8 @@ from collocation_sysid.live import Estimator, Frame, LiveOptions
 from collocation_sysid.live.sources import collected_before, recorded
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import solve
 from collocation_sysid.statistics.uncertainty import covariance
 
 PROBLEMS = Path(__file__).parent.parent / "problems"

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from collocation_sysid import Body, Collocation, Experiment, Parameters, Problem, Unknown
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.sweep import Sweep
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.sweep import Sweep
 
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}

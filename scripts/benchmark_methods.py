@@ -38,17 +38,17 @@ from collocation_sysid import (
     Parameters,
     simulate,
 )
-from collocation_sysid.experiment import Nuisance, Wrench, place_markers
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.workers import OnCluster
-from collocation_sysid.nlp.parameters import Unknown
-from collocation_sysid.nlp.simulation import with_markers, with_wrenches
+from collocation_sysid.model.parameters import Unknown
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import solve
+from collocation_sysid.program.simulation import with_markers, with_wrenches
+from collocation_sysid.recording import Nuisance, Wrench, place_markers
 
 BOTH = ["interior-point", "reduced-space"]
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}

@@ -23,11 +23,11 @@ import numpy as np
 from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung
 
 from collocation_sysid import Body, Collocation
-from collocation_sysid.nlp.factorisation import Choice
-from collocation_sysid.nlp.marching import march_on
-from collocation_sysid.nlp.newton import NewtonOptions
-from collocation_sysid.nlp.stopwatch import Stopwatch
-from collocation_sysid.nlp.sweep import Sweep
+from collocation_sysid.program.factorisation import Choice
+from collocation_sysid.program.marching import march_on
+from collocation_sysid.program.newton import NewtonOptions
+from collocation_sysid.program.stopwatch import Stopwatch
+from collocation_sysid.program.sweep import Sweep
 
 # Rings x layers of the cylinder, element, and steps that are enough to tell, by nodes.
 SIZES = {

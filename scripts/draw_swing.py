@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from collocation_sysid import Problem, simulate
-from collocation_sysid.output.pictures import save_pictures, shapes
-from collocation_sysid.output.replay import Replay
+from collocation_sysid.result.pictures import save_pictures, shapes
+from collocation_sysid.result.replay import Replay
 
 ROOT = Path(__file__).parents[1]
 TRUTH = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from synthetic import Swing, measure, unmeasured
 
-from collocation_sysid.experiment import write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.recording import write_markers_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "foam_cylinder"
 TRUTH = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}

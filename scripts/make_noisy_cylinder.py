@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import Swing, exchanged, measure, occluded, unmeasured
 
-from collocation_sysid.experiment import Experiment, place_markers, write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.recording import Experiment, place_markers, write_markers_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "noisy_cylinder"
 TRUTH = {"lambda_pa": 2500.0, "mu_pa": 1500.0, "gamma_r_s": 0.005, "gamma_m_1_s": 1.5}

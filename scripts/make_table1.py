@@ -10,9 +10,9 @@ from pathlib import Path
 
 from synthetic import Swing, measure, unmeasured
 
-from collocation_sysid.experiment import write_markers_csv
 from collocation_sysid.fem.structured import cylinder_mesh
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import write_markers_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "table1"
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}

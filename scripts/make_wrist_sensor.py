@@ -13,15 +13,10 @@ from pathlib import Path
 import numpy as np
 from synthetic import Swing
 
-from collocation_sysid.experiment import (
-    Grasp,
-    write_markers_csv,
-    write_poses_csv,
-    write_wrench_csv,
-)
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.simulation import simulate
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Grasp, write_markers_csv, write_poses_csv, write_wrench_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "wrist_sensor"
 TRUTH = {

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from collocation_sysid.plan import Limits, PlannedRun, RunStore, Starts, plan_comparison, run_all
+from collocation_sysid.plan.table import Row, Yardstick, run_row
 from collocation_sysid.problem import Problem
-from collocation_sysid.study import Limits, PlannedRun, RunStore, Starts, plan_comparison, run_all
-from collocation_sysid.study.table import Row, Yardstick, run_row
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 HEADS = ("λ", "μ", "γ_r", "γ_m")

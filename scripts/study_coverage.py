@@ -30,11 +30,11 @@ from scipy.stats import binom, norm
 from study_starts import TRUTH, hanging_cylinder, parameters
 from synthetic import swing
 
-from collocation_sysid.experiment import Experiment, Grasp, Nuisance
 from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Nuisance
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import (
     ErrorsOption,

@@ -16,12 +16,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid import run
-from collocation_sysid.experiment import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.parameters import Unknown
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
 SIZE_M, DIVISIONS, DENSITY_KG_M3 = (0.03, 0.03, 0.15), (1, 1, 5), 100.0
 TRUTH = {"lambda_pa": 16e3, "mu_pa": 12e3, "gamma_r_s": 0.006, "gamma_m_1_s": 0.5}

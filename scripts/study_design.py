@@ -18,12 +18,12 @@ import numpy as np
 from make_foam_cylinder import FOLDER, SWING, TRUTH
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.design import Criterion, Design, DesignOptions, Limits, design
-from collocation_sysid.experiment import Nuisance
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.plan.design import Criterion, Design, DesignOptions, Limits, design
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Nuisance
 from collocation_sysid.statistics.linearised import Derived
 
 FINE_S = 1e-4

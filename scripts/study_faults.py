@@ -27,10 +27,10 @@ from study_coverage import QUANTITIES, SCHEME, held, reference, truth
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
-from collocation_sysid.experiment import Experiment, Grasp, Nuisance, PoseSequence
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.run import solve
+from collocation_sysid.pipeline import solve
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
 Array = NDArray[np.float64]

@@ -21,8 +21,8 @@ from twins import SOFT, twin
 from collocation_sysid.live import Estimator, LiveOptions, Update
 from collocation_sysid.live.sources import recorded
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import solve
 from collocation_sysid.statistics.uncertainty import covariance
 
 SAMPLES = 101

@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 from studies import TRUTH, Variant, markdown, number, run_variants, save, worst_error
 from synthetic import swing
 
-from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.structured import cylinder_mesh
+from collocation_sysid.plan.table import Row, wilson_interval
 from collocation_sysid.problem import Problem
-from collocation_sysid.study.table import Row, wilson_interval
-from collocation_sysid.synthesis import Recipe, write_data
+from collocation_sysid.recording import write_poses_csv
+from collocation_sysid.result.synthesis import Recipe, write_data
 
 WITHIN = 0.01
 RADIUS_M, HEIGHT_M = 0.04, 0.16

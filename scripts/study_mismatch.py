@@ -22,11 +22,11 @@ from studies import HEADS, TRUTH, markdown, save
 from study_starts import BOUNDS, hanging_cylinder
 from synthetic import Swing
 
-from collocation_sysid.experiment import Experiment, Grasp
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp
 
 Array = NDArray[np.float64]
 

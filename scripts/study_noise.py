@@ -28,9 +28,9 @@ from study_coverage import SCHEME, reference
 from study_starts import BOUNDS
 
 from collocation_sysid.methods import METHODS
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.statistics.uncertainty import covariance
 
 Array = NDArray[np.float64]

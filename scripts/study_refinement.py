@@ -16,15 +16,15 @@ from dataclasses import replace
 import numpy as np
 from twins import random_poses
 
-from collocation_sysid.earlier import Earlier
-from collocation_sysid.experiment import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.parameters import Unknown
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Unknown
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.refine import finer_mesh, refinement_of
-from collocation_sysid.run import solve
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
+from collocation_sysid.runs.refine import finer_mesh, refinement_of
+from collocation_sysid.runs.warm_start import Earlier
 from collocation_sysid.statistics.uncertainty import covariance
 
 NOISE_M = 5e-5

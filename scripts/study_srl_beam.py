@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from collocation_sysid import Problem, Solution, solve
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Part
+from collocation_sysid.program.collocation import Part
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import verdicts

@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 from study_refinement import BODIES, NAMES, STEP_S, still
 
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run
+from collocation_sysid.program.simulation import simulate, with_markers
 
 NOISES_M = (5e-5, 2e-4, 1e-3)
 

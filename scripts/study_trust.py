@@ -26,14 +26,14 @@ from wrong_twins import FAULTS
 
 from collocation_sysid import Run, run
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.experiment import Experiment, Grasp, Markers
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
 from collocation_sysid.methods.scan import usual_constants
-from collocation_sysid.nlp.parameters import Unknown
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.recording import refuse_other_scale
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers
 from collocation_sysid.statistics.causes import likely_causes
 from collocation_sysid.statistics.plausible import oddities
 

@@ -30,7 +30,7 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.simulation import with_wrenches
+from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_of
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence, write_poses_csv
-from collocation_sysid.nlp.simulation import simulate
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence, write_poses_csv
 
 HANGING = Rotation.from_rotvec([np.pi, 0, 0])
 

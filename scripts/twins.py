@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Experiment, Grasp, Markers, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.parameters import Unknown
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers, PoseSequence
 
 NOISE_M = 5e-4
 SAMPLES, STEP_S = 60, 0.01

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.nlp.simulation import with_markers
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 Rng = np.random.Generator
 Change = Callable[[Experiment, Rng], Experiment]

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from problem_files import write_problem
 
-from collocation_sysid import heartbeat
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.output import record
+from collocation_sysid.result import heartbeat, record
 
 BodyFactory = Callable[..., Body]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from collocation_sysid.nlp.parameters import Parameter, Parameters
+from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
 
 SAMPLE_S = 0.01

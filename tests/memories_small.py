@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 from problems_small import SMALL_EXPERIMENTS, TRUTH, measured_with
 
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.body import Body
-from collocation_sysid.nlp.parameters import Parameters, Unknown
+from collocation_sysid.model.parameters import Parameters, Unknown
+from collocation_sysid.recording import Experiment
 
 ONE = TRUTH | {"prony_1.share": 0.4, "prony_1.tau_s": 0.03}
 TWO = ONE | {"prony_2.share": 0.25, "prony_2.tau_s": 0.15}

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from problems_small import EDGE_M, hung_cube, nodes_where, vertex_markers
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
-from collocation_sysid.nlp.modes import Modes, natural_modes
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.program.modes import Modes, natural_modes
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 # Small enough for the cube to be linear, large enough against the tolerance of Newton's method.
 AMPLITUDE_M = 1e-6 * EDGE_M

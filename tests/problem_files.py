@@ -14,12 +14,12 @@ import pytest
 from problems_small import smooth_poses, times
 
 from collocation_sysid import cli
-from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.output import record
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import Recipe, write_data
+from collocation_sysid.recording import write_poses_csv
+from collocation_sysid.result import record
+from collocation_sysid.result.synthesis import Recipe, write_data
 
 SIZE_M, DIVISIONS = (0.06, 0.06, 0.09), (2, 2, 3)
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}

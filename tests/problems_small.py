@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import (
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.selection import Box
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.solution import Solution
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import (
     Experiment,
     Force,
     Grasp,
@@ -22,14 +30,6 @@ from collocation_sysid.experiment import (
     Pressure,
     Tendon,
 )
-from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.selection import Box
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import simulate, with_markers
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 GUESS = Parameters(

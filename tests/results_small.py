@@ -10,7 +10,7 @@ import numpy as np
 
 from collocation_sysid.files import SCHEMA
 from collocation_sysid.methods.solution import Iteration, Timing
-from collocation_sysid.result import (
+from collocation_sysid.runs.result import (
     FoundDynamics,
     FoundFit,
     FoundRollout,

@@ -9,7 +9,14 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import (
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.selection import Box, Named
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.model.force_term import States
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.program.newton import Solver
+from collocation_sysid.program.rest import rest_state
+from collocation_sysid.recording import (
     Experiment,
     Grasp,
     Markers,
@@ -18,13 +25,6 @@ from collocation_sysid.experiment import (
     Pressure,
     Tendon,
 )
-from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.selection import Box, Named
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.force_term import States
-from collocation_sysid.nlp.forces import Forces
-from collocation_sysid.nlp.newton import Solver
-from collocation_sysid.nlp.rest import rest_state
 
 STILL = PoseSequence.fixed()
 

@@ -13,11 +13,11 @@ from problem_files import TRUTH, pictures_drawn, run_command
 from problems_small import smooth_poses, times
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import write_poses_csv
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.volume import Volume
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import Recipe, write_data
+from collocation_sysid.recording import write_poses_csv
+from collocation_sysid.result.synthesis import Recipe, write_data
 
 PROBLEM = """\
 title = "A driven box"

@@ -18,11 +18,11 @@ from results_small import a_result, value
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.output import animation
-from collocation_sysid.output.animation import Film, animate, film_samples
-from collocation_sysid.output.page import surface_strain
-from collocation_sysid.output.replay import headline, read_run
-from collocation_sysid.output.view import frame_files, view
+from collocation_sysid.result import animation
+from collocation_sysid.result.animation import Film, animate, film_samples
+from collocation_sysid.result.page import surface_strain
+from collocation_sysid.result.replay import headline, read_run
+from collocation_sysid.result.view import frame_files, view
 from collocation_sysid.statistics.concern import Concern
 from collocation_sysid.statistics.trust import Trust
 
@@ -231,7 +231,7 @@ def test_the_page_has_no_syntax_error(run, tmp_path):
 
 
 def test_without_pyvista_the_remedy_is_named(run, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.output.view.find_spec", lambda name: None)
+    monkeypatch.setattr("collocation_sysid.result.view.find_spec", lambda name: None)
     outcome = run_command("view", run)
     assert outcome.code == 2
     assert "pip install 'collocation-sysid[view]'" in outcome.err

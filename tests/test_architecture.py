@@ -17,19 +17,17 @@ LAYERS = (
     {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
     | {"tree", "display", "section", "stated"},
     {"fem"},
-    {"experiment"},
-    {"nlp"},
+    {"recording"},
+    {"model"},
+    {"program"},
     {"methods"},
     {"statistics"},
     {"problem"},
-    {"check", "result", "earlier", "rollout", "second_start", "verdict", "solving", "answer"}
-    | {"refine"},
-    {"output", "synthesis", "beginning"},
-    {"export"},
-    {"terminal", "heartbeat"},
-    {"run"},
+    {"runs"},
+    {"result"},
+    {"pipeline"},
     {"live"},
-    {"design", "study"},
+    {"plan"},
     {"cli"},
 )
 
@@ -46,11 +44,11 @@ MODULES = modules()
 
 
 def imports(name: str) -> set[str]:
-    """Modules of the package that one imports when it is imported itself."""
+    """Modules of the package that one imports, also those inside functions and for types alone."""
     path = MODULES[name]
     folder = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     found = set()
-    for statement in ast.parse(path.read_text()).body:
+    for statement in ast.walk(ast.parse(path.read_text())):
         if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
             continue
         base = folder[: len(folder) - statement.level + 1]

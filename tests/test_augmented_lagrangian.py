@@ -11,7 +11,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
-from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation
 
 # Their bands are wide; a penalty of the same steps finds the truth of these every time.
 DEAR = ("quadratic-bar", "cube-with-nuisance", "bar-with-nuisance", "driven-bar")

@@ -15,8 +15,10 @@ from checks import relative_error
 from materials_small import ELASTIC
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem import batched
-from collocation_sysid.fem.batched import (
+from collocation_sysid.fem import kernels as batched
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.expressions import PointKernel
+from collocation_sysid.fem.kernels import (
     Batch,
     choose_evaluator,
     instructions,
@@ -25,9 +27,7 @@ from collocation_sysid.fem.batched import (
     make_evaluator,
     simd,
 )
-from collocation_sysid.fem.batched.combine import combine_natively, combine_with_numpy
-from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.expressions import PointKernel
+from collocation_sysid.fem.kernels.combine import combine_natively, combine_with_numpy
 from collocation_sysid.fem.materials import MATERIALS, neo_hookean
 
 VARIABLE = "COLLOCATION_SYSID_EVALUATOR"

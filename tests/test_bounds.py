@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from problems_small import IDEAL, box, measured_with, nodes_where, times, vertex_markers
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem, RolloutOptions
-from collocation_sysid.run import run
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 TRUTH = {"lambda_pa": 6e3, "mu_pa": 9e3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 SIGMA_M = 3e-4

@@ -20,8 +20,8 @@ from collocation_sysid.methods.casadi_nlp import PLUGINS, REFUSED, SqpMethod, wh
 from collocation_sysid.methods.method import Watch
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
 
 
 @cache

@@ -13,19 +13,19 @@ from problem_files import REFERENCES, Edit, both, replace_cell, replace_text, ru
 from problems_small import TRUTH, hung_cube
 from test_static import block
 
-from collocation_sysid.check import Findings, check_problem, glance
-from collocation_sysid.check.cost import Cost, cost_notes, cost_warnings
-from collocation_sysid.check.derivatives import shortened
-from collocation_sysid.check.elements import element_warnings, slenderness, worst_elements
-from collocation_sysid.check.motion import ModeFinding, Motion, motion_of, motion_warnings
 from collocation_sysid.display import plain_text
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.numerical_damping import numerical_mode
-from collocation_sysid.nlp.schemes import SCHEMES, as_scheme
+from collocation_sysid.model.numerical_damping import numerical_mode
+from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
-from collocation_sysid.terminal import check_table
+from collocation_sysid.result.terminal import check_table
+from collocation_sysid.runs.check import Findings, check_problem, glance
+from collocation_sysid.runs.check.cost import Cost, cost_notes, cost_warnings
+from collocation_sysid.runs.check.derivatives import shortened
+from collocation_sysid.runs.check.elements import element_warnings, slenderness, worst_elements
+from collocation_sysid.runs.check.motion import ModeFinding, Motion, motion_of, motion_warnings
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
 SILICONE = (
@@ -277,7 +277,7 @@ def test_tracks_in_another_unit_are_warned_of(tiny: Path):
 
 @pytest.mark.parametrize("scheme", ["backward-euler", "midpoint", "bdf2"])
 def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme: str):
-    monkeypatch.setattr("collocation_sysid.check.derivatives.SAMPLES", 5)
+    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 5)
     overrides = (f"transcription.scheme={scheme}", "transcription.substeps=2")
     findings = checked(tiny, *overrides)
     whole = Problem.read(tiny / "problem.toml", overrides).collocation()
@@ -295,7 +295,7 @@ def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):
 
 
 def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.check.cost.machine_memory_mb", lambda: 8000.0)
+    monkeypatch.setattr("collocation_sysid.runs.check.cost.machine_memory_mb", lambda: 8000.0)
     small, large = Cost("reduced-space", 500.0, 10.0), Cost("interior-point", 40000.0, 1000.0)
     (warning,) = cost_warnings(large, (small, large))
     assert "about 40 GB" in warning
@@ -314,7 +314,7 @@ def no_simulation(*_):
 
 def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
     for name in ("initial_variables", "started"):
-        monkeypatch.setattr(f"collocation_sysid.check.{name}", no_simulation)
+        monkeypatch.setattr(f"collocation_sysid.runs.check.{name}", no_simulation)
     unguessed = ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
     seen = glance(Problem.read(tiny / "problem.toml", unguessed))
     assert seen.bodies[0].elements > 0
@@ -324,7 +324,7 @@ def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
 
 
 def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.check.initial_variables", no_simulation)
+    monkeypatch.setattr("collocation_sysid.runs.check.initial_variables", no_simulation)
     shown = []
     show = "collocation_sysid.cli.problems.show"
     monkeypatch.setattr(show, lambda content: shown.append(plain_text(content)))
@@ -336,8 +336,8 @@ def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypat
 
 
 def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.check.PATIENCE_S", 0.0)
-    monkeypatch.setattr("collocation_sysid.check.derivatives.SAMPLES", 4)
+    monkeypatch.setattr("collocation_sysid.runs.check.PATIENCE_S", 0.0)
+    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 4)
     problem, told = Problem.read(tiny / "problem.toml"), []
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None

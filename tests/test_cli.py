@@ -11,7 +11,6 @@ import threading
 import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,17 +31,16 @@ from problem_files import (
 from rich.console import Console
 
 import collocation_sysid as cs
-from collocation_sysid import terminal
+from collocation_sysid import pipeline
 from collocation_sysid.cli import common
-from collocation_sysid.experiment import read_markers, read_poses
-from collocation_sysid.heartbeat import Heartbeat
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
+from collocation_sysid.recording import read_markers, read_poses
+from collocation_sysid.result import terminal
+from collocation_sysid.result.heartbeat import Heartbeat
+from collocation_sysid.runs import forward_simulation, solving
 
-ROLLOUT, RUN, SOLVING = (
-    import_module(f"collocation_sysid.{name}") for name in ("rollout", "run", "solving")
-)
 RESULT_KEYS = {
     "schema": set(),
     "status": set(),
@@ -222,7 +220,7 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
             time.sleep(0.5)  # until it is heard, on the main thread
 
     monkeypatch.setattr(terminal.Progress, "iteration", interrupt)
-    monkeypatch.setattr(RUN, "likely_causes", lambda _: pytest.fail("nobody waits for this"))
+    monkeypatch.setattr(pipeline, "likely_causes", lambda _: pytest.fail("nobody waits for this"))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Interrupted" in outcome.out
@@ -246,7 +244,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ROLLOUT, "simulate", interrupt)
+    monkeypatch.setattr(forward_simulation, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Verdict: doubtful\n  interrupted: no forward simulation has checked" in outcome.out
@@ -261,7 +259,7 @@ def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(RUN, late, interrupt)
+    monkeypatch.setattr(pipeline, late, interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "interrupted: what comes after the error bars is left out" in outcome.out
@@ -275,13 +273,13 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch
     found = []
 
     def solved(solver, collocation, watch, start=None):
-        solution = SOLVING.ReducedSpace()(collocation, watch, start)
-        status = solution.status if not found else SOLVING.Status.INTERRUPTED
+        solution = solving.ReducedSpace()(collocation, watch, start)
+        status = solution.status if not found else solving.Status.INTERRUPTED
         found.append(replace(solution, status=status))
         return found[-1]
 
-    monkeypatch.setattr(SOLVING, "read_where_found", solved)
-    monkeypatch.setattr(SOLVING, "second_start", lambda first: first.collocation.parameters)
+    monkeypatch.setattr(solving, "read_where_found", solved)
+    monkeypatch.setattr(solving, "second_start", lambda first: first.collocation.parameters)
     method = settings("solver.method=reduced-space")
     outcome = run_command("solve", "problem.toml", *method, "--out", "run")
     assert (outcome.code, len(found)) == (130, 2)
@@ -315,7 +313,7 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
 
 
 def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.heartbeat.FIRST_S", 0.01)
+    monkeypatch.setattr("collocation_sysid.result.heartbeat.FIRST_S", 0.01)
     told, lines = threading.Event(), []
 
     class Log(io.StringIO):
@@ -418,7 +416,7 @@ def test_check_reports_sizes_and_derivatives(tiny):
 
 
 def test_check_fails_where_derivatives_do_not_agree(tiny, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.check.AGREEMENT", 0.0)
+    monkeypatch.setattr("collocation_sysid.runs.check.AGREEMENT", 0.0)
     outcome = run_command("check", "problem.toml")
     assert outcome.code == 1
     assert "do not agree" in outcome.out

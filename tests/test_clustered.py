@@ -28,7 +28,7 @@ from collocation_sysid.methods import workers
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.workers import OnCluster, workers_of
-from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation
 
 distributed = pytest.importorskip("distributed")
 

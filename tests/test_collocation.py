@@ -17,16 +17,16 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment
-from collocation_sysid.fem.batched.combine import combine_with_numpy
+from collocation_sysid.fem.kernels.combine import combine_with_numpy
 from collocation_sysid.fem.moduli import engineering as engineering_moduli
 from collocation_sysid.methods.start import initial_variables
-from collocation_sysid.nlp import block_band
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program import block_band
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment
 
 THETA = as_theta(TRUTH)
 DAMPING = GUESS.items[2:]

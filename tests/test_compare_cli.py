@@ -16,8 +16,9 @@ from results_small import a_result
 from rich.console import Console
 
 from collocation_sysid.cli import studies
-from collocation_sysid.result import HistoryLine
-from collocation_sysid.study import display, process
+from collocation_sysid.plan import process
+from collocation_sysid.plan import progress as display
+from collocation_sysid.runs.result import HistoryLine
 from collocation_sysid.tree import as_json
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]

@@ -14,12 +14,12 @@ from scipy.interpolate import CubicSpline
 from test_static import HANGING, block
 from wrenches_small import sensing, wristed_cube
 
-from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.methods.condensed import Condensed, condensed
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.recording import Experiment, Nuisance
 
 DEFAULT, ON_TIME = Nuisance(), Nuisance(time_shift_s=None)
 

@@ -22,16 +22,16 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.methods.continuation import Continuation, first_part, first_samples
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import solve
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment
 
 SHARES = (0.5, 1.0)
 

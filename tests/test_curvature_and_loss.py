@@ -9,15 +9,15 @@ from memories_small import guesses, recorded, truth
 from problems_small import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.methods.curvature import exact_curvature
 from collocation_sysid.methods.horizon import Horizon, Point
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.reading import as_squares
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.reading import as_squares
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment
 
 
 def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) -> Collocation:

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from problem_files import run_command, settings, write_problem
 
-from collocation_sysid.earlier import Earlier
 from collocation_sysid.errors import InputError
-from collocation_sysid.output.view import frame_files
+from collocation_sysid.result.view import frame_files
+from collocation_sysid.runs.warm_start import Earlier
 
 Damage = Callable[[Path], object]
 links = pytest.mark.skipif(os.name != "posix", reason="links need rights here")

@@ -18,16 +18,16 @@ from problems_small import (
 )
 from wrenches_small import sensing, with_wrenches
 
-from collocation_sysid.experiment import Experiment, PointMass
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import is_density
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.shooting import adjoint_gradient, simulated
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters, Unknown
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Parameters, Unknown
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, PointMass
 
 # In the ratio that is stated: then known masses are damped alike.
 DENSITY_KG_M3 = {"density_kg_m3": 36.0, "core.density_kg_m3": 60.0}

@@ -13,22 +13,22 @@ from problems_small import GUESS, IDEAL, TRUTH, bar_in_two_hands, cube_with_nuis
 from scipy.spatial.transform import Rotation
 from wrenches_small import wristed_cube
 
-from collocation_sysid.design import Criterion, DesignOptions, Limits, Motion, designing
-from collocation_sysid.design.criterion import Errors, both_sides, draws_about
-from collocation_sysid.design.designing import Judge, design
-from collocation_sysid.design.display import DesignProgress
-from collocation_sysid.design.folder import PROBLEM_FILE, write_design
-from collocation_sysid.design.information import Recording, shared_information
-from collocation_sysid.design.linear import LinearRecording
-from collocation_sysid.design.motion import angular_motion
-from collocation_sysid.design.search import search
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Grasp, PoseSequence
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameter, Parameters, ThetaMap
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
+from collocation_sysid.plan.design import Criterion, DesignOptions, Limits, Motion, designing
+from collocation_sysid.plan.design.criterion import Errors, both_sides, draws_about
+from collocation_sysid.plan.design.designing import Judge, design
+from collocation_sysid.plan.design.display import DesignProgress
+from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
+from collocation_sysid.plan.design.information import Recording, shared_information
+from collocation_sysid.plan.design.linear import LinearRecording
+from collocation_sysid.plan.design.motion import angular_motion
+from collocation_sysid.plan.design.search import search
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import covariance
 

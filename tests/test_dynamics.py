@@ -18,11 +18,11 @@ from problems_small import (
     with_papers_damping,
 )
 
-from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.marching import march
+from collocation_sysid.model.dynamics import Dynamics
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 
 THETA = as_theta(TRUTH)
 ELASTIC = {"lambda_pa": TRUTH["lambda_pa"], "mu_pa": TRUTH["mu_pa"]}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from collocation_sysid.nlp.entries import Entries
+from collocation_sysid.program.entries import Entries
 
 SHAPE = (5, 7)
 

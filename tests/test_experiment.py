@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import (
+from collocation_sysid.recording import (
     Experiment,
     Force,
     Grasp,
@@ -20,7 +20,7 @@ from collocation_sysid.experiment import (
     PoseSequence,
     align,
 )
-from collocation_sysid.experiment.clock import unrounded_s
+from collocation_sysid.recording.clock import unrounded_s
 
 NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0.0]]) * 0.1
 TIMES = 0.01 * np.arange(6.0)

@@ -11,7 +11,6 @@ from checks import relative_error
 from memories_small import ONE, guesses, recorded, truth
 from problems_small import GUESS, box, hung_cube, measured_with, with_markers
 
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods.casadi_nlp import SqpMethod
@@ -19,7 +18,8 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.collocation import Collocation, carried_over
+from collocation_sysid.program.collocation import Collocation, carried_over
+from collocation_sysid.recording import Experiment
 
 CORE = Region("core", np.arange(6), prony=["slow"])
 REGIONS = ONE | {"core.slow.share": 0.7, "core.slow.tau_s": 0.08}

@@ -14,18 +14,18 @@ from test_explicit import explicit, of_branches
 from test_static import ELASTIC_ONLY, HANGING, block
 from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
 
-from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.methods.casadi_nlp import SqpMethod
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.nlp.collocation import Collocation, carried_over
-from collocation_sysid.nlp.parameters import Parameters, Unknown
-from collocation_sysid.nlp.reaction_rows import Reactions
-from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.nlp.wrench_rows import WrenchRows
+from collocation_sysid.model.parameters import Parameters, Unknown
+from collocation_sysid.program.collocation import Collocation, carried_over
+from collocation_sysid.program.reaction_rows import Reactions
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.program.wrench_rows import WrenchRows
+from collocation_sysid.recording import Experiment, Nuisance
 
 DENSE = TRUTH | {"density_kg_m3": 30.0}
 ALL_UNKNOWN = Nuisance.none(

@@ -16,12 +16,12 @@ from problem_files import run_command, write_problem
 from problems_small import IDEAL, nodes_where, smooth_poses, times, vertex_markers
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
-from collocation_sysid.export import TARGETS, Identified, export_run, verify_export
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.simulation import simulate
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
+from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(

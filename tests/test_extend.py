@@ -13,11 +13,11 @@ from problems_small import GUESS, TRUTH, hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.fem.refinement import refined
 from collocation_sysid.methods import METHODS
-from collocation_sysid.nlp.forces import Forces
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Nuisance
 
 DRAG = 40.0
 

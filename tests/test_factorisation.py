@@ -7,9 +7,9 @@ from problems_small import TRUTH, box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
-from collocation_sysid.nlp.factorisation import Factoriser
-from collocation_sysid.nlp.supernodal import library
-from collocation_sysid.nlp.unsymmetric import whole
+from collocation_sysid.program.factorisation import Factoriser
+from collocation_sysid.program.supernodal import library
+from collocation_sysid.program.unsymmetric import whole
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
 BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
@@ -149,7 +149,7 @@ def test_factors_that_live_together_do_not_share_their_memory():
 
 
 def test_what_is_asked_for_and_not_installed_is_told(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.nlp.supernodal.library", lambda: None)
+    monkeypatch.setattr("collocation_sysid.program.supernodal.library", lambda: None)
     with pytest.raises(InputError, match=r"collocation-sysid\[large\]"):
         Factoriser(SMALL, np.arange(7), "supernodal")
 

@@ -11,15 +11,15 @@ from checks import assert_derivative
 from problems_small import GUESS, driven_bar, hung_cube, nodes_where
 from test_density import parameters, with_core
 
-from collocation_sysid.experiment import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.node_force import NodeForce
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.force_term import States
-from collocation_sysid.nlp.forces import Forces
-from collocation_sysid.nlp.parameters import Parameters, Unknown
-from collocation_sysid.nlp.segment import Segment
-from collocation_sysid.nlp.unsymmetric import whole
+from collocation_sysid.model.force_term import States
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.model.parameters import Parameters, Unknown
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.segment import Segment
+from collocation_sysid.program.unsymmetric import whole
+from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 
 # Of a tendon whose tension grows and a pressure that stays.
 BAR = driven_bar()

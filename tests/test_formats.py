@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import align_to_template, read_markers
+from collocation_sysid.recording import align_to_template, read_markers
 
 ROOT = Path(__file__).parents[1]
 # A folder with the C3D files of scripts/get_srl_beam.py, and what they become in the world's frame.

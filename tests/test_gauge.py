@@ -12,13 +12,13 @@ from test_static import HANGING, block
 from test_wrench import assert_slopes
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Gauge, Look, Markers
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import simulate, with_readings
+from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_readings
+from collocation_sysid.recording import Experiment, Gauge, Look, Markers
 
 LOW_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]

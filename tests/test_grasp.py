@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Grasp, PoseSequence, held_nodes
+from collocation_sysid.recording import Grasp, PoseSequence, held_nodes
 
 POINTS = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.3]])
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from problems_small import times, vertex_markers
 
-from collocation_sysid.check.hold import Hold, hold_sentence, hold_warnings, holds_of
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
+from collocation_sysid.runs.check.hold import Hold, hold_sentence, hold_warnings, holds_of
 
 # Layers of nodes are so far apart, so a tenth of an edge is 2 mm.
 EDGE_M = 0.02

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from problem_files import replace_cell, replace_text, run_command, settings
 
-from collocation_sysid.check import memory
-from collocation_sysid.output import writers
+from collocation_sysid.result import writers
+from collocation_sysid.runs.check import ram as memory
 
 pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 
@@ -179,7 +179,7 @@ DEAF = """
 import os, signal, sys, threading, time
 from collocation_sysid import cli
 from collocation_sysid.methods import nlpsol
-from collocation_sysid.output import record
+from collocation_sysid.result import record
 record._write_pictures = lambda *_: None
 sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
 def end():

@@ -7,7 +7,7 @@ import pytest
 from problems_small import box
 
 from collocation_sysid.fem.moduli import ENGINEERING, LAME
-from collocation_sysid.nlp.parameters import Parameter, Parameters, ThetaMap
+from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.statistics.identifiability import verdicts
 from collocation_sysid.statistics.linearised import Derived, FitBlock, LinearisedFit
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of

@@ -27,17 +27,17 @@ from test_explicit import of_branches, swung
 from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Markers, Nuisance
 from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters, Unknown
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import solve
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment, Markers, Nuisance
 
 PRECISE = InteriorPoint(tolerance=1e-11)
 

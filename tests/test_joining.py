@@ -13,18 +13,18 @@ from problems_small import GUESS, IDEAL, TRUTH, bar_loaded, box, hung_cube, node
 
 from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Force, Nuisance, PointMass
-from collocation_sysid.experiment.loads import ramp
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.nuisance import NuisanceMap
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem, RolloutOptions
-from collocation_sysid.run import run, solve
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
+from collocation_sysid.recording.loads import ramp
+from collocation_sysid.result.terminal import summary
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_of
-from collocation_sysid.terminal import summary
 
 TIP = nodes_where(box(), 2, 0.0)
 DAMPING = ("gamma_r_s", "gamma_m_1_s")

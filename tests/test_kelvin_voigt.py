@@ -13,15 +13,15 @@ from materials_small import theta_for
 from problems_small import IDEAL, point_markers
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.nlp.unsymmetric import whole
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.unsymmetric import whole
+from collocation_sysid.recording import Experiment
 
 OBJECTIVE = [name for name in MATERIALS if name != "linear"]
 LENGTH_M = 0.03  # a large change of a position

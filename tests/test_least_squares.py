@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from collocation_sysid.nlp.least_squares import LeastSquares
+from collocation_sysid.program.least_squares import LeastSquares
 
 
 def test_an_update_of_the_triangle_is_the_sum_of_the_normal_equations(rng):

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Markers, Nuisance, PoseSequence
 from collocation_sysid.live import (
     Estimator,
     Frame,
@@ -37,7 +36,8 @@ from collocation_sysid.live.sources import as_json, datagrams, paced, recorded
 from collocation_sysid.live.track import Track
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.least_squares import LeastSquares
+from collocation_sysid.program.least_squares import LeastSquares
+from collocation_sysid.recording import Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import covariance
 
 NOISE_M = 3e-4

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import t as student
 
 from collocation_sysid.live.statistics import Scatter, widened
-from collocation_sysid.nlp.least_squares import LeastSquares
+from collocation_sysid.program.least_squares import LeastSquares
 
 WAVE = 2.0 * np.cos(np.pi / 4 * np.arange(33))
 NONE = np.full((2, 3), np.nan)

@@ -22,11 +22,11 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Force, Grasp, PointMass, PoseSequence
-from collocation_sysid.experiment.force_files import read_forces
-from collocation_sysid.nlp.rest import rest_state
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Force, Grasp, PointMass, PoseSequence
+from collocation_sysid.recording.force_files import read_forces
 
 INTEGRATORS = ["newmark", *SCHEMES]
 UNDAMPED = {**TRUTH, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}

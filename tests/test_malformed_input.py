@@ -22,9 +22,9 @@ from problem_files import (
 
 from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment.formats import c3d
-from collocation_sysid.experiment.readers import read_markers
 from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.recording.formats import c3d
+from collocation_sysid.recording.readers import read_markers
 
 MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
 RED = "\x1b[31m"

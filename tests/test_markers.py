@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Markers, Placement, place_markers
-from collocation_sysid.nlp.channel import operator_of
+from collocation_sysid.program.channel import operator_of
+from collocation_sysid.recording import Markers, Placement, place_markers
 
 
 def box_body(divisions=(2, 2, 3), edge_m=0.1) -> Any:

@@ -18,16 +18,16 @@ from scipy.spatial.transform import Rotation
 from skfem.helpers import ddot, div, dot, eye, sym_grad
 from test_against_scikit_fem import Library
 
-from collocation_sysid.experiment import Experiment, Grasp
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.output.fields import ElementFields
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp
+from collocation_sysid.result.fields import ElementFields
 
 P0 = "tet10-p0"
 LENGTH_M = 0.03  # a large change of a position

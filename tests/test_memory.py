@@ -11,10 +11,10 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
-from collocation_sysid.nlp.collocation import Collocation, Part
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.nlp.sweep import Sweep
+from collocation_sysid.program.collocation import Collocation, Part
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.sweep import Sweep
 
 KINDS = {
     "relaxed": ("hung-cube", {}),

@@ -10,14 +10,14 @@ from memories_small import ONE, guesses, recorded, remembering
 from problem_files import replace_text, run_command, settings
 from problems_small import measured_with, with_markers
 
-from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.overstress import Overstress
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.viscoelastic_rows import Overstress
+from collocation_sysid.recording import Experiment
+from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.notes import memory_notes
@@ -128,7 +128,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert findings.derivatives_agree
     assert findings.hessian_error > 0
     assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
-    monkeypatch.setattr("collocation_sysid.check.derivatives.LAID_OUT", 0)
+    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.LAID_OUT", 0)
     checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
     assert f"{findings.overstresses:,} more variables and constraints" in checked.out
     assert "τ prony_1" in checked.out

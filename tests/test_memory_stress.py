@@ -13,15 +13,15 @@ from problems_small import IDEAL, point_markers, times
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.memory import Branch, fading
 from collocation_sysid.fem.prony import Prony
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.memory import History, Recursion, Remembered
-from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.nlp.unsymmetric import whole
+from collocation_sysid.model.viscoelasticity import History, Recursion, Remembered
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.unsymmetric import whole
+from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 
 SHARE, TAU_S = 0.5, 0.2
 CONSTANTS = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}

@@ -19,16 +19,12 @@ from wrenches_small import fitted
 
 from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Markers, Wrench, write_poses_csv
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.evidence import evidence_of
-from collocation_sysid.study import PlannedRun, plan_models
-from collocation_sysid.study.choice import advice, model_rows
-from collocation_sysid.study.prediction import model_record, without
-from collocation_sysid.study.variants import (
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.plan import PlannedRun, plan_models
+from collocation_sysid.plan.choice import advice, model_rows
+from collocation_sysid.plan.prediction import model_record, without
+from collocation_sysid.plan.variants import (
     file_variants,
     models,
     parse_branches,
@@ -36,7 +32,11 @@ from collocation_sysid.study.variants import (
     toml,
     variants,
 )
-from collocation_sysid.synthesis import Recipe, write_data
+from collocation_sysid.problem import Problem
+from collocation_sysid.program.marching import march
+from collocation_sysid.recording import Experiment, Markers, Wrench, write_poses_csv
+from collocation_sysid.result.synthesis import Recipe, write_data
+from collocation_sysid.statistics.evidence import evidence_of
 
 BOTH = ("neo-hookean", "yeoh")
 DAMPING = "gamma_r_s = 0.009, gamma_m_1_s = 1.0, lambda_pa = 120.0"

@@ -14,9 +14,9 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.any_stiffness import _responses
-from collocation_sysid.nlp.forces import Forces
-from collocation_sysid.nlp.modes import Modes, natural_modes
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.program.any_stiffness import _responses
+from collocation_sysid.program.modes import Modes, natural_modes
 
 ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
 DENSITY = 30.0

@@ -23,14 +23,14 @@ from problems_small import (
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.charts import Chart
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.nuisance import NuisanceMap
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run, solve
+from collocation_sysid.program.charts import Chart
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import covariance
 
 ONE_OF_EACH = {

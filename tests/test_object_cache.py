@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from collocation_sysid.fem.batched import object_cache
+from collocation_sysid.fem.kernels import object_cache
 
 CODE = b"\x7fELF and so on"
 

@@ -14,7 +14,7 @@ from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.options import built
 from collocation_sysid.methods.penalty import Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.stated import documented
 
 each_method = pytest.mark.parametrize("name", METHODS)

@@ -11,9 +11,9 @@ from problems_small import EDGE_M, TRUTH, point_markers
 from test_static import block
 
 import collocation_sysid as cs
-from collocation_sysid.experiment import Experiment, Wrench
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Wrench
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.outliers import set_apart
 from collocation_sysid.statistics.trust import Trust, fit_concerns

@@ -18,11 +18,11 @@ import collocation_sysid as cs
 from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.nuisance import NuisanceMap
-from collocation_sysid.output.record import result
-from collocation_sysid.run import run, solve
-from collocation_sysid.terminal import summary
+from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.pipeline import run, solve
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.result.record import result
+from collocation_sysid.result.terminal import summary
 
 SCALE = cs.NuisanceRow(
     "camera_scale", "1", 0.02, reading=lambda y, scale, t_s, data: (1 + scale) * y

@@ -12,7 +12,7 @@ from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.parameters import (
+from collocation_sysid.model.parameters import (
     Parameter,
     Parameters,
     ThetaMap,

@@ -25,7 +25,7 @@ from collocation_sysid.methods.merit import Merit, Unconstrained
 from collocation_sysid.methods.penalty import Penalty
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.start import initial_variables
-from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation
 
 NEWTON = Penalty(inner="levenberg-marquardt")
 

@@ -12,11 +12,11 @@ from matplotlib.legend import Legend
 from problem_files import AT_TRUTH, REFERENCES, replace_text, run_command, settings, write_problem
 
 import collocation_sysid as cs
-from collocation_sysid.earlier import Earlier
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.start import initial_variables
-from collocation_sysid.output.pictures.mesh import mesh_picture
-from collocation_sysid.output.replay import read_run
+from collocation_sysid.result.pictures.mesh import mesh_picture
+from collocation_sysid.result.replay import read_run
+from collocation_sysid.runs.warm_start import Earlier
 from collocation_sysid.statistics.places import Place, places_of
 from collocation_sysid.statistics.uncertainty import covariance
 

@@ -26,11 +26,11 @@ from results_small import a_result, lines, uncertainty, value
 
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.output.pictures import (
+from collocation_sysid.model.dynamics import Dynamics
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.result.pictures import (
     Confidence,
     album,
     confidence_ellipses,
@@ -45,16 +45,16 @@ from collocation_sysid.output.pictures import (
     spectrum,
     tracks,
 )
-from collocation_sysid.output.pictures.camera import Camera
-from collocation_sysid.output.pictures.confidence import ellipse
-from collocation_sysid.output.pictures.jacobian import RASTER, SHOWN_STEPS
-from collocation_sysid.output.pictures.mesh import apart
-from collocation_sysid.output.pictures.scene import Drawn, View, sheet
-from collocation_sysid.output.pictures.shapes import COLOURS, Field
-from collocation_sysid.output.pictures.spectrum import spectral_density
-from collocation_sysid.output.replay import Replay
-from collocation_sysid.output.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
-from collocation_sysid.result import Result
+from collocation_sysid.result.pictures.camera import Camera
+from collocation_sysid.result.pictures.confidence import ellipse
+from collocation_sysid.result.pictures.jacobian import RASTER, SHOWN_STEPS
+from collocation_sysid.result.pictures.mesh import apart
+from collocation_sysid.result.pictures.scene import Drawn, View, sheet
+from collocation_sysid.result.pictures.shapes import COLOURS, Field
+from collocation_sysid.result.pictures.spectrum import spectral_density
+from collocation_sysid.result.replay import Replay
+from collocation_sysid.result.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
+from collocation_sysid.runs.result import Result
 
 THETA = np.array([*TRUTH.values()])
 TIMES = 0.01 * np.arange(20.0)
@@ -540,7 +540,7 @@ def test_an_experiment_can_be_read_back_from_its_arrays():
 def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
-        "import collocation_sysid.output.animation, collocation_sysid.output.redraw as r;"
+        "import collocation_sysid.result.animation, collocation_sysid.result.redraw as r;"
         "from results_small import a_result; r.album([], a_result());"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )

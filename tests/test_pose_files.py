@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import PoseSequence, read_poses, write_poses_csv
+from collocation_sysid.recording import PoseSequence, read_poses, write_poses_csv
 
 NAMED = "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0.0,0,0,1,0,0,0,1\n0.1,0.5,0,1,0,0,0.6,0.8\n"
 NUMBERED = NAMED.replace("qx,qy,qz,qw", "q0,q1,q2,q3")

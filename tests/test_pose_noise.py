@@ -9,10 +9,10 @@ import pytest
 from problems_small import GUESS, TRUTH, hung_cube
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import Grasp, Nuisance, PoseSequence
-from collocation_sysid.experiment.poses import Interpolation
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Grasp, Nuisance, PoseSequence
+from collocation_sysid.recording.poses import Interpolation
 from collocation_sysid.statistics.pose_noise import pose_noise_draws, roughness
 
 # So small that all is linear, and markers as exact, so that it counts.

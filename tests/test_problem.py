@@ -26,16 +26,16 @@ from problem_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.fem.materials import MATERIALS, neo_hookean
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp.collocation import Collocation
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
+from collocation_sysid.runs.check import check_problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"

@@ -38,11 +38,11 @@ from test_static import HANGING, block
 from wrenches_small import sensing, wristed_cube
 
 import collocation_sysid as cs
-from collocation_sysid.experiment import Experiment, Markers, Nuisance
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.sweep import Sweep
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.sweep import Sweep
+from collocation_sysid.recording import Experiment, Markers, Nuisance
 
 Make = Callable[[], Collocation]
 

@@ -17,10 +17,10 @@ from matplotlib.collections import PolyCollection
 from problems_small import EDGE_M, TRUTH, box, hung_cube, measured, noisy, smooth_poses, times
 
 import collocation_sysid as cs
-from collocation_sysid.check import check_problem
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.options import Options
-from collocation_sysid.output.fields import ElementFields
+from collocation_sysid.result.fields import ElementFields
+from collocation_sysid.runs.check import check_problem
 
 UNKNOWN = {
     "lambda_pa": 200.0,

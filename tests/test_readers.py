@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import (
+from collocation_sysid.recording import (
     PoseSequence,
     read_markers,
     read_poses,

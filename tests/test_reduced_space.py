@@ -32,10 +32,10 @@ from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.secant import updated, with_curvature
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.least_squares import LeastSquares
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.least_squares import LeastSquares
+from collocation_sysid.program.simulation import with_markers
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,10 @@ from problems_small import GUESS, TRUTH, hung_cube, measured
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.solution import Status
-from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem, RolloutOptions
-from collocation_sysid.refine import refine
-from collocation_sysid.run import Run, run
+from collocation_sysid.runs.refine import refine
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.numerical import Refinement, numerical_error
 from collocation_sysid.statistics.trust import numerical_concerns
@@ -195,7 +194,8 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeyp
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
     assert run_command("solve", problem, "--out", folder, "--method", "reduced-space").code == 0
-    refining = import_module("collocation_sysid.refine")  # its name is the function's too
+    from collocation_sysid.runs import refine as refining
+
     solved, whole = [], refining.solve
 
     def interrupted_at_the_mesh(problem, *arguments, **options):

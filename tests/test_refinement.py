@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from problems_small import EDGE_M, bar_let_go, box, cube_with_gaps, driven_bar, hung_cube
 
-from collocation_sysid.experiment import Grasp
-from collocation_sysid.experiment.refinement import refined as refined_experiment
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.refinement import refined, split_in_eight
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
+from collocation_sysid.recording import Grasp
+from collocation_sysid.recording.refinement import refined as refined_experiment
 
 TOP = Box((-1.0, -1.0, 0.6 * EDGE_M), (1.0, 1.0, 1.0))
 

@@ -14,9 +14,9 @@ import pytest
 from problem_files import TRUTH, pictures_drawn, run_command, settings, write_problem
 from results_small import ROLLOUT, a_result, value
 
-from collocation_sysid.output.remedies import REMEDIES
-from collocation_sysid.output.report.run_page import verdict
-from collocation_sysid.result import Result, SimulatedExperiment
+from collocation_sysid.result.remedies import REMEDIES
+from collocation_sysid.result.report.run_page import verdict
+from collocation_sysid.runs.result import Result, SimulatedExperiment
 from collocation_sysid.statistics.concern import Concern
 from collocation_sysid.statistics.trust import Trust
 from collocation_sysid.tree import as_json

@@ -11,11 +11,11 @@ import pytest
 from problem_files import TRUTH, run_command, settings, write_problem
 
 from collocation_sysid import Problem, run
-from collocation_sysid.experiment import read_markers, write_markers_csv
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.output.record import result
-from collocation_sysid.result import Result
-from collocation_sysid.rollout import Rollout
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.recording import read_markers, write_markers_csv
+from collocation_sysid.result.record import result
+from collocation_sysid.runs.forward_simulation import Rollout
+from collocation_sysid.runs.result import Result
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.profile import profile_of
 from collocation_sysid.tree import as_json, content, read

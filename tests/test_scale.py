@@ -9,12 +9,12 @@ import pytest
 from problem_files import replace_text, run_command
 from problems_small import hung_cube, noisy
 
-from collocation_sysid.check import check_problem
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Force, PointMass
-from collocation_sysid.nlp.parameters import Tied, Unknown
+from collocation_sysid.model.parameters import Tied, Unknown
+from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run
+from collocation_sysid.recording import Experiment, Force, PointMass
+from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.scale import open_scale, relative_moduli, relative_sentence
 
 STIFF = {"lambda_pa": Unknown(300.0), "mu_pa": Unknown(200.0)}

@@ -27,8 +27,8 @@ from collocation_sysid import (
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.scan import _Trial, _Tried, scan, started, usual_parameters
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.program.collocation import Collocation
 
 NOTHING = {name: Unknown() for name in TRUTH}
 # Of λ = 200 Pa and μ = 300 Pa.

@@ -18,9 +18,9 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Grasp
-from collocation_sysid.nlp.schemes import SCHEMES, STATIC, Stencil, as_scheme
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.model.schemes import SCHEMES, STATIC, Stencil, as_scheme
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Grasp
 
 REGULAR = {name: scheme.regular for name, scheme in SCHEMES.items()}
 STARTS = {

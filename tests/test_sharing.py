@@ -24,12 +24,12 @@ from problems_small import (
 from wrenches_small import wristed_cube
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Markers, Nuisance
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import solve
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.recording import Experiment, Markers, Nuisance
 from collocation_sysid.statistics.uncertainty import covariance
 
 PLACES = {"marker_offset_m": "shared"}

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from collocation_sysid import Problem, run, solve
-from collocation_sysid.experiment import Nuisance
 from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
-from collocation_sysid.nlp.wrench import without_sensors
-from collocation_sysid.run import Run
+from collocation_sysid.pipeline import Run
+from collocation_sysid.program.wrench import without_sensors
+from collocation_sysid.recording import Nuisance
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
 PROBLEMS = Path(__file__).parents[1] / "problems"

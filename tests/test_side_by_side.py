@@ -8,7 +8,7 @@ import pytest
 from memories_small import guesses, recorded, truth
 
 from collocation_sysid import Collocation, ReducedSpace
-from collocation_sysid.fem.batched import at_once, in_slices, side_by_side
+from collocation_sysid.fem.kernels import at_once, in_slices, side_by_side
 
 
 def test_results_are_in_the_order_of_the_items():

@@ -23,14 +23,14 @@ from problems_small import (
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence, held_nodes
-from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.forces import Forces
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.newton import NewtonOptions, Solver
-from collocation_sysid.nlp.rest import rest_state
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import simulate, with_markers
+from collocation_sysid.model.dynamics import Dynamics
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.newton import NewtonOptions, Solver
+from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence, held_nodes
 
 THETA = as_theta(TRUTH)
 ABSURDLY_SOFT = np.array([0.02, 0.03, 0.009, 1.0])

@@ -8,18 +8,18 @@ import pytest
 from problems_small import IDEAL, nodes_where, point_markers
 from scipy.sparse.linalg import ArpackNoConvergence
 
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import GAMMA_R
 from collocation_sysid.fem.damping import Damping
 from collocation_sysid.fem.kernel import mirrored
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.nlp import stability
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.forces import Forces
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.nlp.stability import growth_rate_1_s, instabilities
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.program import stability
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.stability import growth_rate_1_s, instabilities
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.trust import stability_concerns
 
 SIZE_M, STRETCH = (0.03, 0.03, 0.09), 1.6

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from problem_files import TRUTH, contents, pictures_drawn, run_command, settings, write_problem
 
 import collocation_sysid as cs
-from collocation_sysid.earlier import Earlier
+from collocation_sysid.runs.warm_start import Earlier
 
 pytestmark = pytest.mark.long
 

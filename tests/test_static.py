@@ -23,11 +23,22 @@ from problems_small import (
 from scipy.optimize import brentq
 
 import collocation_sysid as cs
-from collocation_sysid.check import check_problem
-from collocation_sysid.check.derivatives import derivative_errors
 from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import (
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.shooting import Shooting
+from collocation_sysid.methods.start import initial_variables
+from collocation_sysid.model.dynamics import Dynamics
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.pipeline import run
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.newton import Solver
+from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import (
     Experiment,
     Grasp,
     Nuisance,
@@ -35,22 +46,11 @@ from collocation_sysid.experiment import (
     displaced_axes,
     read_displacement,
 )
-from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.interior_point import InteriorPoint
-from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.shooting import Shooting
-from collocation_sysid.methods.start import initial_variables
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.dynamics import Dynamics
-from collocation_sysid.nlp.newton import Solver
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.nlp.rest import rest_state
-from collocation_sysid.nlp.simulation import simulate, with_markers
-from collocation_sysid.rollout import Rollout
-from collocation_sysid.run import run
+from collocation_sysid.result.terminal import check_table, summary
+from collocation_sysid.runs.check import check_problem
+from collocation_sysid.runs.check.derivatives import derivative_errors
+from collocation_sysid.runs.forward_simulation import Rollout
 from collocation_sysid.statistics.stillness import stillness_notes
-from collocation_sysid.terminal import check_table, summary
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])

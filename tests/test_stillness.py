@@ -15,12 +15,12 @@ from problems_small import (
     released_cube,
 )
 
-from collocation_sysid.check import check_problem
-from collocation_sysid.experiment import Experiment, Force, Grasp, PoseSequence
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
+from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.stillness import motionless
 
 

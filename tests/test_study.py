@@ -16,9 +16,7 @@ from collocation_sysid import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.problem import Problem
-from collocation_sysid.result import HistoryLine
-from collocation_sysid.study import (
+from collocation_sysid.plan import (
     Limits,
     PlannedRun,
     RunStore,
@@ -29,10 +27,12 @@ from collocation_sysid.study import (
     run_all,
     worker,
 )
-from collocation_sysid.study.arguments import parse_methods, parse_over, read_truth
-from collocation_sysid.study.display import time_left_s
-from collocation_sysid.study.plan import short_keys
-from collocation_sysid.study.table import Yardstick, method_rows, run_row, wilson_interval
+from collocation_sysid.plan.arguments import parse_methods, parse_over, read_truth
+from collocation_sysid.plan.progress import time_left_s
+from collocation_sysid.plan.study import short_keys
+from collocation_sysid.plan.table import Yardstick, method_rows, run_row, wilson_interval
+from collocation_sysid.problem import Problem
+from collocation_sysid.runs.result import HistoryLine
 from collocation_sysid.tree import as_json, content
 
 NAMES = tuple(TRUTH)

@@ -12,10 +12,10 @@ from problems_small import TRUTH, hung_cube
 import collocation_sysid as cs
 from collocation_sysid.live.model import Model
 from collocation_sysid.methods.method import Method
-from collocation_sysid.output.record import result
+from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
-from collocation_sysid.refine import refine
-from collocation_sysid.run import Run, run
+from collocation_sysid.result.record import result
+from collocation_sysid.runs.refine import refine
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.numerical import MOST_SUBSTEPS, Refinement, numerical_error
 

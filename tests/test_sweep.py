@@ -19,13 +19,13 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.multipliers import constraint_multipliers
-from collocation_sysid.nlp import sweep
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.setting import Setting
-from collocation_sysid.nlp.stopwatch import Stopwatch
-from collocation_sysid.nlp.sweep import Sweep, Tangent
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.model.setting import Setting
+from collocation_sysid.program import sweep
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.stopwatch import Stopwatch
+from collocation_sysid.program.sweep import Sweep, Tangent
 
 EXPERIMENTS = SMALL_EXPERIMENTS | {"bar-loaded": bar_loaded}
 LAYOUTS = {

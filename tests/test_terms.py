@@ -11,14 +11,14 @@ import pytest
 from checks import assert_derivative, relative_error
 from problems_small import bar_in_two_hands, measured_with
 
-from collocation_sysid.experiment import Experiment
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.methods import METHODS
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.parameters import Parameters, Tied, Unknown
-from collocation_sysid.nlp.sweep import Sweep
+from collocation_sysid.model.parameters import Parameters, Tied, Unknown
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.sweep import Sweep
+from collocation_sysid.recording import Experiment
 from collocation_sysid.statistics.uncertainty import covariance
 
 LEFT_HALF = Box((-1, -1, -1), (0.075, 1, 1))

@@ -15,15 +15,15 @@ from problem_files import AT_TRUTH, TRUTH, run_command, settings
 from scipy.sparse.linalg import eigsh, spsolve
 from scipy.spatial.transform import Rotation
 
-from collocation_sysid.experiment import place_markers
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.output.writers import write_frames
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import Recipe, write_data
+from collocation_sysid.recording import place_markers
+from collocation_sysid.result.synthesis import Recipe, write_data
+from collocation_sysid.result.writers import write_frames
 
 TET10 = element_named("tet10")
 LENGTH_M = 0.03  # a large change of a position

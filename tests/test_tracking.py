@@ -10,8 +10,8 @@ from problem_files import GRASP, replace_text
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import read_markers, read_poses, write_markers_csv
 from collocation_sysid.problem import Problem
+from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 
 MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
 BASE_M = {

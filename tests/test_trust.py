@@ -16,9 +16,10 @@ from problem_files import run_command, settings, write_problem
 from collocation_sysid import Run, run
 from collocation_sysid.display import plain_text
 from collocation_sysid.methods.solution import Status
-from collocation_sysid.output.record import result
-from collocation_sysid.output.remedies import REMEDIES
 from collocation_sysid.problem import Problem
+from collocation_sysid.result.record import result
+from collocation_sysid.result.remedies import REMEDIES
+from collocation_sysid.result.terminal import summary
 from collocation_sysid.statistics.concern import SENTENCES, Concern
 from collocation_sysid.statistics.hypothesis import Hypothesis
 from collocation_sysid.statistics.trust import (
@@ -31,7 +32,6 @@ from collocation_sysid.statistics.trust import (
     scheme_concerns,
 )
 from collocation_sysid.statistics.uncertainty import uncertainty_of
-from collocation_sysid.terminal import summary
 from collocation_sysid.tree import as_json, content, read
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))

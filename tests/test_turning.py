@@ -10,14 +10,14 @@ import pytest
 from checks import observed_order
 from problems_small import TRUTH, hung_cube, measured, smooth_poses, times
 
-from collocation_sysid.check import check_problem
-from collocation_sysid.experiment import Experiment, Grasp
-from collocation_sysid.experiment.poses import Interpolation
-from collocation_sysid.experiment.turning import fastest_turn, turning_warnings
-from collocation_sysid.nlp.parameters import Unknown
-from collocation_sysid.nlp.simulation import simulate
+from collocation_sysid.model.parameters import Unknown
+from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import Experiment, Grasp
+from collocation_sysid.recording.poses import Interpolation
+from collocation_sysid.recording.turning import fastest_turn, turning_warnings
+from collocation_sysid.runs.check import check_problem
 
 STEPS, FINEST = 8, 32
 

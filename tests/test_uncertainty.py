@@ -17,14 +17,14 @@ from problems_small import (
 from scipy.stats import chi2
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Experiment, Grasp, PoseSequence
 from collocation_sysid.fem.moduli import engineering
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.segment import Segment
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.segment import Segment
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.sensitivity import marker_sensitivities, sensitivities
 from collocation_sysid.statistics.uncertainty import covariance
 

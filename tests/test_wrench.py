@@ -26,28 +26,21 @@ from problems_small import (
 from scipy.spatial.transform import Rotation
 from wrenches_small import fitted, sensing, with_wrenches, wristed_cube
 
-from collocation_sysid.experiment import (
-    Experiment,
-    Force,
-    Grasp,
-    Nuisance,
-    PointMass,
-    PoseSequence,
-)
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.shooting import adjoint_gradient, simulated
-from collocation_sysid.nlp.channel import Forced, Motion
-from collocation_sysid.nlp.collocation import Collocation, Part
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameters
-from collocation_sysid.nlp.schemes import SCHEMES
-from collocation_sysid.nlp.simulation import simulate
-from collocation_sysid.nlp.wrench_channel import (
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.channel import Forced, Motion
+from collocation_sysid.program.collocation import Collocation, Part
+from collocation_sysid.program.marching import march
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.wrench_channel import (
     fading,
     pulled_through,
     smoothed,
     smoothed_slope,
 )
+from collocation_sysid.recording import Experiment, Force, Grasp, Nuisance, PointMass, PoseSequence
 
 EVERYTHING = Nuisance(
     gravity_rad=0.03,

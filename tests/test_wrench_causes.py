@@ -10,9 +10,9 @@ import pytest
 from problems_small import GUESS
 from test_wrench_fit import swung
 
-from collocation_sysid.experiment import Wrench
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.recording import Wrench
 from collocation_sysid.statistics.causes import likely_causes
 
 

@@ -9,9 +9,9 @@ import pytest
 from problem_files import run_command
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Wrench, read_wrench, write_wrench_csv
 from collocation_sysid.problem import Problem
-from collocation_sysid.synthesis import Recipe, write_data
+from collocation_sysid.recording import Wrench, read_wrench, write_wrench_csv
+from collocation_sysid.result.synthesis import Recipe, write_data
 
 SENSOR = 'wrench = { file = "force.csv", sigma_n = 0.001, sigma_nm = 0.0001 }'
 HEADER = "t_s,fx_n,fy_n,fz_n,tx_nm,ty_nm,tz_nm"

@@ -14,17 +14,17 @@ from test_static import HANGING, block
 from wrenches_small import SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
-from collocation_sysid.check import check_problem
-from collocation_sysid.check.derivatives import derivative_errors, shortened
-from collocation_sysid.experiment import Experiment, Nuisance
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.shooting import Shooting
 from collocation_sysid.methods.start import initial_variables
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
+from collocation_sysid.recording import Experiment, Nuisance
+from collocation_sysid.runs.check import check_problem
+from collocation_sysid.runs.check.derivatives import derivative_errors, shortened
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import covariance, uncertainty_of
 
@@ -140,9 +140,9 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     with np.load(folder / "trajectory.npz") as stored:
         assert stored["wrench_1"].shape == (21, 19)
     from collocation_sysid.display import plain_text
-    from collocation_sysid.output.redraw import redraw
-    from collocation_sysid.output.report import as_page, run_report
-    from collocation_sysid.terminal import summary
+    from collocation_sysid.result.redraw import redraw
+    from collocation_sysid.result.report import as_page, run_report
+    from collocation_sysid.result.terminal import summary
 
     said = plain_text(summary(run, folder))
     assert "wrench of 'hung cube'" in said

@@ -11,8 +11,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.output.fields import ElementFields
-from collocation_sysid.output.writers import run_folder, write_frames, write_pvd, write_vtu
+from collocation_sysid.result.fields import ElementFields
+from collocation_sysid.result.writers import run_folder, write_frames, write_pvd, write_vtu
 
 MESH = box_mesh((0.1, 0.2, 0.3), (1, 2, 1))
 TET4 = element_named("tet4")

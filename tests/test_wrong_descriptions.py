@@ -12,16 +12,16 @@ import pytest
 from problem_files import both, replace_text, run_command
 from problems_small import box
 
-from collocation_sysid.check.description import description_causes
-from collocation_sysid.check.hold import hold_warnings, holds_of
 from collocation_sysid.errors import InputError
-from collocation_sysid.experiment import Grasp
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.simulation import with_markers
+from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.run import run, solve
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording import Grasp
+from collocation_sysid.runs.check.description import description_causes
+from collocation_sysid.runs.check.hold import hold_warnings, holds_of
 from collocation_sysid.statistics.causes import likely_causes
 from collocation_sysid.statistics.plausible import odd_material, oddities
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from problems_small import TRUTH, as_theta, hung_cube, measured_with
 
-from collocation_sysid.experiment import Experiment, Nuisance, Wrench
-from collocation_sysid.nlp.collocation import Collocation
-from collocation_sysid.nlp.marching import march
-from collocation_sysid.nlp.parameters import Parameters
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.marching import march
+from collocation_sysid.recording import Experiment, Nuisance, Wrench
 
 SIGMA_N, SIGMA_NM = 1e-3, 1e-4
 POINT_M = (0.02, -0.01, 0.12)

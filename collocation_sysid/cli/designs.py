@@ -8,12 +8,12 @@ from typing import cast
 
 import typer
 
-from ..design import Criterion, DesignOptions, Limits
-from ..design import design as designed
-from ..design.criterion import Kind, Over
 from ..errors import InputError
 from ..folders import require_possible, run_name
-from ..output.writers import require_replaceable
+from ..plan.design import Criterion, DesignOptions, Limits
+from ..plan.design import design as designed
+from ..plan.design.criterion import Kind, Over
+from ..result.writers import require_replaceable
 from ..tree import as_json
 from .common import EXIT_INTERRUPTED, errors, show
 from .options import OfProblem, OneExperiment, Out, Told, command
@@ -68,8 +68,8 @@ def design(options: Design) -> None:
     of the parameters. The folder gets poses.csv, error bars before and after, pictures, a film and
     a problem that simulates it. Ctrl-C keeps the best motion so far.
     """
-    from ..design.display import DesignProgress, design_summary
-    from ..design.folder import DESIGN_FILE, as_dict, write_design
+    from ..plan.design.display import DesignProgress, design_summary
+    from ..plan.design.folder import DESIGN_FILE, as_dict, write_design
 
     folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
     names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))

@@ -8,22 +8,16 @@ from pathlib import Path
 
 import typer
 
-from ..check import check_problem, glance
 from ..folders import require_possible, run_name
 from ..methods.described import require_method
 from ..methods.solution import Status
-from ..output.record import result
-from ..output.writers import require_replaceable
-from ..run import run
-from ..synthesis import Recipe, write_data
+from ..pipeline import run
+from ..result.record import result
+from ..result.synthesis import Recipe, write_data
+from ..result.writers import require_replaceable
+from ..runs.check import check_problem, glance
 from ..tree import as_json
-from .common import (
-    EXIT_DOUBTFUL,
-    EXIT_INTERRUPTED,
-    EXIT_NOT_CONVERGED,
-    errors,
-    show,
-)
+from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors, show
 from .options import OfProblem, Out, Told, command
 
 commands = typer.Typer()
@@ -73,7 +67,7 @@ def solve(options: Solve) -> None:
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
     """
-    from ..terminal import Progress, summary
+    from ..result.terminal import Progress, summary
 
     if options.method is not None:
         require_method(options.method, "--method")
@@ -123,7 +117,7 @@ def simulate(options: Simulate) -> None:
     The markers' places are their reference_m, or follow from their file. The parameters are the
     guesses or fixed values: set others with --set.
     """
-    from ..terminal import Progress
+    from ..result.terminal import Progress
 
     problem = options.read(simulation=True)
     require_possible(options.out)
@@ -161,7 +155,7 @@ def check(options: Check) -> None:
     Bodies, recordings and grasps are shown at once; derivatives, costs and the simulation at the
     guess follow, of the first samples where the whole takes more than some ten seconds.
     """
-    from ..terminal import Progress, closer_table, glance_table
+    from ..result.terminal import Progress, closer_table, glance_table
 
     problem = options.read()
     if not options.as_json:

@@ -43,8 +43,8 @@ def refine(options: Refine) -> None:
     numerical error of each parameter, with an interval for noise and discretisation. What was
     solved before, as of a call that was interrupted, is not solved again.
     """
-    from ..output.refined import refine_run
-    from ..terminal import refinement_table
+    from ..result.refined import refine_run
+    from ..result.terminal import refinement_table
 
     def say(what: str) -> None:
         if not options.quiet:
@@ -93,8 +93,8 @@ def export(options: Export) -> None:
 
     Says what the target cannot express. By default in a folder export-TARGET of the run.
     """
-    from ..export import Identified, export_run, target_named, verify_export
-    from ..terminal import comparison_table, export_notes
+    from ..result.export import Identified, export_run, target_named, verify_export
+    from ..result.terminal import comparison_table, export_notes
 
     target = target_named(options.to)
     folder = options.out or options.run_folder / f"export-{options.to}"
@@ -127,7 +127,7 @@ class Plot(OfRun):
 @command(commands, "plot runs/swing")
 def plot(options: Plot) -> None:
     """Draw the pictures of a run again, from its files."""
-    from ..output.redraw import redraw
+    from ..result.redraw import redraw
 
     folder = options.out or options.run_folder
     require_possible(folder)
@@ -157,7 +157,7 @@ def report(options: Report) -> None:
 
     Everything it found; of a page the pictures are inside, in Markdown they are links.
     """
-    from ..output.report import as_file, comparison_report, run_report
+    from ..result.report import as_file, comparison_report, run_report
 
     folder, file = options.folder, options.to or options.folder / "report.html"
     study = (folder / "summary.json").is_file()
@@ -193,7 +193,7 @@ def animate(options: Animate) -> None:
     """Film a run: the body as fitted beside the body as rolled out."""
     from rich.progress import Progress
 
-    from ..output.animation import animate as film
+    from ..result.animation import animate as film
 
     require_possible(options.run_folder if options.to is None else options.to.parent)
     bar = Progress(console=errors, transient=True)
@@ -227,8 +227,8 @@ def view(options: View) -> None:
 
     In a window (needs pyvista), or as a web page that needs nothing.
     """
-    from ..output.view import FIELD, export_page
-    from ..output.view import view as opened
+    from ..result.view import FIELD, export_page
+    from ..result.view import view as opened
 
     run, html, field = options.run_folder, options.html, options.field
     if html is None:

@@ -14,8 +14,7 @@ from rich.text import Text
 
 from ..errors import InputError
 from ..folders import require_possible, run_name
-from ..problem import Problem
-from ..study import (
+from ..plan import (
     Limits,
     PlannedRun,
     RunStore,
@@ -25,9 +24,10 @@ from ..study import (
     plan_sweep,
     run_all,
 )
-from ..study.arguments import parse_methods, parse_over, read_truth
-from ..study.table import Yardstick
-from ..study.variants import models, parse_branches, parse_materials
+from ..plan.arguments import parse_methods, parse_over, read_truth
+from ..plan.table import Yardstick
+from ..plan.variants import models, parse_branches, parse_materials
+from ..problem import Problem
 from ..tree import as_json
 from .common import EXIT_INTERRUPTED, errors, show
 from .options import OfProblem, Out, Told, command
@@ -168,8 +168,8 @@ def _study(
     kind: str, options: Many, planned: Sequence[PlannedRun], yardstick: Yardstick | None = None
 ) -> None:
     """Do the runs that are left, write the tables and plots, and print them."""
-    from ..study.display import StudyProgress, plan_table, study_tables
-    from ..study.report import load_report, report_json, write_report
+    from ..plan.progress import StudyProgress, plan_table, study_tables
+    from ..plan.study_page import load_report, report_json, write_report
 
     name = run_name(options.problem)
     folder = options.out or Path("runs") / f"{name}-{kind}"

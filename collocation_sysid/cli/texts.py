@@ -90,7 +90,7 @@ class New:
 )
 def new(options: New) -> None:
     """Write a commented problem file to start from."""
-    from ..beginning import begin
+    from ..problem.beginning import begin
     from ..problem.template import write_template
 
     folder, kind = Path(options.name), options.kind

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .batched import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
+from .kernels import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .memory import Past, PointLayout
 from .mesh import TetMesh
 from .model import Model, Theta

@@ -18,11 +18,11 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array, Index
-from .batched import COMPILING, Batch, Evaluator
 from .discretisation import Discretisation
 from .elements import Element
 from .expressions import Law, carried_energy, first_piola, second_piola, six_of
 from .kernel import PointKernel
+from .kernels import COMPILING, Batch, Evaluator
 from .pattern import dofs_of
 from .point import Pieces, Point
 

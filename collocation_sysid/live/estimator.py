@@ -25,10 +25,10 @@ from ..arrays import Array
 from ..checked import AtLeastOne, Positive
 from ..errors import InputError, SimulationError
 from ..methods.options import Options
-from ..nlp.lapack import one_blas_thread
-from ..nlp.least_squares import LeastSquares
+from ..pipeline import Run
 from ..problem import Problem
-from ..run import Run
+from ..program.lapack import one_blas_thread
+from ..program.least_squares import LeastSquares
 from ..statistics.concern import concerned
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..experiment.formats.text import written_number
-from ..experiment.poses import first_matrix_fault, first_pose_fault
+from ..recording.formats.text import written_number
+from ..recording.poses import first_matrix_fault, first_pose_fault
 
 Pose = Any
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..experiment.clock import TIME_TOLERANCE_S
+from ..recording.clock import TIME_TOLERANCE_S
 from .sweep import LATEST, LoggedRow, Tracks, lagrange
 
 # Frames this near in time, in samples, are of one time.

@@ -15,22 +15,22 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..experiment.experiment import Experiment
-from ..experiment.poses import PoseSequence
 from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
-from ..nlp.collocation import Collocation
-from ..nlp.forces import Forces
-from ..nlp.least_squares import LeastSquares
-from ..nlp.markers import NEIGHBOURS, MarkerReading
-from ..nlp.newton import NewtonOptions, Solver
-from ..nlp.row import Row
-from ..nlp.segment import Segment
-from ..nlp.sweep import Sweep
+from ..model.forces import Forces
 from ..problem import Problem
+from ..program.collocation import Collocation
+from ..program.least_squares import LeastSquares
+from ..program.markers import NEIGHBOURS, MarkerReading
+from ..program.newton import NewtonOptions, Solver
+from ..program.row import Row
+from ..program.segment import Segment
+from ..program.sweep import Sweep
+from ..recording.experiment import Experiment
+from ..recording.poses import PoseSequence
 
 if TYPE_CHECKING:
-    from ..fem.batched.skyline import Room
+    from ..fem.kernels.skyline import Room
 
 # Rows that are linearised at a time, at most.
 TOGETHER = 8
@@ -248,7 +248,7 @@ class Model:
 
     @cached_property
     def stencils(self) -> tuple[Array, Array, Array, Array]:
-        """Of all rows the coefficients p, q, w and s of `nlp.row`, as (rows, rows) matrices."""
+        """Of all rows the coefficients p, q, w and s of `program.row`, as (rows, rows) matrices."""
         dynamics = self.segment.dynamics.first_rows(self.rows)
         tables, step_s = dynamics.tables, dynamics.step_s
         p, q, w, s = (

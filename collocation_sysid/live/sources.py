@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..experiment.experiment import Experiment
 from ..problem import Problem
-from ..result import Result
+from ..recording.experiment import Experiment
+from ..runs.result import Result
 from .estimator import Update
 from .frames import Frame
 from .model import Model

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, stdtrit
 
 from ..arrays import Array
-from ..nlp.least_squares import LeastSquares
+from ..program.least_squares import LeastSquares
 
 # Probability of taking noise of the σ given for larger, at each look.
 RARE = 1e-3

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.body import Linearisation
-from ..nlp.least_squares import LeastSquares
-from ..nlp.marching import RowEquations, extrapolated, solve_row
-from ..nlp.newton import NewtonFailure, simulation_error
-from ..nlp.reading import as_squares
-from ..nlp.rest import start_state
-from ..nlp.row import Row
-from ..nlp.sweep import Columns, Forward, GraspMotion, LastRows, Step
+from ..program.least_squares import LeastSquares
+from ..program.marching import RowEquations, extrapolated, solve_row
+from ..program.newton import NewtonFailure, simulation_error
+from ..program.reading import as_squares
+from ..program.rest import start_state
+from ..program.row import Row
+from ..program.sweep import Columns, Forward, GraspMotion, LastRows, Step
 from .model import TOGETHER, Model, Poses
 
 # A row's correction over the body's size: the next one would be its square. Where rows are solved

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..nlp.least_squares import LeastSquares
+from ..program.least_squares import LeastSquares
 from .model import TOGETHER, Model, Poses
 from .statistics import Scatter
 from .sweep import Kept, LiveSweep, LoggedRow, Said, State

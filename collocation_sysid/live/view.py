@@ -14,7 +14,7 @@ from ..display import Line, Shown, Span, Table
 from ..errors import InputError
 from ..fem.constants import unit_of
 from ..files import whole_file
-from ..output.style import BLUE, ORANGE, dress, mathematical, new_figure
+from ..result.style import BLUE, ORANGE, dress, mathematical, new_figure
 from .estimator import Update
 
 BARS = "▁▂▃▄▅▆▇█"

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..experiment.clock import STEP_TOLERANCE
-from ..experiment.experiment import Experiment
-from ..experiment.poses import PoseSequence
 from ..methods.reduced_space import ReducedSpace
+from ..pipeline import Run, run
 from ..problem import Problem
-from ..run import Run, run
+from ..recording.clock import STEP_TOLERANCE
+from ..recording.experiment import Experiment
+from ..recording.poses import PoseSequence
 from .intake import Intake
 from .model import Model
 from .sweep import LoggedRow

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation, carried_over
+from ..program.collocation import Collocation, carried_over
 from .recorder import Recorder
 
 HessianValues = Callable[[Array, float, Array, Array], None]

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..checked import Count, Positive
-from ..nlp.collocation import Collocation
+from ..program.collocation import Collocation
 from . import nlpsol
 from .callbacks import HessianValues, NlpFunctions
 from .method import Watch

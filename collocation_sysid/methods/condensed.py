@@ -22,9 +22,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..experiment.nuisance import TIME
-from ..nlp.collocation import Collocation
-from ..nlp.segment import Segment
+from ..program.collocation import Collocation
+from ..program.segment import Segment
+from ..recording.nuisance import TIME
 
 
 def condensed(whole: Collocation) -> Collocation:

@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 
 from ..arrays import Array
 from ..errors import InputError, hint_at
-from ..experiment.experiment import Experiment
-from ..nlp.collocation import Collocation
+from ..program.collocation import Collocation
+from ..recording.experiment import Experiment
 from .casadi_nlp import Sleqp, SqpMethod
 from .interior_point import InteriorPoint
 from .ladder import SHARES, Shares, part_of

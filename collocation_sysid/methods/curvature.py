@@ -6,8 +6,8 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..nlp.collocation import Collocation
-from ..nlp.stopwatch import Stopwatch
+from ..program.collocation import Collocation
+from ..program.stopwatch import Stopwatch
 from .horizon import Point
 from .multipliers import constraint_multipliers
 

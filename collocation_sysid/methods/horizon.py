@@ -11,12 +11,12 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..nlp.collocation import Collocation
-from ..nlp.factorisation import Choice
-from ..nlp.lapack import one_blas_thread
-from ..nlp.least_squares import LeastSquares
-from ..nlp.stopwatch import Stopwatch
-from ..nlp.sweep import Sweep
+from ..program.collocation import Collocation
+from ..program.factorisation import Choice
+from ..program.lapack import one_blas_thread
+from ..program.least_squares import LeastSquares
+from ..program.stopwatch import Stopwatch
+from ..program.sweep import Sweep
 from .trajectory import (
     Reached,
     Report,

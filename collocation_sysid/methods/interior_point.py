@@ -11,7 +11,7 @@ from pydantic import BeforeValidator
 
 from ..arrays import Array
 from ..checked import Count, Finite, NotNegative, Positive, Text, Whole
-from ..nlp.collocation import Collocation
+from ..program.collocation import Collocation
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .condensed import condensed

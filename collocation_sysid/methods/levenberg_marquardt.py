@@ -21,8 +21,8 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..nlp.lapack import cholesky_in_place, one_blas_thread
-from ..nlp.least_squares import LeastSquares
+from ..program.lapack import cholesky_in_place, one_blas_thread
+from ..program.least_squares import LeastSquares
 from .merit import Merit, Unconstrained
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)

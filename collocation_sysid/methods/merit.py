@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..arrays import Array, Index
-from ..nlp.collocation import Collocation, carried_over
-from ..nlp.stopwatch import Stopwatch
+from ..program.collocation import Collocation, carried_over
+from ..program.stopwatch import Stopwatch
 
 
 class Unconstrained:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation
+from ..program.collocation import Collocation
 from .solution import Iteration, Solution
 
 Watch = Callable[[Iteration], None]

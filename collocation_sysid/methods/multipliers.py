@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array
-from ..fem.batched import side_by_side
-from ..nlp.collocation import Collocation, Part
-from ..nlp.stopwatch import Stopwatch
-from ..nlp.sweep import Sweep
+from ..fem.kernels import side_by_side
+from ..program.collocation import Collocation, Part
+from ..program.stopwatch import Stopwatch
+from ..program.sweep import Sweep
 
 
 def constraint_multipliers(

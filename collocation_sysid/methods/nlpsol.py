@@ -17,7 +17,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..nlp.collocation import Collocation, carried_over
+from ..program.collocation import Collocation, carried_over
 from ..starting import LEFT
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .condensed import whole_multipliers

@@ -27,7 +27,7 @@ import numpy as np
 from ..arrays import Array
 from ..checked import AboveOne, AtLeastOne, Count, Positive
 from ..errors import InputError
-from ..nlp.collocation import Collocation
+from ..program.collocation import Collocation
 from .inner import FIRST_ORDER, Inner, minimise
 from .merit import Merit, Unconstrained
 from .method import Watch

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..nlp.collocation import Collocation
-from ..nlp.stopwatch import Stopwatch
+from ..program.collocation import Collocation
+from ..program.stopwatch import Stopwatch
 from .method import Watch
 from .solution import Iteration, Solution, Status, Timing
 from .start import initial_variables

@@ -1,7 +1,7 @@
 """Reduced space: given θ the trajectory is determined, so only θ is searched for.
 
 Each iteration is a Gauss–Newton step on the same NLP as interior point's, with the same optimum.
-One factorisation a timestep gives the feasibility step p and the sensitivities Z (`nlp.sweep`);
+One factorisation a timestep gives the feasibility step p and the sensitivities Z (`program.sweep`);
 the step of all variables is (p + Z dq, dq), and dq solves a bounded least-squares problem in the
 few parameters,
 
@@ -27,10 +27,10 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..fem.batched import at_once
-from ..nlp.collocation import Collocation
-from ..nlp.lapack import one_blas_thread
-from ..nlp.sweep import Sweep
+from ..fem.kernels import at_once
+from ..program.collocation import Collocation
+from ..program.lapack import one_blas_thread
+from ..program.sweep import Sweep
 from .curvature import require_second_derivatives
 from .method import Watch
 from .recorder import Recorder

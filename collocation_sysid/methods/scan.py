@@ -23,10 +23,10 @@ import numpy as np
 from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
-from ..nlp.collocation import Collocation, Part
-from ..nlp.newton import NewtonOptions
-from ..nlp.parameters import Parameter, Parameters
-from ..nlp.segment import Segment
+from ..model.parameters import Parameter, Parameters
+from ..program.collocation import Collocation, Part
+from ..program.newton import NewtonOptions
+from ..program.segment import Segment
 from .ladder import SHARES, part_of
 from .start import marched
 

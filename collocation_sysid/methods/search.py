@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array
 from ..checked import Count, Positive
 from ..errors import SimulationError
-from ..nlp.factorisation import Choice
+from ..program.factorisation import Choice
 from .curvature import exact_curvature
 from .horizon import Horizon, Point
 from .ladder import FEWEST, SHARES, Shares, part_of
@@ -21,7 +21,7 @@ from .solution import Iteration, Status
 from .trajectory import Seen
 
 if TYPE_CHECKING:
-    from ..nlp.collocation import Collocation
+    from ..program.collocation import Collocation
     from .workers import Workers
 
 # A trial's infeasibility may be this share of its step's length, or this share of an edge of

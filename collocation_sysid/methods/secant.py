@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ..arrays import Array
-from ..nlp.least_squares import LeastSquares
+from ..program.least_squares import LeastSquares
 from .horizon import Point
 
 # B may not take more than this share of the curvature of SᵀS away in any direction.

@@ -25,8 +25,8 @@ from scipy.optimize import least_squares, minimize
 from ..arrays import Array
 from ..checked import Count, Positive
 from ..errors import SimulationError
-from ..nlp.collocation import Collocation
-from ..nlp.stopwatch import Stopwatch
+from ..program.collocation import Collocation
+from ..program.stopwatch import Stopwatch
 from .horizon import Horizon
 from .method import Watch
 from .multipliers import constraint_multipliers

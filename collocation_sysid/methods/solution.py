@@ -12,9 +12,9 @@ import numpy as np
 
 from ..arrays import Array, root_mean
 from ..errors import SimulationError
-from ..experiment.experiment import Experiment
-from ..nlp.collocation import Collocation, Violation
-from ..nlp.stopwatch import Stopwatch
+from ..program.collocation import Collocation, Violation
+from ..program.stopwatch import Stopwatch
+from ..recording.experiment import Experiment
 from .multipliers import constraint_multipliers
 from .scan import Scan
 
@@ -114,7 +114,7 @@ class Solution:
     method : str
     collocation : Collocation
         The problem that was solved.
-    z : (variables,) the final variables, see `nlp.collocation`
+    z : (variables,) the final variables, see `program.collocation`
     given_multipliers : (constraints,) of g, in the scaling of the NLP, or None
     iterations : int
     history : sequence of Iteration

@@ -8,13 +8,13 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..fem.batched import side_by_side
-from ..nlp.collocation import Collocation, Part
-from ..nlp.marching import march, march_on
-from ..nlp.newton import NewtonOptions, Solver
-from ..nlp.rest import start_state
-from ..nlp.segment import Segment
-from ..nlp.stopwatch import Stopwatch
+from ..fem.kernels import side_by_side
+from ..program.collocation import Collocation, Part
+from ..program.marching import march, march_on
+from ..program.newton import NewtonOptions, Solver
+from ..program.rest import start_state
+from ..program.segment import Segment
+from ..program.stopwatch import Stopwatch
 
 
 def placed_at_guess(collocation: Collocation) -> Collocation:

@@ -12,13 +12,13 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..nlp.collocation import Part
-from ..nlp.least_squares import LeastSquares
-from ..nlp.marching import march_on
-from ..nlp.newton import NewtonOptions
-from ..nlp.reading import as_squares
-from ..nlp.segment import Segment
-from ..nlp.sweep import Sweep, Tangent
+from ..program.collocation import Part
+from ..program.least_squares import LeastSquares
+from ..program.marching import march_on
+from ..program.newton import NewtonOptions
+from ..program.reading import as_squares
+from ..program.segment import Segment
+from ..program.sweep import Sweep, Tangent
 from .start import continued
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is

@@ -16,12 +16,12 @@ from weakref import WeakKeyDictionary
 
 from ..cluster import connected, distributed
 from ..errors import InputError
-from ..experiment.experiment import Experiment
-from ..fem.batched import alone, side_by_side
 from ..fem.body import Body
-from ..nlp.charts import Chart
-from ..nlp.collocation import Collocation
-from ..nlp.segment import Segment
+from ..fem.kernels import alone, side_by_side
+from ..program.charts import Chart
+from ..program.collocation import Collocation
+from ..program.segment import Segment
+from ..recording.experiment import Experiment
 
 T = TypeVar("T")
 # How often it is looked whether there are workers at all.

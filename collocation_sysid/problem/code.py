@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..errors import InputError, hint_at
-from ..experiment.nuisance import NuisanceRow
-from ..experiment.selected import selection
 from ..fem.materials import Energy, Material
 from ..fem.node_force import NodeForce
 from ..files import reason
+from ..recording.nuisance import NuisanceRow
+from ..recording.selected import selection
 from .nuisance_schema import OwnRow
 from .recording import existing_file
 from .schema import CodeSection, NodeForceSection

@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError
-from ..experiment.nuisance import NuisanceRow
-from ..experiment.selected import selection
 from ..fem.body import Body
 from ..fem.constants import constant_named
 from ..fem.materials import Material
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
-from ..nlp.parameters import Parameters, Tied, Unknown
+from ..model.parameters import Parameters, Tied, Unknown
+from ..recording.nuisance import NuisanceRow
+from ..recording.selected import selection
 from ..stated import keys_of
 from ..statistics.plausible import oddities
 from .code import load_force, load_material, load_row
@@ -26,7 +26,13 @@ from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file
 from .recording_schema import LOADS
-from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
+from .schema import (
+    CodeSection,
+    ObjectSection,
+    ParameterSection,
+    PriorSection,
+    ProblemFile,
+)
 
 T = TypeVar("T")
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Optional
 from pydantic import AfterValidator, Discriminator, Field, Tag, create_model, model_validator
 
 from ..checked import Positive, Text
-from ..experiment import Nuisance
-from ..experiment.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
+from ..recording import Nuisance
+from ..recording.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
 from ..section import Section, given_keys
 
 KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}

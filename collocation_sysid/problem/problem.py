@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Literal
 
 from ..errors import InputError
-from ..experiment import Experiment
 from ..fem.body import Body
 from ..methods import METHODS
 from ..methods.described import require_method
 from ..methods.method import Method
-from ..nlp.collocation import Collocation
-from ..nlp.parameters import Parameters, Tied, Unknown
-from ..nlp.schemes import Scheme, as_scheme
-from ..nlp.sharing import locals_of
-from ..nlp.simulation import require_steps
+from ..model.parameters import Parameters, Tied, Unknown
+from ..model.schemes import Scheme, as_scheme
+from ..program.collocation import Collocation
+from ..program.sharing import locals_of
+from ..program.simulation import require_steps
+from ..recording import Experiment
 from ..stated import key, stated
 from ..statistics.plausible import oddities
 from ..statistics.scale import scale_notes

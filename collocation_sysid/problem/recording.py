@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError, hint_at
-from ..experiment import (
+from ..fem.body import Body
+from ..files import require_regular
+from ..methods.scan import usual_constants
+from ..model.parameters import Parameters
+from ..recording import (
     Experiment,
     Grasp,
     Markers,
@@ -27,15 +31,11 @@ from ..experiment import (
     read_poses,
     read_wrench,
 )
-from ..experiment.clock import TIME_TOLERANCE_S
-from ..experiment.coverage import refuse_untold
-from ..experiment.nuisance import NuisanceRow
-from ..experiment.selected import NodesSection, selection
-from ..experiment.wrench_files import within
-from ..fem.body import Body
-from ..files import require_regular
-from ..methods.scan import usual_constants
-from ..nlp.parameters import Parameters
+from ..recording.clock import TIME_TOLERANCE_S
+from ..recording.coverage import refuse_untold
+from ..recording.nuisance import NuisanceRow
+from ..recording.selected import NodesSection, selection
+from ..recording.wrench_files import within
 from ..section import Section
 from ..stated import keys_of
 from ..statistics.modal import doubts

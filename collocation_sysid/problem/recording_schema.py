@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text
-from ..experiment import Force, PointMass, Pressure, Tendon
-from ..experiment.poses import QUATERNION_NORM_TOLERANCE
-from ..experiment.selected import Nodes
+from ..recording import Force, PointMass, Pressure, Tendon
+from ..recording.poses import QUATERNION_NORM_TOLERANCE
+from ..recording.selected import Nodes
 from ..section import Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 

@@ -9,14 +9,8 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..experiment import (
-    MarkerTable,
-    PoseSequence,
-    align_to_template,
-    fit_poses,
-    read_markers,
-)
-from ..experiment.rigid import loosest_marker
+from ..recording import MarkerTable, PoseSequence, align_to_template, fit_poses, read_markers
+from ..recording.rigid import loosest_marker
 from .recording_schema import ExperimentSection, GraspSection, MarkersSection
 
 # A frame is reported when its residual is this many times the usual one, and above rounding.

@@ -15,13 +15,13 @@ import numpy as np
 
 from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
-from ..experiment.experiment import Experiment
-from ..experiment.grasp import Grasp
-from ..experiment.poses import PoseSequence
 from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
-from ..nlp.any_stiffness import Described
+from ..program.any_stiffness import Described
+from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp
+from ..recording.poses import PoseSequence
 from .hypothesis import Hypothesis, Trial, clock, ranked
 from .mistakes import gravity_mistakes
 from .modal import Comparison, doubts

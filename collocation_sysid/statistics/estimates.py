@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.constants import bare, constant_named
-from ..nlp.parameters import Parameter, Parameters
+from ..model.parameters import Parameter, Parameters
 from .linearised import Derived
 
 Mask = NDArray[np.bool_]

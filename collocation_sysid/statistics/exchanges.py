@@ -11,8 +11,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..arrays import Array, Index
-from ..experiment.experiment import Experiment
-from ..nlp.any_stiffness import carrying
+from ..program.any_stiffness import carrying
+from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
 # Another order of the names suits so many times better before it is believed.

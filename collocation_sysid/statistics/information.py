@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array
-from ..nlp.least_squares import LeastSquares
+from ..program.least_squares import LeastSquares
 from .linearised import LinearisedFit
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..nlp.collocation import Collocation
-from ..nlp.parameters import ThetaMap
-from ..nlp.reading import as_weights
+from ..model.parameters import ThetaMap
+from ..program.collocation import Collocation
+from ..program.reading import as_weights
 from .sensitivity import responses
 
 Mask = NDArray[np.bool_]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..nlp.any_stiffness import Described
+from ..program.any_stiffness import Described
 from .hypothesis import Hypothesis
 
 # How many times as large what is given in another unit should be, and the key's value.

@@ -1,8 +1,8 @@
 """Does the description of a recording fit its tracks? Told before solving, for any stiffness.
 
-The markers of bodies of many stiffnesses (`nlp.any_stiffness`) are compared with the tracks: for
-the description as given, and without each of the mistakes that people make. What fits far better
-is named.
+The markers of bodies of many stiffnesses (`program.any_stiffness`) are compared with the tracks:
+for the description as given, and without each of the mistakes that people make. What fits far
+better is named.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Index
 from ..errors import SimulationError
-from ..experiment.experiment import Experiment
-from ..nlp.any_stiffness import Described, Sway, later
+from ..program.any_stiffness import Described, Sway, later
+from ..recording.experiment import Experiment
 from .exchanges import exchanges
 from .hypothesis import Hypothesis, Trial, clock, ranked
 from .mistakes import mistakes

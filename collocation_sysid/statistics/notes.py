@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..fem.constants import SHARE, TAU, bare, is_damping
-from ..nlp.parameters import Parameters
+from ..model.parameters import Parameters
 from .autocorrelation import Dependence
 from .estimates import Estimate
 from .linearised import LinearisedFit

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..arrays import Array
-from ..nlp.collocation import Part
+from ..program.collocation import Part
 from .uncertainty import Uncertainty
 
 

@@ -17,12 +17,12 @@ from scipy.interpolate import CubicSpline, interp1d
 from scipy.special import binom
 
 from ..arrays import Array
-from ..experiment.grasp import Grasp
-from ..experiment.poses import PoseSequence
-from ..nlp.collocation import Collocation, Part
-from ..nlp.lapack import one_blas_thread
-from ..nlp.reaction import HeldForces
-from ..nlp.sweep import Sweep
+from ..program.collocation import Collocation, Part
+from ..program.lapack import one_blas_thread
+from ..program.reaction import HeldForces
+from ..program.sweep import Sweep
+from ..recording.grasp import Grasp
+from ..recording.poses import PoseSequence
 
 # Samples of D η, and the fewest and the memory where bodies are large.
 DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8

@@ -17,7 +17,7 @@ from ..arrays import Array
 from ..errors import InputError, SimulationError
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
-from ..nlp.parameters import Parameter
+from ..model.parameters import Parameter
 from .distributions import chi2_isf
 from .linearised import LinearisedFit
 from .uncertainty import Uncertainty, uncertainty_of

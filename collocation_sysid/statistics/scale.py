@@ -12,11 +12,11 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import listed
-from ..experiment.experiment import Experiment
 from ..fem.body import Body
 from ..fem.constants import DENSITY, bare, is_density, is_modulus, symbol_of
 from ..methods.scan import SOFT_PA, usual_parameters
-from ..nlp.parameters import Parameters, ThetaMap
+from ..model.parameters import Parameters, ThetaMap
+from ..recording.experiment import Experiment
 
 # What is left over of a change of all constants that parameters cannot bring about.
 LEFT = 1e-8

@@ -1,7 +1,7 @@
 """How the trajectory follows the parameters: Z = dx/dp with the equations of motion kept.
 
-From the linearised constraints c_x Z + c_p = 0, solved forward in time by `nlp.sweep`; p are the
-shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
+From the linearised constraints c_x Z + c_p = 0, solved forward in time by `program.sweep`; p are
+the shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array
-from ..fem.batched import side_by_side
-from ..nlp.collocation import Collocation, Part
-from ..nlp.lapack import one_blas_thread
-from ..nlp.reaction import HeldForces
-from ..nlp.sensing import Response
-from ..nlp.sweep import Sweep
+from ..fem.kernels import side_by_side
+from ..program.collocation import Collocation, Part
+from ..program.lapack import one_blas_thread
+from ..program.reaction import HeldForces
+from ..program.sensing import Response
+from ..program.sweep import Sweep
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:

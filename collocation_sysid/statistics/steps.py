@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..arrays import Array
-from ..experiment.experiment import Experiment
-from ..nlp.any_stiffness import carrying
+from ..program.any_stiffness import carrying
+from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
 # A step is so many times what else happens between samples.

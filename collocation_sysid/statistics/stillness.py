@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..experiment.experiment import Experiment
 from ..fem.constants import is_damping
-from ..nlp.parameters import Parameters
+from ..model.parameters import Parameters
+from ..recording.experiment import Experiment
 from .distributions import chi2_isf
 
 # Probability of noise of sigma_m that moves markers more than still ones move.

@@ -14,7 +14,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ..arrays import Array
-from ..nlp.stability import Instability
+from ..program.stability import Instability
 from .concern import Concern, as_said, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import normal_isf

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.constants import constant_named, is_damping
-from ..nlp.collocation import Collocation
-from ..nlp.lapack import one_blas_thread
-from ..nlp.parameters import Parameters
+from ..model.parameters import Parameters
+from ..program.collocation import Collocation
+from ..program.lapack import one_blas_thread
 from .autocorrelation import Dependence, dependence, error_processes, score_covariance
 from .distributions import student_ppf
 from .estimates import (

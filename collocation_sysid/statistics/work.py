@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..experiment.experiment import Experiment
+from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
 # Of load and displacement; noise and hysteresis leave it above zero.

@@ -13,12 +13,12 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
-from ..experiment.wrench import Frame, Wrench
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
-from ..nlp.channel import Forced
-from ..nlp.collocation import Collocation, Part
-from ..nlp.wrench import WrenchReading, without_sensors
+from ..program.channel import Forced
+from ..program.collocation import Collocation, Part
+from ..program.wrench import WrenchReading, without_sensors
+from ..recording.wrench import Frame, Wrench
 from .hypothesis import Hypothesis, Trial
 
 # Residuals up to so many standard deviations need no cause; what is right leaves so much less.

@@ -49,13 +49,12 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.check import check_problem
-from collocation_sysid.experiment import held_nodes
-from collocation_sysid.experiment.nuisance import Nuisance
 from collocation_sysid.fem.moduli import engineering as engineering_moduli
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.nlp.parameters import Parameter, Parameters
-from collocation_sysid.output.style import (
+from collocation_sysid.model.parameters import Parameter, Parameters
+from collocation_sysid.recording import held_nodes
+from collocation_sysid.recording.nuisance import Nuisance
+from collocation_sysid.result.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -66,6 +65,7 @@ from collocation_sysid.output.style import (
     legend,
     new_figure,
 )
+from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.profile import profile_of

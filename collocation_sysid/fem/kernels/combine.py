@@ -1,0 +1,133 @@
+"""Fill sparse values with linear combinations of gathered rows, natively or with NumPy."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Array, Index
+
+
+class Plan(Protocol):
+    """What to combine, see `program.block_band.CombinePlan`."""
+
+    @property
+    def first_task(self) -> Index:
+        """(N + 1,) where each column block's tasks begin and end."""
+        ...
+
+    @property
+    def tasks(self) -> Index:
+        """(tasks, 5) out, map start, map length, row, 1 to add or 0 to overwrite."""
+        ...
+
+    @property
+    def coefficients(self) -> Array:
+        """(tasks, 2) a, b."""
+        ...
+
+    @property
+    def targets(self) -> NDArray[np.int32]:
+        """Concatenated maps: where to write, from out on."""
+        ...
+
+    @property
+    def sources(self) -> NDArray[np.int32]:
+        """Concatenated maps: which entry of the row to read."""
+        ...
+
+
+Combiner = Callable[[int, int, Array, Array, Array], None]
+
+
+def combine_with_numpy(plan: Plan) -> Combiner:
+    """The reference: one fancy-indexed statement a task."""
+
+    def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
+        for task in range(plan.first_task[start], plan.first_task[stop]):
+            out, first, length, row, add = plan.tasks[task]
+            alpha, beta = plan.coefficients[task]
+            target = plan.targets[first : first + length] + out
+            source = plan.sources[first : first + length]
+            new = np.zeros(length)
+            if alpha:
+                new += alpha * a[row, source]
+            if beta:
+                new += beta * b[row, source]
+            values[target] = values[target] + new if add else new
+
+    return combine
+
+
+def combine_natively(plan: Plan) -> Combiner:
+    """The same through a compiled loop."""
+    from .jit import CompiledFunction
+
+    signature = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 7
+    run = CompiledFunction(_emit, "combine", "combine", signature)
+    constants = [
+        array.ctypes.data for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
+    ]
+
+    def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
+        stride = a.strides[0] // a.itemsize
+        tasks = int(plan.first_task[start]), int(plan.first_task[stop])
+        run(*tasks, stride, *constants, a.ctypes.data, b.ctypes.data, values.ctypes.data)
+
+    return combine
+
+
+def _emit() -> Any:
+    from llvmlite import ir
+
+    from .loops import DOUBLES, I32S, I64, counting
+
+    module = ir.Module()
+    i64s = I64.as_pointer()
+    kind = ir.FunctionType(
+        ir.VoidType(), [I64, I64, I64, i64s, DOUBLES, I32S, I32S, DOUBLES, DOUBLES, DOUBLES]
+    )
+    function = ir.Function(module, kind, "combine")
+    start, stop, stride, tasks, coefficients, targets, sources, a, b, values = function.args
+    for pointer in function.args[3:]:
+        pointer.add_attribute("noalias")
+    builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
+    with counting(builder, start, stop, "task") as task:
+        first = builder.mul(task, I64(5))
+        out, begin, length, row, add = (
+            builder.load(builder.gep(tasks, [builder.add(first, I64(k))])) for k in range(5)
+        )
+        pair = builder.mul(task, I64(2))
+        alpha, beta = (
+            builder.load(builder.gep(coefficients, [builder.add(pair, I64(k))])) for k in range(2)
+        )
+        row_start = builder.mul(row, stride)
+        a_row, b_row = (builder.gep(matrix, [row_start]) for matrix in (a, b))
+        out_row = builder.gep(values, [out])
+        targets_here, sources_here = (builder.gep(m, [begin]) for m in (targets, sources))
+
+        def loop(accumulate: bool) -> None:
+            with counting(builder, I64(0), length, "entry") as i:
+                source = builder.sext(builder.load(builder.gep(sources_here, [i])), I64)
+                target = builder.sext(builder.load(builder.gep(targets_here, [i])), I64)
+                new = builder.fadd(
+                    builder.fmul(alpha, builder.load(builder.gep(a_row, [source]))),
+                    builder.fmul(beta, builder.load(builder.gep(b_row, [source]))),
+                    flags=["contract"],
+                )
+                address = builder.gep(out_row, [target])
+                if accumulate:
+                    new = builder.fadd(builder.load(address), new)
+                builder.store(new, address)
+
+        with builder.if_else(builder.icmp_signed("==", add, I64(0))) as (overwrite, accumulate):
+            with overwrite:
+                loop(accumulate=False)
+            with accumulate:
+                loop(accumulate=True)
+    builder.ret_void()
+    return module

@@ -1,0 +1,228 @@
+"""All forces on a body at some times: F(ξ, ν; u) = f(ξ, ν; θ) + Σ terms.
+
+Whatever acts on the body of an experiment joins here, and nothing else adds forces: the internal
+ones f of its materials and dampings, see `fem.body`, `weight`, and the `potential` of each tendon
+and pressure. Slopes are on the pattern of all couplings; slopes by θ go on with those by the other
+inputs u, term by term, see `inputs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Array, Index
+from ..fem.body import Body, Curvature, Linearisation
+from ..fem.memory import Past
+from ..fem.model import Theta
+from ..fem.pattern import Joined, SymmetricPattern
+from ..recording.experiment import Experiment
+from .force_term import ForceTerm, Places, States
+from .point_forces import point_forces
+from .potential import Potential
+from .weight import Mass, Weight
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """The forces on a body at T times.
+
+    States ξ, ν are (T, 3n) positions [m] and velocities [m/s], or one (3n,) where T is one.
+
+    Attributes
+    ----------
+    weight : Weight
+    further : tuple of ForceTerm
+    joined : Joined
+        The mesh graph, and the couplings of the further terms that have some.
+    """
+
+    weight: Weight
+    further: tuple[ForceTerm, ...]
+    joined: Joined
+
+    @classmethod
+    def of(cls, experiment: Experiment, t_s: ArrayLike) -> Forces:
+        """Those of an experiment at the times `t_s` (T,)."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        potentials = tuple(
+            Potential(actuator.measure, actuator.amplitude(times)[:, None])
+            for actuator in experiment.actuators
+        )
+        further = (*potentials, *point_forces(experiment.body, times))
+        return cls(Weight.of(experiment, times), further, experiment.joined)
+
+    @classmethod
+    def on(cls, body: Body) -> Forces:
+        """Those on a body that nothing acts on but what is its own, at one time."""
+        own = point_forces(body, np.zeros(1))
+        return cls(Weight.none(body), own, body.joined_with(()))
+
+    @property
+    def body(self) -> Body:
+        """What they act on."""
+        return self.weight.body
+
+    @property
+    def mass(self) -> Mass:
+        """What gravity pulls at and γ_m damps."""
+        return self.weight.mass
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Of the slopes."""
+        return self.joined.pattern
+
+    @cached_property
+    def terms(self) -> tuple[ForceTerm, ...]:
+        """Beside what is internal."""
+        return (self.weight, *self.further)
+
+    def _rates(self, times: int) -> Array:
+        """Room for the curvature by velocities, where forces may have some."""
+        return np.zeros((times, self.pattern.entries if self.body.forces else 0))
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        """Where the inputs of each term begin in u, and where the last end."""
+        sizes = [term.size for term in self.terms]
+        return list(accumulate(sizes, initial=len(self.body.constants)))
+
+    @cached_property
+    def mass_by_input(self) -> dict[int, Array]:
+        """∂M/∂u (3n,) of each input, by its place in u, that M depends on."""
+        return self.weight.mass_by_input(self._ends[0])
+
+    def at(self, u: Array) -> Forces:
+        """The same at inputs (T, U)."""
+        if len(self.body.constants) == self._ends[-1]:
+            return self
+        weight, *further = (
+            term.at(u[:, start:stop])
+            for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
+        )
+        return replace(self, weight=weight, further=tuple(further))
+
+    def rows(self, rows: slice) -> Forces:
+        """The same at some of the times."""
+        further = tuple(term.rows(rows) for term in self.further)
+        return replace(self, weight=self.weight.rows(rows), further=further)
+
+    def scaled(self, share: float) -> Forces:
+        """The same with a share of what acts, on the same mass."""
+        further = tuple(term.scaled(share) for term in self.further)
+        return replace(self, weight=self.weight.scaled(share), further=further)
+
+    def towards(self, other: Forces, share: float) -> Forces:
+        """The same with a share of the way to what acts at other times."""
+        further = tuple(
+            term.towards(that, share)
+            for term, that in zip(self.further, other.further, strict=True)
+        )
+        return replace(self, weight=self.weight.towards(other.weight, share), further=further)
+
+    def undriven(self) -> Forces:
+        """The same without tensions and pressures."""
+        return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
+
+    def external_n(self, theta: Theta) -> Array:
+        """(T, 3n) those that do not depend on the state: weight, and forces on nodes."""
+        return self.weight.force(States(np.zeros(0), np.zeros(0), np.asarray(theta)))
+
+    def total(self, xi: Array, nu: Array, theta: Theta, carried: Past | None = None) -> Array:
+        """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
+        found = self.body.force(xi, nu, theta, self.mass.tied, carried)
+        states = self._states(xi, nu, theta)
+        for term in self.terms:
+            found = found + term.force(states)
+        return found
+
+    def linearise(
+        self,
+        xi: Array,
+        nu: Array,
+        theta: Theta,
+        out: Array | None = None,
+        carried: Past | None = None,
+    ) -> Linearisation:
+        """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
+        at = self.body.linearise(xi, nu, theta, out, self.mass.tied, carried)
+        if self.further or self._ends[-1] > len(theta):
+            spread = self.joined.spread
+            at = Linearisation(
+                at.force,
+                spread(at.by_position),
+                spread(at.by_velocity),
+                self._widened(at.by_theta),
+                spread(at.by_position_skew),
+            )
+        states = self._states(xi, nu, theta)
+        for term, places in self._placed:
+            term.add_slopes(at, places, states)
+        return at
+
+    @property
+    def linearisation_width(self) -> int:
+        """Length of one time's row of `linearise`."""
+        return self.body.linearisation_width
+
+    def curvature(
+        self,
+        xi: Array,
+        nu: Array,
+        weights: Array,
+        theta: Theta,
+        out: Array | None = None,
+        carried: Past | None = None,
+        stress_weights: Array | None = None,
+    ) -> Curvature:
+        """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
+        tied = self.mass.tied
+        at = self.body.curvature(xi, nu, weights, theta, out, tied, carried, stress_weights)
+        if self.further or self._ends[-1] > len(theta):
+            spread, widened = self.joined.spread, self._widened
+            at = Curvature(
+                spread(at.position_position),
+                spread(at.position_velocity),
+                widened(at.position_theta),
+                widened(at.velocity_theta),
+                widened(widened(at.theta_theta).swapaxes(1, 2)),
+                widened(at.theta),
+                spread(at.position_velocity_skew),
+                self._rates(len(at.theta)),
+            )
+        states = self._states(xi, nu, theta)
+        for term, places in self._placed:
+            term.add_curvature(at, places, states, weights.reshape(states.xi.shape))
+        return at
+
+    @property
+    def curvature_width(self) -> int:
+        """Length of one time's row of `curvature`."""
+        return self.body.curvature_width
+
+    def _states(self, xi: Array, nu: Array, theta: Theta) -> States:
+        size = self.body.pattern.size
+        return States(xi.reshape(-1, size), nu.reshape(-1, size), np.asarray(theta))
+
+    @cached_property
+    def _placed(self) -> list[tuple[ForceTerm, Places]]:
+        """Every term, and where what it adds goes."""
+        entries: Iterator[Index] = iter(self.joined.places[1:])
+        nowhere: Index = np.zeros(0, dtype=np.int64)
+        return [
+            (term, Places(slice(start, stop), nowhere if term.couplings is None else next(entries)))
+            for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
+        ]
+
+    def _widened(self, by_theta: Array) -> Array:
+        """(…, U) slopes by θ with room for those by the inputs of the terms."""
+        further = self._ends[-1] - len(self.body.constants)
+        if not further:
+            return by_theta
+        return np.concatenate([by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1)

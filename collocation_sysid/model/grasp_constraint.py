@@ -1,0 +1,138 @@
+"""Where the grasps hold a body's dofs, as a function of how it is off in them.
+
+A grasped node is at U_t H(φ) X, see `nuisance`, along the axes that are held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import Array, Index
+from ..recording.experiment import Experiment
+from ..recording.grasp import held_dofs
+from .nuisance import NuisanceMap
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Goals of the dofs that are grasped at some time, on the time grid.
+
+    Attributes
+    ----------
+    dofs : (g,) ascending
+    positions_m : (N, g) NaN while free
+    by_phi : (N, g, m) derivatives by the φ that move the body, zero while free; m = 0 where none
+        of them moves the grasps
+    """
+
+    dofs: Index
+    positions_m: Array
+    by_phi: Array
+
+    @property
+    def moves(self) -> bool:
+        """Whether the goals depend on φ."""
+        return self.by_phi.shape[2] > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Grasping:
+    """The grasps of an experiment on its time grid.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    nuisance : NuisanceMap
+    t_s : (N,)
+    """
+
+    experiment: Experiment
+    nuisance: NuisanceMap
+    t_s: Array
+
+    @cached_property
+    def dofs(self) -> Index:
+        """(g,) dofs that are grasped at some time."""
+        return held_dofs(self.experiment.grasps)
+
+    def at(self, phi: Array) -> Held:
+        """The goals at φ."""
+        if not self.nuisance.moves_grasps:
+            return self._fixed
+        places, slopes = self.places(phi)
+        turns, shifts = self._poses
+        by_phi = self._zeros + np.einsum("tgj,gjk->tgk", turns, slopes)
+        positions = np.einsum("tgj,gj->tg", turns, places) + shifts
+        positions += self._zeros @ phi[self.nuisance.moving]
+        by_phi[np.isnan(positions)] = 0.0
+        return Held(self.dofs, positions, by_phi)
+
+    def places(self, phi: Array) -> tuple[Array, Array]:
+        """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
+        places, by_own = self.nuisance.in_grasps.slopes(*self._instances(phi))
+        slopes = np.zeros((3, len(self.nuisance.moving), places.shape[1]))
+        slopes[:, self._columns] = by_own
+        return places.T[self._node], np.moveaxis(slopes, 2, 0)[self._node]
+
+    def curvature(self, phi: Array, weights: Array) -> Array:
+        """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
+        u, points = self._instances(phi)
+        pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._poses[0]), weights)
+        of_nodes = np.zeros_like(points.T)
+        np.add.at(of_nodes, self._node, pulled)
+        found = np.zeros((len(self.nuisance.moving),) * 2)
+        second = self.nuisance.in_grasps.curvature(u, points, of_nodes.T).sum(axis=2)
+        found[np.ix_(self._columns, self._columns)] = second
+        return found
+
+    def _instances(self, phi: Array) -> tuple[Array, Array]:
+        """φ and X of the grasped nodes."""
+        points = self.experiment.body.nodes_m[self._nodes[0]].T
+        return np.repeat(phi[self.nuisance.of_grasps, None], points.shape[1], axis=1), points
+
+    @cached_property
+    def _zeros(self) -> Array:
+        """(N, g, m) by how much goals move with the zeros of displacements."""
+        found = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
+        for number, grasp in enumerate(self.experiment.grasps):
+            rows = np.flatnonzero(grasp.holds(self.t_s))
+            for axis, place in zip(grasp.zero, self.nuisance.zero(number), strict=False):
+                along = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
+                column = np.flatnonzero(self.nuisance.moving == place)
+                found[np.ix_(rows, along, column)] = self.nuisance.scales[place]
+        return found
+
+    @cached_property
+    def _nodes(self) -> tuple[Index, Index]:
+        """Nodes that are grasped at some time, and of each dof the place of its node in them."""
+        nodes, places = np.unique(self.dofs // 3, return_inverse=True)
+        return nodes, places
+
+    @property
+    def _node(self) -> Index:
+        return self._nodes[1]
+
+    @property
+    def _columns(self) -> Index:
+        """Among the φ that move the body, those that move it in its grasps."""
+        return np.flatnonzero(np.isin(self.nuisance.moving, self.nuisance.of_grasps))
+
+    @cached_property
+    def _fixed(self) -> Held:
+        held = self.experiment.grasped(self.t_s)[1].reshape(len(self.t_s), -1)
+        return Held(self.dofs, held[:, self.dofs], np.zeros((len(held), len(self.dofs), 0)))
+
+    @cached_property
+    def _poses(self) -> tuple[Array, Array]:
+        """Of each dof its row of U_t, (N, g, 3) and (N, g), NaN while free."""
+        turns, shifts = (np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ()))
+        for grasp in self.experiment.grasps:
+            here = np.flatnonzero(grasp.holds(self.t_s))
+            place, axis = np.searchsorted(self.dofs, grasp.dofs), grasp.dofs % 3
+            turned, moved = grasp.poses.at(self.t_s[here])
+            turns[np.ix_(here, place)] = turned[:, axis]
+            shifts[np.ix_(here, place)] = moved[:, axis]
+        return turns, shifts

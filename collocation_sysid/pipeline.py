@@ -1,0 +1,224 @@
+"""One run: solve a problem, verify the answer by simulating forward, and find the error bars."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .errors import InputError, SimulationError
+from .methods.method import Method, Watch
+from .methods.solution import Solution, Status
+from .methods.start import marched
+from .methods.workers import workers_of
+from .model.schemes import as_scheme
+from .problem import Problem
+from .recording.turning import turning_warnings
+from .runs.answer import Answer
+from .runs.check.ram import require_memory
+from .runs.forward_simulation import roll_outs, step_error
+from .runs.refine import refine
+from .runs.solving import read_where_found, shared, solve
+from .runs.warm_start import Earlier
+from .statistics.causes import likely_causes
+from .statistics.diagnostics import diagnose
+from .statistics.linearised import linearised_fit
+from .statistics.numerical import MOST_SUBSTEPS
+from .statistics.pose_noise import pose_noise_draws
+from .statistics.profile import Profile, profile_of
+from .statistics.uncertainty import uncertainty_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes a while to import
+
+Log = Callable[[str], None]
+
+
+class Run(Answer):
+    """A solved problem with its checks, as it is looked at and kept; see `Answer`."""
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """Parameters, intervals, what these hold, and the verdict, as the terminal shows them."""
+        from .display import plain_text
+        from .result.terminal import answer  # how it looks is no part of a run
+
+        return plain_text(answer(self))
+
+    def plot(
+        self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
+    ) -> Figure:
+        """Draw the body as it moved, fitted or else simulated with the answer, and its markers.
+
+        Parameters
+        ----------
+        experiment : str, optional
+            By default the first.
+        field : {"von_mises_pa", "energy_density_j_m3", "det_f"} or None
+            What colours it, element by element; None for its regions.
+        count : int
+            How many shapes, from the first sample to the last; 20 at most.
+
+        Returns
+        -------
+        Figure
+            Of matplotlib. A notebook shows it, ``savefig`` writes it.
+
+        Raises
+        ------
+        InputError
+            For an unknown experiment or field, a count that cannot be, or a run without motion.
+        """
+        from .result.animation import chosen  # how it looks is no part of a run
+        from .result.portrait import portrait
+        from .result.record import replays
+
+        replay = chosen(replays(self), experiment)
+        bodies = {each.name: each.body for each in self.problem.experiments}
+        return portrait(replay, bodies[replay.name], self.parameters, field, count)
+
+    def save(self, folder: str | Path, frames: bool = True) -> Path:
+        """Write the run folder, whole or not at all, and return it.
+
+        Raises
+        ------
+        InputError
+            If there is anything but an earlier run.
+        """
+        from .result.record import write_run  # what files hold is no part of a run
+
+        return write_run(self, folder, frames)
+
+
+def run(
+    problem: Problem,
+    method: str | Method | None = None,
+    watch: Watch | None = None,
+    log: Log | None = None,
+    start: str | Path | Earlier | None = None,
+    seek_causes: bool = True,
+    scheduler: str | None = None,
+) -> Run:
+    """Solve a problem, simulate every experiment with the answer, and find the error bars.
+
+    Once there is an answer, Ctrl-C ends what comes after it: `Run.missing` says what is left out.
+
+    Parameters
+    ----------
+    problem : Problem
+    method, watch, start, scheduler
+        See `solve`.
+    log : callable, optional
+        Called with what is being done now, a text.
+    seek_causes : bool
+        Whether a misfit's cause is looked for, see `likely_causes`.
+
+    Raises
+    ------
+    InputError
+        As `solve` does.
+    """
+    say = log or (lambda _: None)
+    found = Run(problem, solve(problem, method, watch, start, scheduler), {}, None)
+    missing = "no forward simulation has checked the answer, and there are no error bars"
+    try:
+        found = _checked(problem, found.solution, say)
+        missing = "what comes after the error bars is left out: finer steps, causes of the misfit"
+        if problem.substeps == "auto":
+            found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
+        substeps = found.solution.collocation.substeps
+        turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
+        found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
+        if not seek_causes or found.solution.status is Status.INTERRUPTED:
+            return found
+        say("looking for causes of the misfit")
+        found = replace(found, causes=likely_causes(found.solution))
+        if problem.uncertainty.numerical and found.uncertainty is not None:
+            return refine(found, say=say)
+        return found
+    except KeyboardInterrupt:
+        unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
+        return replace(found, rollouts=unsimulated | dict(found.rollouts), missing=missing)
+
+
+def _checked(problem: Problem, solution: Solution, say: Log) -> Run:
+    """A solution simulated forward, with its error bars, where there are any."""
+    say("checking the answer by a forward simulation")
+    rollouts = roll_outs(problem, solution)
+    if not solution.status.converged:
+        return Run(problem, solution, rollouts, None)
+    say("finding the error bars")
+    try:
+        fit = linearised_fit(solution.collocation, solution.z)
+        say("finding what noise of the poses does")
+        extra, noises = pose_noise_draws(solution.collocation, solution.z)
+    except SimulationError as error:
+        return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",))
+    found = Run(problem, solution, rollouts, None, diagnose(fit, extra))
+    if not solution.collocation.nq:
+        return found
+    options = problem.uncertainty
+    try:
+        uncertainty = uncertainty_of(
+            fit, solution.collocation.parameters, solution.q, options.noise, options.errors, extra
+        )
+    except InputError as error:
+        raise error.located(problem.path) from error
+    found = replace(found, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
+    estimates = found.noise_estimates
+    return replace(found, refinement=step_error(problem, solution, fit, rollouts, estimates))
+
+
+def _profiles(found: Run, say: Log) -> tuple[Profile, ...]:
+    """The profile likelihoods that are asked for."""
+    asked, profiles = found.problem.uncertainty.profile, []
+    if found.uncertainty is None or not asked:
+        return ()
+    fit = linearised_fit(found.solution.collocation, found.solution.z)
+    for name in asked:
+        say(f"profile likelihood of {name}")
+        try:
+            profiles.append(profile_of(found.solution, fit, found.uncertainty, name))
+        except InputError as error:
+            raise error.located(found.problem.path) from error
+    return tuple(profiles)
+
+
+def _fine_enough(
+    coarse: Run, solver: Method, watch: Watch | None, say: Log, scheduler: str | None
+) -> Run:
+    """The run again from its answer, with as many substeps as its error bars ask for."""
+    if coarse.refinement is None:
+        return coarse
+    first, problem = coarse.solution, coarse.problem
+    substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
+    if substeps == 1:
+        return coarse
+    say(f"solving again with {substeps} steps a sample")
+    worst, many = coarse.refinement.worst(coarse.noise_estimates)
+    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
+    again = replace(first.collocation, substeps=substeps)
+    p, _ = first.collocation.unpack(first.z)
+    try:
+        require_memory(problem, again, solver)
+        positions, failure = marched(again, p)
+        if failure is not None:
+            raise failure
+        with workers_of(scheduler) as workers:
+            finer = read_where_found(
+                shared(solver, workers), again, watch, again.pack(p, positions)
+            )
+        message = finer.message
+    except (InputError, SimulationError) as error:
+        finer, message = None, str(error)
+    if finer is not None and finer.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt  # the first answer is whole
+    if finer is None or not finer.status.converged:
+        note = f"{why}; with {substeps} it was not solved: {message}"
+        return replace(coarse, notes=(note, *coarse.notes))
+    most = ", the most that are chosen" if substeps == MOST_SUBSTEPS else ""
+    said = f"{why}; so it was solved again with {substeps}{most}"
+    return _checked(problem, finer.after(first, said), say)

@@ -1,0 +1,259 @@
+"""Which model to use: what each predicts of recordings it has not seen, and Akaike's criterion.
+
+Prediction counts. Models miss the same samples, with the same noise, so their misses are compared
+block by block in time; how much the difference scatters between blocks, and the logarithm of the
+ratio between recordings, tells how sure it is (Diebold & Mariano 1995, with means of batches). The
+model with the fewest parameters that predicts as well as the best, within one standard error, is
+taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import exp, log, sqrt
+from typing import Any
+
+import numpy as np
+
+from ..fem.constants import bare, symbol_of
+from ..statistics.evidence import Evidence
+from .store import Record
+from .study import PlannedRun
+from .table import Row
+
+# Predictions nearer than this, as a logarithm, are alike whatever the scatter.
+ALIKE = 0.01
+# ΔAIC beyond which a model has hardly any support, and below which it has as much (Burnham &
+# Anderson 2002, section 2.6); and standard errors of a prediction.
+NO_SUPPORT, SUPPORT = 10.0, 2.0
+SURE, LIKELY = 2.0, 1.0
+# Ratio of small-strain stiffnesses beyond which models that predict alike disagree.
+APART = 1.05
+
+
+def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> list[Row]:
+    """One row for each model, in their order; None where there is no number."""
+    of_model: dict[str, dict[str, Any]] = {}
+    for run in planned:
+        fit = (records.get(run.key) or {}).get("model") or {}
+        of_model.setdefault(run.swept["model"], {})[run.held_out or ""] = fit
+    rows = [_row(label, fits) for label, fits in of_model.items()]
+    _add_criterion(rows)
+    _add_ratios(rows)
+    chosen = chosen_row(rows)
+    for row in rows:
+        row["chosen"] = row is chosen
+    return rows
+
+
+def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Of a model's fits, to all recordings and to all but each."""
+    whole = fits.get("", {})
+    predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
+    evidence, free = whole.get("evidence"), whole.get("free")
+    unit = next((each["unit"] for each in predictions.values() if each), "m")
+    return {
+        "model": label,
+        "status": whole.get("status", "missing"),
+        "converged": bool(whole.get("converged")),
+        "free": None if free is None else len(free),
+        "unit": unit,
+        "rms": (whole.get("rms") or {}).get(unit),
+        "held_out_rms": _pooled([*predictions.values()]),
+        "predictions": {name: each.get("rms") for name, each in predictions.items()},
+        "blocks": {name: each.get("blocks") for name, each in predictions.items()},
+        "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
+        "evidence": evidence,
+        "parameters": whole.get("parameters") or {},
+        "total_s": sum(each.get("time_s") or 0.0 for each in fits.values()),
+    }
+
+
+def _pooled(predictions: Sequence[Mapping[str, Any]]) -> float | None:
+    if not predictions or any(each.get("rms") is None for each in predictions):
+        return None
+    if len({each["unit"] for each in predictions}) > 1:
+        return None  # metres and newtons have no common measure
+    samples = sum(each["samples"] for each in predictions)
+    return sqrt(sum(each["samples"] * each["rms"] ** 2 for each in predictions) / samples)
+
+
+def _add_criterion(rows: Sequence[Row]) -> None:
+    """ΔAIC, with as many independent measurements as the best fit's errors are worth."""
+    known = [row for row in rows if row["converged"] and row["evidence"]]
+    evidences = [Evidence(**row["evidence"]) for row in known]
+    best = min(evidences, key=lambda e: e.misfit, default=None)
+    values = [e.criterion(best.independent) for e in evidences] if best else []
+    for row in rows:
+        row["independent"] = best.independent if best else None
+        row["delta_aic"] = None
+    for row, value in zip(known, values, strict=True):
+        row["delta_aic"] = value - min(values)
+
+
+def _add_ratios(rows: Sequence[Row]) -> None:
+    """The logarithm of how many times worse than the best each predicts, and its standard error."""
+    best = _best_prediction(rows)
+    for row in rows:
+        row["log_ratio"] = row["log_ratio_error"] = None
+        if best is None or row["held_out_rms"] is None:
+            continue
+        names = [name for name, rms in best["predictions"].items() if rms]
+        logs = [log(row["predictions"][name] / best["predictions"][name]) for name in names]
+        row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
+        row["log_ratio_error"] = _error(row, best, logs)
+
+
+def _error(row: Row, best: Row, logs: Sequence[float]) -> float:
+    """Standard error of the logarithm, from blocks in time or from recordings if that is more."""
+    if row is best:
+        return 0.0
+    pairs = [(row["blocks"][name], best["blocks"][name]) for name in best["blocks"]]
+    missed, least = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    change = missed - least
+    # d ln √(a/b) = (a − b) / (a + b) to first order
+    of_sum = float(np.std(change, ddof=1)) * sqrt(len(change))
+    between = float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
+    return max(between, of_sum / float(np.sum(missed + least)))
+
+
+def _best_prediction(rows: Sequence[Row]) -> Row | None:
+    predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
+    return min(predicted, key=lambda r: r["held_out_rms"], default=None)
+
+
+def chosen_row(rows: Sequence[Row]) -> Row | None:
+    """The model to use; None if none could be fitted."""
+    best = _best_prediction(rows)
+    if best is None:
+        fitted = [row for row in rows if row["delta_aic"] is not None]
+        return min(fitted, key=lambda r: r["delta_aic"], default=None)
+    as_good = [
+        row
+        for row in rows
+        if row["converged"]
+        and row["log_ratio"] is not None
+        and row["log_ratio"] <= max(ALIKE, LIKELY * row["log_ratio_error"])
+    ]
+    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
+
+
+def advice(rows: Sequence[Row]) -> str:
+    """Which model to use, why, and how sure that is, in a sentence or two."""
+    chosen = next((row for row in rows if row["chosen"]), None)
+    if chosen is None:
+        return "No model could be fitted."
+    others = [row for row in rows if row is not chosen and row["converged"]]
+    use = f"Use {chosen['model']}"
+    if not others:
+        return f"{use}: no other could be fitted."
+    if chosen["held_out_rms"] is None:
+        rival = min(others, key=lambda row: row["delta_aic"])
+        return (
+            f"{use}, by AIC alone, for nothing could be predicted: ΔAIC of {rival['model']} is "
+            f"{rival['delta_aic']:.3g}."
+        )
+    predicted = [row for row in others if row["log_ratio"] is not None]
+    lost = [_lost(row, chosen) for row in others if row["log_ratio"] is None]
+    if not predicted:
+        return " ".join([f"{use}: no other predicts what is held out.", *lost])
+    rival = min(predicted, key=lambda row: row["log_ratio"])
+    said = [f"{use}: {_compared(chosen, rival)}.", _sureness(chosen, rival), *lost]
+    return " ".join([*said, *_stiffness_told([chosen, *predicted])])
+
+
+def _stiffness_told(rows: Sequence[Row]) -> list[str]:
+    """How far the models that predict as well as the best disagree about E at small strain."""
+    alike = [r for r in rows if r["log_ratio"] <= max(ALIKE, SURE * r["log_ratio_error"])]
+    said = []
+    for name in dict.fromkeys(n for r in alike for n in r["parameters"] if bare(n) == "young_pa"):
+        values = [r["parameters"][name] for r in alike if r["parameters"].get(name)]
+        low, high = min(values, default=1.0), max(values, default=1.0)
+        if high > APART * low:
+            said.append(
+                f"By those that predict alike, {symbol_of(name)} is {low:.3g} to {high:.3g} Pa: "
+                "these recordings do not tell it better."
+            )
+    return said
+
+
+def _lost(row: Row, chosen: Row) -> str:
+    """On a model that what is held out cannot be predicted with."""
+    without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
+    said = f"{row['model']} does not predict {without}"
+    if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
+        return f"{said}."
+    return (
+        f"{said}, but fits all better (AIC is {more:.3g} for it): what its parameters need was "
+        "seen there alone, and more such recordings would decide."
+    )
+
+
+def _compared(chosen: Row, rival: Row) -> str:
+    missed = f"it misses what is held out by {_size(chosen)}"
+    ratio, error = _between(chosen, rival)
+    more = chosen["free"] - rival["free"]
+    count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
+    size = f" with {count} {'more' if more > 0 else 'fewer'}" if more else ""
+    support = rival["delta_aic"] - chosen["delta_aic"]
+    side = "for it" if support > 0 else "against it"
+    return (
+        f"{missed}{size}, {rival['model']} by {_size(rival)}, "
+        f"{exp(ratio):.3g} times as much (±{100 * error:.2g} %), and AIC is "
+        f"{abs(support):.3g} {side}"
+    )
+
+
+def _size(row: Row) -> str:
+    """What a model misses of what is held out."""
+    factor, unit = shown_in(row["unit"])
+    return f"{factor * row['held_out_rms']:.3g} {unit}"
+
+
+def shown_in(unit: str) -> tuple[float, str]:
+    """The factor and the unit that people see metres or newtons in."""
+    return (1e3, "mm") if unit == "m" else (1.0, unit)
+
+
+def _between(chosen: Row, rival: Row) -> tuple[float, float]:
+    """The logarithm of how many times worse the rival predicts, and its standard error."""
+    ratio = rival["log_ratio"] - chosen["log_ratio"]
+    return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
+
+
+def _sureness(chosen: Row, rival: Row) -> str:
+    ratio, error = _between(chosen, rival)
+    support = rival["delta_aic"] - chosen["delta_aic"]
+    if ratio > SURE * error and support > NO_SUPPORT:
+        return "That is sure, as far as these recordings go."
+    if ratio > LIKELY * error and support > SUPPORT:
+        return "That is likely, but not sure."
+    if support < -NO_SUPPORT:
+        return (
+            f"{rival['model']} fits better, but does not predict better: more recordings, or "
+            "larger motions, would decide."
+        )
+    return (
+        "These recordings hardly tell them apart: of models that predict alike the one with the "
+        "fewest parameters is taken."
+    )
+
+
+def model_notes(rows: Sequence[Row]) -> list[str]:
+    """How to read the table, and what failed."""
+    names = rows[0]["predictions"]
+    kept = "each recording in turn" if len(names) > 1 else "the last third of the recording"
+    counted = rows[0]["independent"]
+    evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
+    worth = ""
+    if counted is not None and evidence is not None:
+        worth = f" The {evidence['measurements']} measurements are worth {counted:.0f} independent."
+    return [
+        f"Held out is {kept}; ± is the standard error of the ratio to the best.{worth}",
+        *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
+        *(
+            f"{row['model']} without '{name}': {why}"
+            for row in rows
+            for name, why in row["failures"].items()
+        ),
+    ]

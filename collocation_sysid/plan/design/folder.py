@@ -1,0 +1,211 @@
+"""The folder of a design: the poses, what they are predicted to tell, and a problem to record."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from ...problem.schema import ProblemFile, completed
+from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
+from ...result.animation import film
+from ...result.pictures.album import save_pictures
+from ...result.replay import Replay
+from ...result.writers import run_folder
+from ...tree import as_json, content
+from .designing import Bars, Design
+from .pictures import pictures
+
+DESIGN_FILE, POSES_FILE, MARKERS_FILE = "design.json", "poses.csv", "predicted_markers.csv"
+WRENCH_FILE, PROBLEM_FILE, FILM_FILE = "predicted_wrench.csv", "problem.toml", "motion.gif"
+NAME = "designed"
+SCHEMA = 1
+FRAMES_PER_SECOND = 25.0
+# What says how the files of a recording are read; those of a design are in the package's own form.
+OF_POSES = (
+    "poses",
+    "displacement",
+    "markers",
+    "weights",
+    "max_residual_m",
+    "quaternion",
+    "length_unit",
+    "interpolation",
+)
+OF_MARKERS = (
+    "names",
+    "labels",
+    "length_unit",
+    "rate_hz",
+    "template_m",
+    "template_window_s",
+    "max_template_residual_m",
+)
+# Whose texts are files, wherever they stand.
+OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pressure")
+OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
+OF_TIME = ("window_s", "resample_hz", "every", "validation")
+HEAD = """\
+# A designed motion, poses.csv, and what is predicted to be seen of it at the parameters' guesses.
+# Record it, and put the recorded files in the place of poses.csv and predicted_markers.csv.
+
+"""
+
+
+def write_design(
+    design: Design, folder: str | Path, with_film: bool = True, say: Callable[[str], None] = print
+) -> Path:
+    """Write the folder, whole or not at all, and return it.
+
+    Raises
+    ------
+    InputError
+        If there is anything but an earlier design.
+    """
+    target = Path(folder)
+    with run_folder(target, mark=DESIGN_FILE, what="design") as place:
+        write_poses_csv(place / POSES_FILE, _of_gripper(design))
+        experiment = design.experiment
+        markers = experiment.markers
+        write_markers_csv(place / MARKERS_FILE, markers.t_s, markers.names, markers.positions_m)
+        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+        for sensor, wrench in zip(sensors, design.predicted.wrenches, strict=True):
+            write_wrench_csv(place / WRENCH_FILE, sensor.t_s, wrench)
+        if design.recording.problem.origin is not None:
+            text = HEAD + tomli_w.dumps(_content(design, target.resolve()))
+            (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
+        save_pictures(place, pictures(design))
+        if with_film:
+            say("filming the motion")
+            shapes_m = design.predicted.positions_m
+            replay = Replay.of(experiment, (shapes_m, markers.positions_m))
+            film(replay, place / FILM_FILE, FRAMES_PER_SECOND, names=("predicted", ""))
+        (place / DESIGN_FILE).write_text(as_json(as_dict(design)), encoding="utf-8")
+    return target
+
+
+def as_dict(design: Design) -> dict[str, Any]:
+    """What design.json holds."""
+    search, limits = design.best, design.limits
+    return {
+        "schema": SCHEMA,
+        "experiment": design.recording.template.name,
+        "duration_s": design.experiment.duration_s,
+        "samples": len(design.experiment.t_s),
+        "criterion": {
+            "kind": design.criterion.kind,
+            "for": list(design.criterion.names),
+            "over": design.criterion.over,
+            "draws": design.draws,
+            "relative_error": design.size,
+        },
+        "recordings_count": design.added,
+        "before": None if design.before is None else _bars(design.before),
+        "after": _bars(design.after),
+        "limits": {
+            name: {"limit": getattr(limits, name), "share_used": share}
+            for name, share in design.shares.items()
+        },
+        "limits_reached": design.reached,
+        "search": {
+            "evaluations": len(search.history),
+            "interrupted": search.interrupted,
+            "history": [float(np.exp(min(value, 100.0))) for value in search.history],
+        },
+        "motion": content(design.motion),
+    }
+
+
+def _bars(bars: Bars) -> dict[str, Any]:
+    return {
+        name: {
+            "value": value,
+            "std_error": abs(value) * bars.relative[name],
+            "relative_error": bars.relative[name],
+            "over_draws": [bars.lowest[name], bars.highest[name]],
+        }
+        for name, value in bars.values.items()
+    }
+
+
+# The problem --------------------------------------------------------------------------------------
+
+
+def _of_gripper(design: Design) -> PoseSequence:
+    """The poses as the robot has them: of its gripper, where the problem says how it holds."""
+    origin, name = design.recording.problem.origin, design.recording.template.name
+    if origin is None:
+        return design.poses
+    sections = ProblemFile.model_validate(tomllib.loads(origin.text)).experiment
+    (section,) = (section for section in sections if section.name == name)
+    transform = section.grasps[0].gripper_to_body
+    return (
+        design.poses if transform is None else design.poses.after(np.linalg.inv(transform.matrix))
+    )
+
+
+def _content(design: Design, folder: Path) -> dict[str, Any]:
+    """The problem of the designed recording, and of those there are where they count."""
+    origin, recording = design.recording.problem.origin, design.recording
+    assert origin is not None
+    described = completed(tomllib.loads(origin.text))
+    described.pop("experiment_defaults", None)
+    places = origin.path.resolve().parent, folder
+    described |= {key: _seen_from(described[key], *places) for key in ("object", "experiment")}
+    tables = described["experiment"]
+    names = [each.get("name") for each in tables]
+    new = deepcopy(tables[names.index(recording.template.name)])
+    taken = {*names} if design.added else set()
+    free = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
+    new["name"] = next(name for name in free if name not in taken)
+    described["experiment"] = [*(tables if design.added else []), _designed(new)]
+    for item in recording.problem.parameters.free:
+        stated = described["parameters"].get(item.name)
+        guess = {"guess": design.after.values[item.name]}
+        described["parameters"][item.name] = (stated if isinstance(stated, dict) else {}) | guess
+    return described
+
+
+def _designed(table: dict[str, Any]) -> dict[str, Any]:
+    """An experiment's table with the files of the design."""
+    for key in OF_TIME:
+        table.pop(key, None)
+    grasp = table["grasp"][0] if isinstance(table["grasp"], list) else table["grasp"]
+    for key in OF_POSES:
+        grasp.pop(key, None)
+    grasp["poses"] = POSES_FILE
+    if "wrench" in grasp:
+        grasp["wrench"] = _of_design(grasp["wrench"])
+    if "markers" in table:
+        for key in OF_MARKERS:
+            table["markers"].pop(key, None)
+        table["markers"]["file"] = MARKERS_FILE
+    return table
+
+
+def _of_design(wrench: dict[str, Any]) -> dict[str, Any]:
+    """A wrench's table with the file of the design, which is in newtons and of the mesh."""
+    parts = wrench.get("symmetry", 1)
+    sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
+    kept = {key: value for key, value in wrench.items() if key not in OF_TABLE}
+    return kept | sigmas | {"file": WRENCH_FILE}
+
+
+def _seen_from(value: Any, old: Path, new: Path) -> Any:
+    """A table of a problem, its files named from another folder; columns are no files."""
+    if isinstance(value, list):
+        return [_seen_from(each, old, new) for each in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: Path(os.path.relpath(old / each, new)).as_posix()
+        if key in OF_FILES and isinstance(each, str)
+        else (each if key == "columns" else _seen_from(each, old, new))
+        for key, each in value.items()
+    }

@@ -1,0 +1,406 @@
+"""What a study leaves behind: tables for the terminal and for Markdown, CSV, JSON and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import exp
+from pathlib import Path
+from typing import Any
+
+from ..display import Items, Section, Table, as_markdown
+from ..fem.constants import symbol_of, unit_of, with_unit
+from ..files import SCHEMA, whole_file, write_whole
+from ..tree import as_json
+from .choice import advice, model_notes, model_rows, shown_in
+from .plots import comparison_plots, sweep_plots
+from .store import Record, RunStore
+from .study import PlannedRun, short_keys
+from .table import Row, Yardstick, method_rows, run_row
+
+RESOLUTION_DPI = 150
+SHOWN_FAILURES = 8
+# Heads of the tables where there is room, on pages.
+WORDS = {
+    "": "to use",
+    "success": "successes",
+    "95 %": "95 % interval of the rate",
+    "violation N": "dynamics violated by [N]",
+    "relative": "of the largest force",
+    "markers mm": "markers, RMS [mm]",
+    "roll-out mm": "roll-out, RMS [mm]",
+    "tip mm": "tip, at most [mm]",
+    "iter.": "iterations",
+    "evals": "evaluations",
+    "build s": "set-up [s]",
+    "evaluate s": "evaluations [s]",
+    "solve s": "linear algebra [s]",
+    "total s": "in all [s]",
+    "free": "parameters estimated",
+    "fit mm": "markers, RMS [mm]",
+    "fit N": "forces, RMS [N]",
+    "held out mm": "held out, RMS [mm]",
+    "held out N": "held out, RMS [N]",
+    "times best": "held out, times the best",
+}
+UNITS = ("Pa", "s", "1/s", "kg/m³")
+MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answer."
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A study's numbers, finished or not.
+
+    Attributes
+    ----------
+    title : str
+    kind : {"compare", "sweep", "models"}
+    planned : tuple of PlannedRun
+    records : mapping of key to record, those there are
+    yardstick : Yardstick
+    """
+
+    title: str
+    kind: str
+    planned: tuple[PlannedRun, ...]
+    records: Mapping[str, Record]
+    yardstick: Yardstick
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row for each planned run, or for each model."""
+        if self.kind == "models":
+            return model_rows(self.planned, self.records)
+        return [run_row(run, self.records.get(run.key), self.yardstick) for run in self.planned]
+
+    @property
+    def views(self) -> list[Table]:
+        """The tables people look at, each within 80 columns."""
+        if self.kind == "compare":
+            return comparison_views(method_rows(self.rows))
+        if self.kind == "models":
+            return model_views(self.rows)
+        return sweep_views(self.rows, list(self.planned[0].swept))
+
+    @property
+    def headline(self) -> list[str]:
+        """What the study says, in a sentence or a few."""
+        if self.kind == "models":
+            return [advice(self.rows)]
+        if self.kind == "compare":
+            return [_method_sentence(row) for row in method_rows(self.rows)]
+        return sweep_sentences(self.rows)
+
+    @property
+    def tables(self) -> list[Table]:
+        """The same with heads in words, and a comparison's runs: for pages, where there is room."""
+        views = [replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.views]
+        return [*views, run_view(self.rows)] if self.kind == "compare" else views
+
+    @property
+    def failures(self) -> list[str]:
+        """A line for each run without an answer."""
+        return [
+            f"{run.label}: {record['outcome']}: {record.get('message', '')}"
+            for run in self.planned
+            if (record := self.records.get(run.key)) is not None
+            and not {"result", "model"} & record.keys()
+        ]
+
+    @property
+    def notes(self) -> list[str]:
+        """What to know when reading the tables."""
+        missing = len(self.planned) - len(self.records)
+        kept = [f"{missing} of {len(self.planned)} runs are still to be done."] if missing else []
+        if self.kind == "models":
+            return [*model_notes(self.rows), *kept]
+        return [*((self.yardstick.sentence, MEDIANS_NOTE) if self.kind == "compare" else ()), *kept]
+
+
+def load_report(
+    title: str,
+    kind: str,
+    planned: Sequence[PlannedRun],
+    store: RunStore,
+    yardstick: Yardstick | None = None,
+) -> Report:
+    """Gather the records of planned runs."""
+    loaded = {run.key: store.load(run.key) for run in planned}
+    records = {key: record for key, record in loaded.items() if record is not None}
+    return Report(title, kind, tuple(planned), records, yardstick or Yardstick())
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+def write_report(report: Report, folder: Path) -> None:
+    """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
+    rows = report.rows
+    write_whole(folder / "runs.csv", as_csv(rows))
+    if report.kind == "compare":
+        write_whole(folder / "summary.csv", as_csv(method_rows(rows)))
+    write_whole(folder / "summary.json", as_json(report_json(report)) + "\n")
+    write_whole(folder / "summary.md", as_markdown([report_section(report)]))
+    if report.kind == "models":
+        figures = {}
+    elif report.kind == "compare":
+        figures = comparison_plots(rows, report.records, report.yardstick)
+    else:
+        figures = sweep_plots(rows, list(report.planned[0].swept))
+    for name, figure in figures.items():
+        with whole_file(folder / f"{name}.png") as draft:
+            figure.savefig(draft, dpi=RESOLUTION_DPI)
+
+
+def report_json(report: Report) -> dict[str, Any]:
+    """Content of summary.json."""
+    rows = report.rows
+    first = report.planned[0]
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "kind": report.kind,
+        "title": report.title,
+        "problem": first.problem,
+        "runs": rows,
+        "headline": report.headline,
+        "notes": report.notes,
+        "tables": report.tables,
+        "failures": report.failures,
+    }
+    if report.kind == "compare":
+        content |= {
+            "truth": dict(report.yardstick.truth) or None,
+            "within": report.yardstick.within,
+            "methods": method_rows(rows),
+        }
+    elif report.kind == "models":
+        content["advice"] = advice(rows)
+    else:
+        content["swept"] = list(first.swept)
+    return content
+
+
+def as_csv(rows: Sequence[Row]) -> str:
+    """Rows as CSV; the columns are those of all rows, in the order they first come."""
+    columns = dict.fromkeys(name for row in rows for name in row)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def report_section(report: Report) -> Section:
+    """The views and the failures for a paper's appendix or an issue."""
+    failures = (Items(tuple(report.failures)),) if report.failures else ()
+    without = tuple(Section("Runs without an answer", (each,)) for each in failures)
+    parts = (*report.headline, *report.notes, *report.views, *without)
+    return Section(report.title, parts, level=1)
+
+
+def _in_words(head: str) -> str:
+    if head.startswith("Δ") and head.endswith(" %"):
+        return f"error of {head[1:-2]} [%]"
+    symbol, space, unit = head.partition(" ")
+    return WORDS.get(head, f"{symbol} [{unit}]" if space and unit in UNITS else head)
+
+
+# Views --------------------------------------------------------------------------------------------
+
+Cell = Callable[[Row], str]
+
+
+def comparison_views(summaries: Sequence[Row]) -> list[Table]:
+    """Success, quality and cost of every method."""
+    errors = [name for name in summaries[0] if name.startswith("error_")]
+    success: dict[str, Cell] = {
+        "runs": lambda row: str(row["runs"]),
+        "success": lambda row: f"{row['successes']}/{row['runs']}",
+        "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
+    }
+    for name in errors:
+        symbol = symbol_of(name.removeprefix("error_"))
+        success[f"Δ{symbol} %"] = _number(name, 100)
+    quality = {
+        "violation N": _number("violation_n", 1, ".1e"),
+        "relative": _number("violation_relative", 1, ".1e"),
+        "markers mm": _number("rms_m", 1e3),
+        "roll-out mm": _number("rollout_rms_m", 1e3),
+        "tip mm": _number("tip_max_m", 1e3),
+    }
+    cost = {
+        "iter.": _number("iterations", 1, ".4g"),
+        "evals": _number("evaluations", 1, ".4g"),
+        "build s": _number("build_s"),
+        "evaluate s": _number("evaluations_s"),
+        "solve s": _number("linear_algebra_s"),
+        "total s": _number("total_s"),
+    }
+    if all(row["evaluations"] is None for row in summaries):
+        del cost["evals"]
+    return [
+        _view("Success", {"method": _text("method")}, success, summaries),
+        _view("Quality", {"method": _text("method")}, quality, summaries),
+        _view("Cost", {"method": _text("method")}, cost, summaries),
+    ]
+
+
+def run_view(rows: Sequence[Row]) -> Table:
+    """Every run of a comparison."""
+    names = {"start": _text("start"), "method": _text("method")}
+    cells: dict[str, Cell] = {
+        "ended": _text("status"),
+        "succeeded": lambda row: "yes" if row["success"] else "no",
+    }
+    for name in (column for column in rows[0] if column.startswith("error_")):
+        cells[f"Δ{symbol_of(name.removeprefix('error_'))} %"] = _number(name, 100)
+    cells |= {
+        "markers mm": _number("rms_m", 1e3),
+        "roll-out mm": _number("rollout_rms_m", 1e3),
+        "iterations": _number("iterations", 1, ".4g"),
+        "total s": _number("total_s"),
+    }
+    ordered = sorted(rows, key=lambda row: row["start"])
+    view = _view("Runs", names, cells, ordered)
+    return replace(view, heads=tuple(map(_in_words, view.heads)))
+
+
+def _method_sentence(row: Row) -> str:
+    """How often, how well and how fast a method found the answer."""
+    low, high = 100 * row["success_low"], 100 * row["success_high"]
+    said = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
+    said += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
+    if row["total_s"] is None:
+        return f"{said}, and gave no answer."
+    misfit = f"with the markers {1e3 * row['rms_m']:.2g} mm off"
+    return f"{said}, {misfit} and in {row['total_s']:.2g} s at the median."
+
+
+def sweep_sentences(rows: Sequence[Row]) -> list[str]:
+    """How many runs converged, and how far each estimate moves over them."""
+    found = [row for row in rows if row["converged"]]
+    said = [f"{len(found)} of {len(rows)} runs converged."]
+    for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
+        values = [row[f"value_{name}"] for row in found]
+        errors = [e for row in found if (e := row[f"std_error_{name}"]) is not None]
+        if len(values) > 1:
+            spread = f"; the standard errors are {max(errors):.2g} at most" if errors else ""
+            low, high = f"{min(values):.4g}", f"{max(values):.4g} {unit_of(name)}".strip()
+            said.append(f"{symbol_of(name)} is {low} to {high} over them{spread}.")
+    return said
+
+
+def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
+    """Estimates and quality against the swept values."""
+    places = {short: _swept(key) for key, short in short_keys(swept)}
+    estimates: dict[str, Cell] = {}
+    for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
+        estimates[with_unit(name)] = _estimate(name)
+    quality = {
+        "status": _text("status"),
+        "markers mm": _number("rms_m", 1e3),
+        "roll-out mm": _number("rollout_rms_m", 1e3),
+        "iterations": _number("iterations", 1, ".4g"),
+        "total s": _number("total_s"),
+    }
+    return [
+        _view("Estimates ± standard error", places, estimates, rows),
+        _view("Quality and cost", places, quality, rows),
+    ]
+
+
+def model_views(rows: Sequence[Row]) -> list[Table]:
+    """Fit and prediction of every model, and what its small-strain moduli are."""
+    factor, unit = shown_in(rows[0]["unit"])
+    numbers: dict[str, Cell] = {
+        "free": _number("free", 1, "d"),
+        f"fit {unit}": _number("rms", factor, ".3g"),
+        "ΔAIC": _number("delta_aic", 1, ".1f"),
+        f"held out {unit}": _number("held_out_rms", factor, ".3g"),
+        "times best": lambda row: _times(row),
+        "total s": _number("total_s"),
+    }
+    moduli: dict[str, Cell] = {}
+    names = dict.fromkeys(name for row in rows for name in row["parameters"])
+    for name in names:
+        moduli[with_unit(name)] = lambda row, name=name: _value(row["parameters"].get(name))
+    model = {"": lambda row: "→" if row["chosen"] else "", "model": _text("model")}
+    views = [_view("Models", model, numbers, rows)]
+    held = {
+        f"'{n}' {unit}": _held_out(n, factor)
+        for n in dict.fromkeys(n for r in rows for n in r["predictions"])
+    }
+    if len(held) > 1:
+        views.append(_view("Recordings held out", {"model": _text("model")}, held, rows))
+    return [*views, _turned("Parameters", {"model": _text("model")}, moduli, rows)]
+
+
+def _turned(
+    title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
+) -> Table:
+    """A view with a line for each cell and a column for each row."""
+    (name,) = names.values()
+    lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
+    return Table(title, ("", *(name(row) for row in rows)), lines)
+
+
+def _held_out(name: str, factor: float) -> Cell:
+    return lambda row: _value(row["predictions"].get(name), factor, ".3g")
+
+
+def _times(row: Row) -> str:
+    if row["log_ratio"] is None:
+        return "–"
+    return f"{exp(row['log_ratio']):.2f} ± {exp(row['log_ratio']) * row['log_ratio_error']:.2f}"
+
+
+def _value(value: float | None, factor: float = 1.0, form: str = ".4g") -> str:
+    return "–" if value is None else format(factor * value, form)
+
+
+def _view(
+    title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
+) -> Table:
+    columns = {**names, **numbers}
+    cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
+    return Table(title, tuple(columns), cells, len(names))
+
+
+def _text(name: str) -> Cell:
+    return lambda row: str(row[name])
+
+
+def _swept(key: str) -> Cell:
+    """A swept value, numbers shortened."""
+
+    def cell(row: Row) -> str:
+        try:
+            return f"{float(row[key]):.5g}"
+        except ValueError:
+            return str(row[key])
+
+    return cell
+
+
+def _number(name: str, factor: float = 1.0, form: str = ".2g") -> Cell:
+    def cell(row: Row) -> str:
+        if row[name] is None:
+            return "–"
+        value = factor * row[name]
+        if form == ".2g" and abs(value) >= 100:
+            return f"{value:.0f}"
+        return format(value, form)
+
+    return cell
+
+
+def _estimate(name: str) -> Cell:
+    def cell(row: Row) -> str:
+        value, spread = row.get(f"value_{name}"), row.get(f"std_error_{name}")
+        if value is None:
+            return "–"
+        return f"{value:.4g}" if spread is None else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
+
+    return cell

@@ -1,0 +1,217 @@
+"""Numbers of a study: one row for each run, and a comparison's summary of each method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, nan, sqrt
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..runs.result import Result
+from ..tree import read
+from .store import TIMEOUT, Record
+from .study import PlannedRun
+
+Row = dict[str, Any]
+
+# Medians over a method's runs that have an answer, under the names of the runs' columns.
+MEDIANS = (
+    "rms_m",
+    "violation_n",
+    "violation_relative",
+    "rollout_rms_m",
+    "tip_max_m",
+    "iterations",
+    "evaluations",
+    "build_s",
+    "evaluations_s",
+    "linear_algebra_s",
+    "total_s",
+)
+# What a run's result says of its quality and cost.
+NUMBERS = (
+    "loss",
+    "rms_m",
+    "violation_n",
+    "violation_relative",
+    "rollout_rms_m",
+    "rollout_max_m",
+    "iterations",
+    "evaluations",
+    "build_s",
+    "evaluations_s",
+    "linear_algebra_s",
+    "total_s",
+)
+NORMAL_975 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What a success is.
+
+    Attributes
+    ----------
+    truth : mapping of name to value, empty where it is unknown
+    within : float
+        Largest relative error of an estimated parameter.
+    """
+
+    truth: Mapping[str, float] = field(default_factory=dict)
+    within: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not self.within > 0:
+            raise InputError(f"found {self.within:g}; expected a number above 0", None, "--within")
+
+    @property
+    def sentence(self) -> str:
+        """The same for people."""
+        if not self.truth:
+            return "A run succeeds when it converges."
+        return (
+            "A run succeeds when it converges with every estimated parameter within "
+            f"{100 * self.within:g} % of the truth."
+        )
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
+
+    Unlike the normal approximation it holds at rates of 0 and 1 and for few trials.
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    rate, z2 = successes / trials, NORMAL_975**2
+    centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
+    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
+    low = 0.0 if successes == 0 else centre - spread
+    return low, 1.0 if successes == trials else centre + spread
+
+
+# Runs ---------------------------------------------------------------------------------------------
+
+
+def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row:
+    """One run as a flat row; None where there is no number.
+
+    Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` and ``error_*``
+    (relative to the truth) hold the parameters; swept keys have columns of their own.
+    """
+    record = record or {"outcome": "missing", "message": "not run yet"}
+    result: Result | None = read(Result | None, record.get("result"))
+    late = record["outcome"] == TIMEOUT
+    converged = result is not None and result.converged and not late
+    parameters = _parameters(run, result, yardstick.truth)
+    errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
+    near = all(error is not None and error <= yardstick.within for error in errors)
+    numbers: Row = dict.fromkeys(NUMBERS) if result is None else _numbers(result)
+    row = {
+        "key": run.key,
+        "method": run.method,
+        "start": run.start,
+        **run.swept,
+        "status": record["outcome"] if late or result is None else result.status,
+        "converged": converged,
+        "success": converged and near,
+        **parameters,
+        **numbers,
+        "tip_max_m": (record.get("tip") or {}).get("max_m"),
+        "wall_s": record.get("wall_s"),
+        "attempts": record.get("attempts"),
+        "message": record.get("message", ""),
+    }
+    return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
+
+
+def _numbers(result: Result) -> Row:
+    """Quality and cost, by `NUMBERS`."""
+    dynamics, rollout, timing = result.dynamics, result.rollout, result.timing_s
+    loss = result.history[-1].loss if result.history else None
+    violated = (dynamics.max_violation_n, dynamics.max_violation_relative)
+    misfits = (result.fit.rms_m, *violated, rollout.rms_m, rollout.max_m)
+    cost = (timing.build, timing.evaluations, timing.linear_algebra, timing.total)
+    values = (loss, *misfits, result.iterations, result.evaluations, *cost)
+    return dict(zip(NUMBERS, values, strict=True))
+
+
+def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
+    row: Row = {}
+    estimates = {} if result is None else result.parameters
+    for name, guess in run.guess.items():
+        known = estimates[name].guess if name in estimates else None
+        row[f"guess_{name}"] = known if guess is None else guess
+    for name in run.guess:
+        estimate = estimates.get(name)
+        value = None if estimate is None else estimate.value
+        row[f"value_{name}"] = value
+        row[f"std_error_{name}"] = None if estimate is None else estimate.std_error
+        interval = None if estimate is None else estimate.ci95
+        row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
+        if name in truth:
+            row[f"error_{name}"] = None if value is None else abs(value / truth[name] - 1)
+    return row
+
+
+# Methods ------------------------------------------------------------------------------------------
+
+
+def method_rows(rows: Sequence[Row]) -> list[Row]:
+    """A comparison's summary, one row for each method in the order of their first runs."""
+    methods = dict.fromkeys(row["method"] for row in rows)
+    return [
+        _summary(method, [row for row in rows if row["method"] == method]) for method in methods
+    ]
+
+
+def _summary(method: str, rows: Sequence[Row]) -> Row:
+    done = [row for row in rows if row["status"] != "missing"]
+    successes = sum(row["success"] for row in done)
+    low, high = wilson_interval(successes, len(done))
+    errors = [name for name in rows[0] if name.startswith("error_")]
+    return {
+        "method": method,
+        "runs": len(done),
+        "converged": sum(row["converged"] for row in done),
+        "successes": successes,
+        "success_rate": successes / len(done) if done else None,
+        "success_low": low,
+        "success_high": high,
+        **{name: _median(done, name) for name in (*errors, *MEDIANS)},
+    }
+
+
+def _median(rows: Sequence[Row], name: str) -> float | None:
+    values = [row[name] for row in rows if row[name] is not None]
+    return float(np.median(values)) if values else None
+
+
+def best_run(rows: Sequence[Row]) -> Row | None:
+    """The answer with the lowest loss, of the successes if there are any, else of the converged."""
+    answered = [row for row in rows if row["rms_m"] is not None]
+
+    def rank(row: Row) -> tuple[bool, bool, float]:
+        loss = row["loss"] if row["loss"] is not None else inf
+        return not row["success"], not row["converged"], loss
+
+    return min(answered, key=rank, default=None)
+
+
+def reference(rows: Sequence[Row], yardstick: Yardstick) -> dict[str, float]:
+    """Where guesses are measured from: the truth, or the best answer's parameters."""
+    names = [name.removeprefix("guess_") for name in rows[0] if name.startswith("guess_")]
+    if yardstick.truth:
+        return {name: yardstick.truth[name] for name in names}
+    best = best_run(rows)
+    if best is None or not best["converged"]:
+        return {}
+    return {name: best[f"value_{name}"] for name in names}
+
+
+def distance(row: Row, centre: Mapping[str, float]) -> float:
+    """Factor by which the guess that is farthest off misses."""
+    logs = [abs(np.log(row[f"guess_{name}"] / value)) for name, value in centre.items()]
+    return float(np.exp(max(logs))) if logs else nan

@@ -1,0 +1,94 @@
+"""One run of a study in a process of its own: ``python -m collocation_sysid.plan.worker OUT``.
+
+The run comes as one line of JSON on stdin, and its record goes to the file OUT. The process ends
+when its stdin is closed, so that none outlives the study that started it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, SimulationError
+from ..files import write_whole
+from ..pipeline import Run, run
+from ..problem import Problem
+from ..recording.grasp import held_nodes
+from ..result.record import result
+from ..runs.forward_simulation import Rollout
+from ..starting import heed_interrupts, leave
+from ..tree import as_json
+from .prediction import model_record
+from .store import ERROR, FINISHED
+
+
+def main() -> None:
+    """Entry point."""
+    heed_interrupts()
+    planned = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_the_study, daemon=True).start()
+    write_whole(Path(sys.argv[1]), as_json(attempt(planned)))
+    leave(0)
+
+
+def attempt(planned: dict[str, Any]) -> dict[str, Any]:
+    """Do a planned run; what goes wrong becomes part of its record."""
+    try:
+        problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
+        held_out = planned.get("held_out")
+        if held_out is not None:
+            fit = model_record(problem, planned["method"], held_out)
+            return {"outcome": FINISHED, "message": fit["status"], "model": fit}
+        finished = run(problem, planned["method"])
+        return {
+            "outcome": FINISHED,
+            "message": finished.solution.message,
+            "result": result(finished),
+            "tip": _tip(finished),
+        }
+    except (InputError, SimulationError) as error:
+        return {"outcome": ERROR, "message": str(error)}
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+        return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
+
+
+def _tip(finished: Run) -> dict[str, Any] | None:
+    """Measured and re-simulated track of the marker farthest from the grasp, if there is one."""
+    experiment = finished.solution.collocation.segments[0].experiment
+    markers, nodes_m = experiment.markers, experiment.body.nodes_m
+    held = held_nodes(experiment.grasps)
+    if not markers.names:
+        return None
+    centre = nodes_m[held if len(held) else slice(None)].mean(axis=0)
+    tip = int(np.linalg.norm(markers.observe(nodes_m) - centre, axis=1).argmax())
+    measured = markers.positions_m[:, tip]
+    rollout = finished.rollouts[experiment.name]
+    rolled = rollout.trajectory.markers_m[:, tip] if isinstance(rollout, Rollout) else None
+    error = None
+    if rolled is not None and markers.present[:, tip].any():
+        error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
+    return {
+        "experiment": experiment.name,
+        "marker": markers.names[tip],
+        "max_m": error,
+        "t_s": experiment.t_s.tolist(),
+        "measured_m": measured.tolist(),
+        "rolled_out_m": None if rolled is None else rolled.tolist(),
+    }
+
+
+def _end_with_the_study() -> None:
+    os.read(0, 1)  # returns when the other end is closed
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

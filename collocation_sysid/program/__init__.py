@@ -1,0 +1,1 @@
+"""The program: rows in time, what is carried and read, their sweep, factorisation and matrices."""

@@ -1,0 +1,254 @@
+"""Sparse matrices made of mesh-graph blocks along the time axis, refilled at every iterate.
+
+Column block t holds the columns of x_t; row blocks are placed at fixed offsets from it. A block
+is a linear combination of lower triangles on the mesh graph,
+
+    block(t, offset) = Σ_terms a[t] A[t + shift] + b[t] B[t + shift] + constant,
+
+so the positions and the coefficients are laid out once and `fill` only copies numbers. A and B
+are (K, m) arrays of lower-triangle values, see `fem.pattern`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array, Index
+from ..fem.kernels import in_slices, make_combiner
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """a[t] A[t + shift] + b[t] B[t + shift] with a, b of length N, by column time t."""
+
+    shift: int
+    a: Array
+    b: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """The blocks at one row offset: their entries, and the terms that fill them.
+
+    Attributes
+    ----------
+    offset : int
+        Row block minus column block.
+    rows, columns : (e,) entries within the block
+    source : (e,) position of each in the lower triangle; −1 where only constants go
+    terms : sequence of Term
+    whole : (e,) position of each in both triangles, see `pattern.full`
+    """
+
+    offset: int
+    rows: Index
+    columns: Index
+    source: Index
+    terms: Sequence[Term]
+    whole: Index
+
+
+class BlockBand:
+    """Structure of the matrix in compressed columns, and the plan to fill it.
+
+    Parameters
+    ----------
+    columns : int
+        Columns per block.
+    row_starts : (N,) first row of each row block, −1 where the block does not exist
+    blocks : sequence of Block
+    top : int
+        Rows above all blocks that every column has an entry in (0 … top − 1).
+    adds : bool
+        Whether `fill` adds to the values instead.
+
+    Attributes
+    ----------
+    indptr, indices : compressed-column structure, rows ascending in each column
+    top_positions : (N · columns, top) positions of the top rows' values
+    """
+
+    def __init__(
+        self,
+        columns: int,
+        row_starts: Index,
+        blocks: Sequence[Block],
+        top: int = 0,
+        adds: bool = False,
+    ) -> None:
+        count = len(row_starts)
+        blocks = sorted(blocks, key=lambda block: block.offset)
+        exists = np.array(
+            [
+                [0 <= t + b.offset < count and row_starts[t + b.offset] >= 0 for b in blocks]
+                for t in range(count)
+            ]
+        )
+        self._slabs: dict[tuple[bool, ...], _Slab] = {}
+        for present in map(tuple, np.unique(exists, axis=0)):
+            chosen = [b for b, here in zip(blocks, present, strict=True) if here]
+            self._slabs[present] = _Slab.of(columns, chosen, top)
+        kinds = [self._slabs[tuple(present)] for present in exists]
+        starts = np.concatenate([[0], np.cumsum([slab.entries for slab in kinds])])
+        self.starts = starts
+        self.nnz = int(starts[-1])
+        self.indptr = np.concatenate(
+            [[0], *(slab.column_ends + starts[t] for t, slab in enumerate(kinds))]
+        )
+        self.indices = np.concatenate(
+            [slab.row_indices(row_starts, t) for t, slab in enumerate(kinds)]
+        )
+        self.top_positions = np.concatenate(
+            [slab.top_positions + starts[t] for t, slab in enumerate(kinds)]
+        )
+        self._kinds = kinds
+        self._fill = make_combiner(_plan(kinds, starts[:-1], count, adds))
+
+    def positions(self, times: Index, offset: int, rows: Index, columns: Index) -> Index:
+        """Positions in the values of entries of the blocks (t + offset, t), which must exist.
+
+        Returns
+        -------
+        (len(times), len(rows)) ndarray
+        """
+        result = np.empty((len(times), len(rows)), dtype=np.int64)
+        for slab in self._slabs.values():
+            here = np.array([self._kinds[t] is slab for t in times], dtype=bool)
+            if here.any():
+                places = slab.locate(offset, rows, columns)
+                result[here] = self.starts[times[here], None] + places
+        return result
+
+    def fill(self, values: Array, a: Array, b: Array, threads: int) -> None:
+        """Write all block entries into `values`; entries without terms become zero.
+
+        Parameters
+        ----------
+        values : (nnz,) the top rows are left as they are
+        a, b : (K, m) rows contiguous, of the same row stride
+        """
+        in_slices(
+            lambda start, stop: self._fill(start, stop, a, b, values),
+            len(self._kinds),
+            threads if len(self._kinds) > 4 * threads else 1,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Slab:
+    """One column block's structure: entries sorted by column, then row."""
+
+    columns: int
+    top: int
+    blocks: Sequence[Block]
+    entries: int
+    column_ends: Index
+    top_positions: Index
+    order: Index  # sorted place of each entry, blocks stacked after the top rows
+    offsets: Index  # row offset of each stacked entry
+    rows: Index
+
+    @classmethod
+    def of(cls, columns: int, blocks: Sequence[Block], top: int) -> _Slab:
+        top_rows = np.tile(np.arange(top), columns)
+        top_columns = np.repeat(np.arange(columns), top)
+        rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
+        cols = np.concatenate([top_columns, *(b.columns for b in blocks)])
+        level = np.concatenate(
+            [np.full(len(top_rows), -1), *(np.full(len(b.rows), k) for k, b in enumerate(blocks))]
+        )
+        order = np.lexsort((rows, level, cols))
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order))
+        ends = np.cumsum(np.bincount(cols, minlength=columns))
+        return cls(
+            columns,
+            top,
+            blocks,
+            len(order),
+            ends,
+            place[: top * columns].reshape(columns, top),
+            place,
+            level,
+            rows,
+        )
+
+    def row_indices(self, row_starts: Index, t: int) -> Index:
+        """Global row of every entry of this slab as column block t."""
+        base = np.array([row_starts[t + b.offset] for b in self.blocks] + [0])
+        result = np.empty(self.entries, dtype=np.int64)
+        result[self.order] = base[self.offsets] + self.rows
+        return result
+
+    def places(self, block: int) -> Index:
+        """Place in the slab of each entry of its `block`-th block."""
+        first = self.top * self.columns + sum(len(b.rows) for b in self.blocks[:block])
+        return self.order[first : first + len(self.blocks[block].rows)]
+
+    def locate(self, offset: int, rows: Index, columns: Index) -> Index:
+        """Place in the slab of given entries of the block at `offset`."""
+        k = [b.offset for b in self.blocks].index(offset)
+        block = self.blocks[k]
+        width = int(max(block.rows.max(), np.max(rows, initial=0))) + 1
+        codes = block.columns * width + block.rows
+        sorter = np.argsort(codes)
+        wanted = np.asarray(columns) * width + rows
+        found = sorter[np.minimum(np.searchsorted(codes, wanted, sorter=sorter), len(codes) - 1)]
+        if (codes[found] != wanted).any():
+            raise IndexError("an entry lies outside the block")
+        return self.places(k)[found]
+
+
+@dataclass(frozen=True, eq=False)
+class CombinePlan:
+    """Tasks of all column blocks, in their order, for the combiner.
+
+    Task: value[out + target[i]] (+)= a A[row, source[i]] + b B[row, source[i]], i in the map.
+
+    Attributes
+    ----------
+    first_task : (N + 1,) tasks of column block t are first_task[t] … first_task[t + 1] − 1
+    tasks : (tasks, 5) out, map start, map length, row, 1 to add or 0 to overwrite
+    coefficients : (tasks, 2) a, b
+    targets, sources : concatenated maps
+    """
+
+    first_task: Index
+    tasks: Index
+    coefficients: Array
+    targets: NDArray[np.int32]
+    sources: NDArray[np.int32]
+
+
+def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> CombinePlan:
+    targets, sources, maps = [], [], {}
+    used = 0
+    tasks, coefficients, first_task = [], [], [0]
+    for t, slab in enumerate(kinds):
+        for k, block in enumerate(slab.blocks):
+            if (id(slab), k) not in maps:
+                # Sorted by target, so that the writes run through memory.
+                places = slab.places(k)
+                order = np.argsort(places)
+                maps[id(slab), k] = (used, len(places))
+                targets.append(places[order])
+                sources.append(np.maximum(block.source[order], 0))
+                used += len(places)
+            start, length = maps[id(slab), k]
+            active = [m for m in block.terms if m.a[t] != 0 or m.b[t] != 0]
+            terms = [(m.a[t], m.b[t], t + m.shift) for m in active] or [(0.0, 0.0, 0)]
+            for number, (a, b, row) in enumerate(terms):
+                tasks.append((starts[t], start, length, row, int(adds or number > 0)))
+                coefficients.append((a, b))
+        first_task.append(len(tasks))
+    return CombinePlan(
+        np.array(first_task, dtype=np.int64),
+        np.array(tasks, dtype=np.int64).reshape(-1, 5),
+        np.array(coefficients, dtype=float).reshape(-1, 2),
+        np.concatenate(targets).astype(np.int32),
+        np.concatenate(sources).astype(np.int32),
+    )

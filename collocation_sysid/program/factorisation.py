@@ -1,0 +1,370 @@
+"""Factorise matrices on the mesh graph, again and again with one pattern.
+
+Reverse Cuthill–McKee makes the mesh graph a narrow band; a factorisation without exchanges of rows,
+within its skyline or, if it is wide, Cholesky's, then also tells whether the matrix is positive
+definite. Wide bands are those of LAPACK, or of a supernodal method where that is installed.
+Indefinite matrices go to SuperLU, and so do all where its fill-in is estimated to cost less than
+the band. What has a skew part besides, see `unsymmetric`, needs no exchanges either where the
+symmetric part is positive definite and the skew one does not outweigh it: within a skyline it is
+factorised whole, else by its symmetric part and refined. What remains SuperLU takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import get_lapack_funcs
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import SuperLU, splu
+
+from ..arrays import Array, Index
+from ..fem.kernels import in_slices, make_skyline
+from ..fem.pattern import SymmetricPattern
+from .lapack import cholesky_in_place
+from .supernodal import Pardiso, SupernodalFactor, library
+
+if TYPE_CHECKING:
+    from ..fem.kernels.skyline import Room, Skyline
+
+Choice = Literal["auto", "band", "sparse", "supernodal"]
+
+# LAPACK works on a band about this many times as fast as SuperLU on its columns (measured: 40
+# against 4 GFlop/s on one core), and below this work there is nothing to choose.
+BAND_SPEED = 10.0
+LITTLE_WORK = 1e8
+# From this work of a band on, some 3,000 nodes of a stout body, supernodal sweeps are faster.
+MUCH_WORK = 2e9
+
+# In wider bands LAPACK is faster (measured: 17 GFlop/s at 200, its Cholesky 21 at 300).
+NARROW = 250
+# Without exchanges a diagonal entry may grow so many times; of definite matrices it never does.
+GROWTH = 10.0
+# Corrections by the skew part end where the next would be so small, far below what a Newton or
+# Gauss–Newton step is accurate to; they must shrink so fast, else another factor pays.
+ACCURACY, CONTRACTION, TINY = 1e-10, 0.2, 1e-300
+
+(_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
+NONE = np.zeros(0)
+
+
+class Factor(Protocol):
+    """A factorised matrix on the free degrees of freedom."""
+
+    @property
+    def positive_definite(self) -> bool:
+        """Whether the matrix, or its symmetric part, is positive definite."""
+        ...
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Solve for (k,) or (k, m) right-hand sides in the order of the free dofs."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _BandFactor:
+    band: Array
+    order: Index
+    positive_definite: bool = True
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        permuted = right[self.order]
+        solved, _ = _pbtrs(self.band, permuted, lower=1)
+        result = np.empty_like(right)
+        result[self.order] = solved.reshape(right.shape)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _SkylineFactor:
+    """L, D and U, see `fem.kernels.skyline`; of a symmetric matrix both sides are one."""
+
+    skyline: Skyline
+    sides: Array
+    pivots: Array
+    order: Index
+    rank: Index
+    positive_definite: bool = True
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        first, second = self.sides[-transposed], self.sides[transposed - 1]
+        rows = np.atleast_2d(right.take(self.order, axis=0).T)
+        solved = self.skyline.solve(first, self.pivots, second, rows)
+        return solved.T.take(self.rank, axis=0).reshape(right.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _RefinedFactor:
+    """Of S + K, K skew: Σ_k (−S⁻¹K)^k S⁻¹, or `whole` where that does not contract."""
+
+    symmetric: Factor
+    skew: sp.csc_array
+    whole: Callable[[], Factor]
+    positive_definite: bool = True
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        found = correction = self.symmetric.solve(right)
+        size = last = np.abs(found).max(axis=0, initial=TINY)
+        shrinks = 1.0
+        # What the next correction would be is not worth another solution.
+        while (shrinks * last > ACCURACY * size).any():
+            pushed = self.skew @ correction
+            correction = self.symmetric.solve(pushed if transposed else -pushed)
+            length = np.abs(correction).max(axis=0, initial=TINY)
+            shrinks = float((length / last).max(initial=0.0))
+            if not shrinks <= CONTRACTION:
+                return self.whole().solve(right, transposed)
+            found, last = found + correction, length
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _SparseFactor:
+    lu: SuperLU
+    positive_definite: bool
+
+    def solve(self, right: Array, transposed: bool = False) -> Array:
+        return self.lu.solve(right, "T" if transposed else "N")
+
+
+class Factoriser:
+    """Symbolic analysis of a symmetric pattern restricted to free degrees of freedom.
+
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+    free : (k,) sorted degrees of freedom kept
+    choice : {"auto", "band", "sparse", "supernodal"}
+        Banded Cholesky, SuperLU, supernodal Cholesky, or whichever is estimated to cost least.
+
+    Raises
+    ------
+    InputError
+        Where a supernodal method is asked for and not installed.
+    """
+
+    def __init__(self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> None:
+        self.choice: Choice = choice
+        position = np.full(pattern.size, -1)
+        position[free] = np.arange(len(free))
+        rows, columns = position[pattern.rows], position[pattern.columns]
+        self._kept = np.flatnonzero((rows >= 0) & (columns >= 0))
+        rows, columns = rows[self._kept], columns[self._kept]
+        self._size = len(free)
+        ones = np.ones(len(rows))
+        graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
+        self._order = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True).astype(np.int64)
+        self._rank = rank = np.empty(self._size, dtype=np.int64)
+        rank[self._order] = np.arange(self._size)
+        low, high = np.minimum(rank[rows], rank[columns]), np.maximum(rank[rows], rank[columns])
+        self.half_bandwidth = int((high - low).max(initial=0))
+        self._band_places = low * (self.half_bandwidth + 1) + high - low
+        self._ranks = rank[rows], rank[columns]
+        strict = rows != columns
+        self._full_rows = np.concatenate([rows, columns[strict]])
+        self._full_columns = np.concatenate([columns, rows[strict]])
+        self._full_source = np.concatenate([self._kept, self._kept[strict]])
+        # Whether an entry has the skew part's own sign; none on the diagonal.
+        self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
+        self._entries = pattern.entries
+        self._pool: list[Pardiso] = []
+        if choice == "supernodal":
+            self._pool.append(self._pardiso())
+
+    @classmethod
+    def of(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
+        """The analysis of a pattern; that of the last few is kept."""
+        return _analysed(pattern, free.tobytes(), choice)
+
+    @cached_property
+    def banded(self) -> bool:
+        """Whether banded Cholesky is chosen."""
+        if self.choice != "auto":
+            return self.choice == "band"
+        if self.supernodal:
+            return False
+        return self._band_work <= max(LITTLE_WORK, BAND_SPEED * self._sparse_work)
+
+    @cached_property
+    def supernodal(self) -> bool:
+        """Whether supernodal Cholesky is chosen."""
+        if self.choice != "auto":
+            return self.choice == "supernodal"
+        wide = self.half_bandwidth > NARROW and self._band_work > MUCH_WORK
+        return wide and library() is not None
+
+    @property
+    def _band_work(self) -> int:
+        return self._size * self.half_bandwidth**2
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that one factor of a symmetric matrix holds."""
+        if self.banded:
+            width = self.skyline.shape[1] if self.skyline else self.half_bandwidth + 1
+            return self._size * width
+        if self.supernodal:
+            return self._supernodal_numbers
+        return 3 * int(self._column_counts.sum())  # L, U, and their row numbers at half the size
+
+    @property
+    def unsymmetric_numbers(self) -> int:
+        """Numbers that one factor of another matrix holds."""
+        return (2 if self.skyline else 1) * self.numbers
+
+    @cached_property
+    def skyline(self) -> Skyline | None:
+        """What factorises narrow bands."""
+        if not self.banded or self.half_bandwidth > NARROW:
+            return None
+        return make_skyline(self._size, *self._ranks, self._kept)
+
+    @property
+    def _sparse_work(self) -> float:
+        return float(np.sum(self._column_counts.astype(float) ** 2))
+
+    @cached_property
+    def _column_counts(self) -> Index:
+        """Entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
+        values = np.full(self._entries, -1.0)
+        degree = np.bincount(self._full_rows, minlength=self._size)
+        values[self._full_source[self._full_rows == self._full_columns]] = degree
+        return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
+
+    def factorise(self, values: Array, skew: Array = NONE, room: Room | None = None) -> Factor:
+        """Factorise the matrix with (m,) lower-triangle values, and those of a skew part.
+
+        Of a factor in a room that was given, nothing is left when another is put there.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the matrix is singular or not finite.
+        """
+        skew = skew if skew.any() else NONE
+        within = self._within(values, skew, room)
+        if within:
+            return within
+        if not (np.isfinite(values).all() and np.isfinite(skew).all()):
+            raise np.linalg.LinAlgError("the matrix has entries that are not finite")
+        symmetric = (self._within(values, NONE, room) if skew.size else None) or (
+            self._cholesky(values) or self._sparse(values)
+        )
+        if not skew.size:
+            return symmetric
+        definite = symmetric.positive_definite
+
+        @cache
+        def whole() -> Factor:
+            return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), definite)
+
+        entries = self._signs * skew[self._full_source]
+        return _RefinedFactor(symmetric, self._matrix(entries), whole) if definite else whole()
+
+    def _cholesky(self, values: Array) -> Factor | None:
+        """The factor of a matrix that is positive definite, where SuperLU is not chosen."""
+        if self.supernodal:
+            try:
+                pardiso = self._pool.pop()
+            except IndexError:  # not asked for beforehand: other threads take from it too
+                pardiso = self._pardiso()
+            factor = SupernodalFactor(pardiso, self._pool)
+            return factor if pardiso.factorise(values[self._upper[2]]) else None
+        if not self.banded or self.skyline:
+            return None
+        band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
+        band.T.reshape(-1)[self._band_places] = values[self._kept]
+        return _BandFactor(band, self._order) if cholesky_in_place(band) else None
+
+    def _pardiso(self) -> Pardiso:
+        return Pardiso(*self._upper[:2])
+
+    @cached_property
+    def _supernodal_numbers(self) -> int:
+        if not self._pool:
+            self._pool.append(self._pardiso())
+        return self._pool[-1].numbers
+
+    @cached_property
+    def _upper(self) -> tuple[Index, Index, Index]:
+        """Starts of the upper triangle's rows, their columns, and where their values are."""
+        here = self._full_rows <= self._full_columns
+        rows, columns = self._full_rows[here], self._full_columns[here]
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(self._size + 1))
+        return starts, columns[order], self._full_source[here][order]
+
+    def room(self, sides: int) -> Room | None:
+        """Room for a factor, of two sides where the matrix is not symmetric, if it can be given."""
+        return self.skyline.room(sides) if self.skyline else None
+
+    def _within(self, values: Array, skew: Array, room: Room | None) -> Factor | None:
+        """The factor within the skyline, unless the matrix needs exchanges of rows."""
+        skyline = self.skyline
+        if skyline is None:
+            return None
+        count = 2 if skew.size else 1
+        room = room or skyline.room(count)
+        pivots, growth = skyline.factorise(room, values, skew)
+        # What is not finite in the matrix is not in its pivots.
+        if not (pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH):
+            return None
+        return _SkylineFactor(skyline, room.sides[:count], pivots, self._order, self._rank)
+
+    def factorise_each(
+        self,
+        matrix: Callable[[int], tuple[Array, Array]],
+        count: int,
+        threads: int,
+        rooms: Sequence[Room | None] = (),
+    ) -> list[Factor]:
+        """Factorise `count` matrices, side by side on threads; matrix(k) gives both parts' values.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If one is singular or not finite.
+        """
+        factors: dict[int, Factor] = {}
+
+        def run(start: int, stop: int) -> None:
+            for k in range(start, stop):
+                factors[k] = self.factorise(*matrix(k), rooms[k] if rooms else None)
+
+        in_slices(run, count, threads)
+        return [factors[k] for k in range(count)]
+
+    def _sparse(self, values: Array) -> Factor:
+        if not self.banded and not self.supernodal:
+            lu = self._superlu(values, pivot_below=0.0)
+            if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
+                return _SparseFactor(lu, positive_definite=True)
+        # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
+        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
+
+    def _matrix(self, entries: Array) -> sp.csc_array:
+        places = self._full_rows, self._full_columns
+        return sp.csc_array((entries, places), shape=(self._size, self._size))
+
+    def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
+        entries = values[self._full_source]
+        if skew.size:
+            entries += self._signs * skew[self._full_source]
+        try:
+            return splu(
+                self._matrix(entries),
+                permc_spec="MMD_AT_PLUS_A",
+                options={"SymmetricMode": True},
+                diag_pivot_thresh=pivot_below,
+            )
+        except RuntimeError as error:
+            raise np.linalg.LinAlgError(str(error)) from error
+
+
+@lru_cache(maxsize=8)
+def _analysed(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
+    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice)

@@ -1,0 +1,216 @@
+"""March a collocation scheme forward: trajectories that satisfy its constraints exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+
+import numpy as np
+
+from ..arrays import Array, Index
+from ..errors import SimulationError
+from ..fem.memory import Past
+from ..model.dynamics import Dynamics
+from ..recording.experiment import Experiment
+from .lapack import one_blas_thread
+from .newton import (
+    NewtonFailure,
+    NewtonOptions,
+    Solver,
+    Solvers,
+    followed,
+    simulation_error,
+)
+from .rest import start_state
+from .row import Row, weighted
+from .stopwatch import Stopwatch
+
+Progress = Callable[[float], None]
+
+
+def march(
+    experiment: Experiment,
+    dynamics: Dynamics,
+    theta: Array,
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+) -> Array:
+    """Positions (N, 3n) that satisfy the scheme's equations, one row after another.
+
+    Raises
+    ------
+    SimulationError
+        Naming time and element of the step that failed.
+    """
+    x, failure = march_on(experiment, dynamics, theta, None, options, progress)
+    if failure is not None:
+        raise failure
+    return x
+
+
+@one_blas_thread()
+def march_on(
+    experiment: Experiment,
+    dynamics: Dynamics,
+    theta: Array,
+    known: Array | None = None,
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+    stopwatch: Stopwatch | None = None,
+    near: Array | None = None,
+) -> tuple[Array, SimulationError | None]:
+    """Continue a trajectory as far as it goes.
+
+    Parameters
+    ----------
+    known : (k, 3n) ndarray, optional
+        The first rows; the experiment's start by default.
+    near : (N, 3n) ndarray, optional
+        A trajectory at other parameters: where equilibria are looked for first.
+
+    Returns
+    -------
+    x : (r, 3n) ndarray
+        The rows reached, `known` included; all N where nothing failed.
+    failure : SimulationError or None
+        Why it stopped.
+    """
+    solvers = Solvers(experiment, options, stopwatch)
+    held, held_positions = experiment.grasped(dynamics.t_s)
+    x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
+    v0 = np.zeros(x.shape[1])
+    if known is None:
+        try:
+            first_near = None if near is None else near[0]
+            x[0], v0 = start_state(experiment, theta, solvers.holding(held[0]), first_near)
+        except SimulationError as failure:
+            return x[:0], failure
+        known = x[:1]
+    done = len(known)
+    x[:done] = known
+    forces = np.zeros_like(x)  # total force at every evaluation so far
+    xi, nu = dynamics.evaluation_states(x)
+    first, seen = dynamics.first_row, done - dynamics.first_row
+    history = dynamics.history(x[:done], theta)
+    if seen > 0:
+        here = slice(first, done)
+        carried = dynamics.carried(history, here)
+        forces[here] = dynamics.forces.rows(here).total(xi[:seen], nu[:seen], theta, carried)
+    dynamics.without_taken(forces)
+    memory, intervals = history.last if history else None, dynamics.until_next_s
+    for t in range(done, dynamics.rows):
+        carried = memory.ahead(intervals[t - 1]) if memory else None
+        row = RowEquations(dynamics, theta, x, forces, t, carried)
+        solver = solvers.holding(held[t])
+        goal = held_positions[t].ravel()[solver.held]
+        if not dynamics.static:
+            guess = extrapolated(x[:t], dynamics.step_s * v0)
+        elif near is None:
+            guess = _carried_on(x[:t], solver.held, goal)
+        else:
+            guess = near[t]
+        try:
+            x[t] = solve_row(solver, row, guess, x[t - 1], goal)
+        except NewtonFailure as failure:
+            time_s = float(dynamics.t_s[t])
+            return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
+        forces[t] = row.force(x[t])
+        forces[t, dynamics.taken[t]] = 0
+        if memory:
+            memory = memory.after(row.states(x[t])[0][0], intervals[t - 1])
+        if progress:
+            progress(t / (dynamics.rows - 1))
+    return x, None
+
+
+def extrapolated(x: Array, first_step: Array) -> Array:
+    """The next row, extrapolated."""
+    if len(x) > 2:
+        return 3 * (x[-1] - x[-2]) + x[-3]
+    return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
+
+
+def _carried_on(x: Array, held: Index, goal: Array) -> Array:
+    """The next equilibrium, as far on as what is held goes on from the last two."""
+    if len(x) < 2:
+        return x[-1]
+    before, way = x[-1, held] - x[-2, held], goal - x[-1, held]
+    share = float(before @ way) / max(float(before @ before), np.finfo(float).tiny)
+    return x[-1] + share * (x[-1] - x[-2])
+
+
+class RowEquations:
+    """Row t of the discrete equations as a function of x_t alone."""
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        theta: Array,
+        x: Array,
+        forces: Array,
+        t: int,
+        carried: Past | None = None,
+    ) -> None:
+        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t, theta)
+        self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
+        self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
+        row = self.row
+        first, shape = max(0, t - dynamics.reach), x.shape[1:]
+        past, past_forces = x[first:t][::-1], forces[first:t][::-1]
+        self.xi = weighted(row.p, past, shape)
+        self.nu = weighted(row.q, past, shape)
+        self.known = weighted(row.w, past_forces, shape)
+        self.known -= row.mass_kg * weighted(row.s, past, shape)
+        self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
+
+    def under(self, share: float) -> RowEquations:
+        """The same when a share of the change of a static load has come."""
+        found = copy(self)
+        if self.forces_before is not None:
+            found.forces = self.forces_before.towards(self.forces, share)
+        return found
+
+    def force(self, x: Array) -> Array:
+        """F_t."""
+        return self.forces.total(*self.states(x), self.theta, self.carried)[0]
+
+    def states(self, x: Array) -> tuple[Array, Array]:
+        """ξ_t and ν_t, (1, 3n) each."""
+        return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
+
+    def balanced(self, force: Array, x: Array) -> Array:
+        """c_t from F_t."""
+        row = self.row
+        return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
+
+    def residual(self, x: Array) -> Array:
+        """c_t."""
+        return self.balanced(self.force(x), x)
+
+    def linearise(self, x: Array) -> tuple[Array, Array, Array]:
+        """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
+        at = self.forces.linearise(*self.states(x), self.theta, carried=self.carried)
+        matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
+        skew = self.row.skew_block(at.by_position_skew[0])
+        return self.balanced(at.force[0], x), matrix, skew
+
+
+def solve_row(
+    solver: Solver, row: RowEquations, guess: Array, previous: Array, held: Array
+) -> Array:
+    """Solve one row; where Newton fails, move the grasp in ever smaller parts of its way.
+
+    So does a static load change then. Static rows keep to the branch that is stable.
+    """
+    origin = previous[solver.held]
+
+    def solve(near: Array, share: float) -> Array:
+        start, step = near.copy(), row.under(share)
+        # To the last digit at the end: bounds hold it there.
+        goal = held if share == 1 else origin + share * (held - origin)
+        if row.dynamics.static:
+            return solver.newton(start, step.residual, step.linearise, True, goal)
+        start[solver.held] = goal
+        return solver.newton(start, step.residual, step.linearise)
+
+    return followed(solve, previous, solver.options.halvings, guess)

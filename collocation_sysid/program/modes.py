@@ -1,0 +1,143 @@
+"""Small oscillations of a body about a state: natural frequencies, shapes and their damping.
+
+Free dofs obey M ẍ + C ẋ + K x = 0 with the stiffness K at that state, the lumped mass M and the
+damping C. A mode K φ = ω² M φ has the damping ratio ζ = φᵀC φ / 2ω φᵀM φ; where Rayleigh's
+C = γ_r K + γ_m M is the same throughout the body that is γ_r ω / 2 + γ_m / 2ω, and the mode
+oscillates for itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from numpy.typing import ArrayLike
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from ..arrays import Array, Index
+from ..fem.body import Body
+from ..model.forces import Forces
+from .factorisation import Factor, Factoriser
+
+# ω² below this share of the largest K_ii / M_ii is zero up to rounding.
+RIGID = 1e-12
+# Lanczos iterations need some room beside the modes they find; fewer dofs are solved densely.
+DENSE = 150
+# Where a body can move rigidly, K is singular: it is shifted by this share of K_ii / M_ii.
+SHIFT = 1e-10
+RIGID_MOTIONS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """The lowest modes that oscillate, by frequency.
+
+    Attributes
+    ----------
+    frequencies_hz : (k,) undamped natural frequencies ω / 2π
+    damping_ratios : (k,) ζ; 1 and above does not oscillate
+    shapes : (k, n, 3) displacements, φᵀ M φ = 1 kg (unit m); held nodes rest
+    not_oscillating : int
+        Modes left out because nothing drives them back: six rigid ones of a body nobody holds,
+        and those in which a state is unstable.
+    """
+
+    frequencies_hz: Array
+    damping_ratios: Array
+    shapes: Array
+    not_oscillating: int = 0
+
+    @property
+    def angular_frequencies_rad_s(self) -> Array:
+        """(k,) ω."""
+        return 2 * np.pi * self.frequencies_hz
+
+
+def natural_modes(
+    body: Body,
+    x: ArrayLike,
+    free_dofs: Index,
+    theta: Array,
+    count: int = 6,
+    forces: Forces | None = None,
+) -> Modes:
+    """The lowest modes of a body about a state.
+
+    Parameters
+    ----------
+    body : Body
+    x : (n, 3) or (3n,) array
+        The state; it should be an equilibrium.
+    free_dofs : (k,) sorted dofs that are not held
+    theta : (k,) constants of the body
+    count : int
+        Modes wanted; there may be fewer.
+    forces : Forces, optional
+        On the body at one time; nothing acts on it by default.
+
+    Returns
+    -------
+    Modes
+    """
+    forces = forces or Forces.on(body)
+    mass, pattern = forces.mass.row(0, theta)[free_dofs], forces.pattern
+    state = np.asarray(x, dtype=float).reshape(1, -1)
+    at = forces.linearise(state, np.zeros_like(state), theta)
+    lower, damping = -at.by_position[0], -at.by_velocity[0]
+    stiffness = sp.csc_array(pattern.matrix(lower)[:, free_dofs][free_dofs])
+    largest = float((stiffness.diagonal() / mass).max(initial=0.0))
+    wanted = count + RIGID_MOTIONS
+    if len(free_dofs) <= max(DENSE, 3 * wanted):
+        squares, vectors = _dense(stiffness, mass, wanted)
+    else:
+        lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
+        factor = Factoriser.of(pattern, free_dofs).factorise(lower)
+        squares, vectors = _lanczos(stiffness, mass, factor, -SHIFT * largest, wanted)
+    oscillating = squares > RIGID * largest
+    shapes = np.zeros((int(oscillating.sum()), pattern.size))
+    shapes[:, free_dofs] = vectors[:, oscillating].T
+    omega, shapes = np.sqrt(squares[oscillating])[:count], shapes[:count]
+    drag = np.einsum("ki,ki->k", shapes, (pattern.matrix(damping) @ shapes.T).T)
+    return Modes(
+        omega / (2 * np.pi),
+        drag / (2 * omega),
+        shapes.reshape(-1, len(body.nodes_m), 3),
+        int((~oscillating).sum()),
+    )
+
+
+def _dense(stiffness: sp.csc_array, mass: Array, wanted: int) -> tuple[Array, Array]:
+    root = np.sqrt(mass)
+    scaled = stiffness.toarray() / np.outer(root, root)
+    last = min(wanted, len(mass)) - 1
+    squares, vectors = scipy.linalg.eigh(scaled, subset_by_index=(0, last))
+    return squares, vectors / root[:, None]
+
+
+class _Inverse(LinearOperator):
+    """(K − shift · M)⁻¹ from its factor."""
+
+    def __init__(self, factor: Factor, size: int) -> None:
+        super().__init__(np.dtype(float), (size, size))
+        self.factor = factor
+
+    def _matvec(self, x: Array) -> Array:
+        return self.factor.solve(np.ravel(x))
+
+
+def _lanczos(
+    stiffness: sp.csc_array, mass: Array, factor: Factor, shift: float, wanted: int
+) -> tuple[Array, Array]:
+    """Shift-invert Lanczos iterations: the modes nearest to `shift`, just below zero."""
+    squares, vectors = eigsh(
+        stiffness,
+        wanted,
+        M=sp.diags_array(mass, format="csc"),
+        sigma=shift,
+        OPinv=_Inverse(factor, len(mass)),
+        v0=np.random.default_rng(0).normal(size=len(mass)),
+    )
+    order = np.argsort(squares)
+    return squares[order], vectors[:, order]

@@ -1,0 +1,157 @@
+"""Equations of motion of some dofs as rows of a Jacobian, in scaled quantities.
+
+Rows are c / `force_n` by x / `length_m`; where a dof is held instead, (x − u x̄) / `length_m`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import Array, Index
+from ..fem.body import Linearisation
+from ..fem.pattern import SymmetricPattern
+from ..model.dynamics import Dynamics
+from .block_band import Block, BlockBand, Term
+from .release import ReleasedGrasps
+from .unsymmetric import adding_skew, skew_values
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRows:
+    """∂c/∂x of the rows of one experiment; row numbers count from its first.
+
+    Attributes
+    ----------
+    dynamics : Dynamics
+        As stated.
+    row_dofs : (k,) the dof of each row of a grid time, ascending
+    moving_dofs : those of them with an equation of motion; others are held throughout
+    length_m, force_n : units
+    """
+
+    dynamics: Dynamics
+    row_dofs: Index
+    moving_dofs: Index
+    length_m: float
+    force_n: float
+
+    @property
+    def pattern(self) -> SymmetricPattern:
+        """Sparsity of the blocks."""
+        return self.dynamics.pattern
+
+    @cached_property
+    def band(self) -> BlockBand:
+        """The structure."""
+        return BlockBand(self.pattern.size, self._starts, self._blocks())
+
+    @cached_property
+    def _skew(self) -> BlockBand:
+        """The same, to add the skew part of ∂F/∂x to it."""
+        return adding_skew(self.pattern.size, self._starts, self._blocks())
+
+    @property
+    def _starts(self) -> Index:
+        first_row = self.dynamics.first_row
+        starts = (np.arange(self.dynamics.rows) - first_row) * len(self.row_dofs)
+        return np.maximum(starts, -1) if first_row else starts
+
+    def _blocks(self) -> list[Block]:
+        rows, columns, source = self.pattern.full
+        place, moving = np.full(self.pattern.size, -1), np.zeros(self.pattern.size, dtype=bool)
+        place[self.row_dofs] = np.arange(len(self.row_dofs))
+        moving[self.moving_dofs] = True
+        whole, held = moving[rows], ~moving[rows] & (place[rows] >= 0)
+        scale = self.length_m / self.force_n
+        blocks = []
+        for lag in range(self.dynamics.reach + 1):
+            terms = [
+                # Column time t has the block of row t + lag, whose coefficients are at t + lag.
+                Term(
+                    lag - j - self.dynamics.first_row,
+                    scale * ahead(a, lag),
+                    scale * ahead(b, lag),
+                )
+                for j, a, b in self.dynamics.block_terms(lag)
+            ]
+            kept = whole.copy() if terms else whole & (rows == columns)
+            if lag == 0:
+                kept |= held & (rows == columns)
+            # Grasp rows hold constants only: they are written after the terms.
+            entries = place[rows[kept]], columns[kept], source[kept]
+            blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
+        return blocks
+
+    def _inertia_rows(self, lag: int) -> Index:
+        """Grid times whose rows have inertia at a lag."""
+        rows = np.arange(max(self.dynamics.first_row, lag), self.dynamics.rows)
+        return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
+
+    @cached_property
+    def _constants(self) -> tuple[Index, Index]:
+        """Positions of the inertia, and of the unit grasp entries."""
+        place = np.searchsorted(self.row_dofs, self.moving_dofs)
+        positions = [np.zeros(0, dtype=np.int64)]
+        for lag in range(self.dynamics.reach + 1):
+            columns = self._inertia_rows(lag) - lag
+            positions.append(self.band.positions(columns, lag, place, self.moving_dofs).ravel())
+        held = np.setdiff1d(self.row_dofs, self.moving_dofs)
+        rows = np.arange(self.dynamics.first_row, self.dynamics.rows)
+        grasps = self.band.positions(rows, 0, np.searchsorted(self.row_dofs, held), held)
+        return np.concatenate(positions), grasps.ravel()
+
+    def _inertia(self, dynamics: Dynamics, theta: Array) -> Array:
+        """∂c/∂x of the inertia, in the order of its positions."""
+        mass = dynamics.mass.at(theta)[:, self.moving_dofs] * self.length_m / self.force_n
+        values = [np.zeros(0)]
+        for lag in range(self.dynamics.reach + 1):
+            rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
+            values.append((coefficient[rows, None] * mass[rows]).ravel())
+        return np.concatenate(values)
+
+    @cached_property
+    def _known_inertia(self) -> Array:
+        """The same where it does not depend on (q, φ)."""
+        return self._inertia(self.dynamics, np.zeros(0))
+
+    @cached_property
+    def _passing(self) -> ReleasedGrasps:
+        scale = self.length_m / self.force_n
+        return ReleasedGrasps.of(
+            self.dynamics, self.band, self._starts, self.pattern, self.row_dofs, scale
+        )
+
+    def fill(
+        self,
+        values: Array,
+        forces: Linearisation,
+        dynamics: Dynamics,
+        theta: Array,
+        mass_moves: bool,
+    ) -> None:
+        """Write the values (band.nnz,), from the slopes of the forces at the evaluations.
+
+        Parameters
+        ----------
+        dynamics, theta : at the parameters
+        mass_moves : whether the mass depends on them
+        """
+        threads = dynamics.body.threads
+        self.band.fill(values, forces.by_position, forces.by_velocity, threads)
+        positions, grasps = self._constants
+        values[positions] += self._inertia(dynamics, theta) if mass_moves else self._known_inertia
+        skew = skew_values(self.pattern, forces.by_position_skew)
+        if skew.size:
+            self._skew.fill(values, skew, skew, threads)
+        self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
+        values[grasps] = 1.0
+
+
+def ahead(values: Array, steps: int) -> Array:
+    """values[t + steps] at t, zero beyond the end."""
+    shifted = np.zeros_like(values)
+    shifted[: len(values) - steps] = values[steps:]
+    return shifted

@@ -1,0 +1,195 @@
+"""Implicit Newmark (β = ¼, γ = ½), the reference integrator, with a step of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array, Index
+from ..model.forces import Forces
+from ..model.viscoelasticity import Remembered
+from ..model.weight import Weight
+from ..recording.experiment import Experiment
+from .channel import Forced
+from .lapack import one_blas_thread
+from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
+from .rest import start_state
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Positions, velocities and accelerations at one time, each (3n,)."""
+
+    t_s: float
+    x: Array
+    v: Array
+    a: Array
+    memory: Remembered | None = None
+
+
+@one_blas_thread()
+def newmark(
+    experiment: Experiment,
+    theta: Array,
+    steps_per_sample: int,
+    options: NewtonOptions | None,
+    progress: Progress | None,
+    sensed: Index,
+) -> tuple[Array, Array, Forced]:
+    """Positions and velocities (T, 3n) at the samples, and the reactions on some dofs at all steps.
+
+    Parameters
+    ----------
+    sensed : (g,) those dofs
+    """
+    stepper = _Stepper(experiment, theta, options)
+    times = experiment.t_s
+    x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
+    state = stepper.start()
+    x[0], v[0] = state.x, state.v
+    step = experiment.timestep_s / steps_per_sample
+    felt = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
+    felt[:, 0] = stepper.felt(state, sensed)
+    for k in range(1, len(times)):
+        for j in range(1, steps_per_sample + 1):
+            state = stepper.advance(state, float(times[k - 1] + j * step))
+            felt[:, (k - 1) * steps_per_sample + j] = stepper.felt(state, sensed)
+        x[k], v[k] = state.x, state.v
+        if progress:
+            progress(k / (len(times) - 1))
+    return x, v, Forced(*felt)
+
+
+class _Stepper:
+    """Newmark steps of one experiment."""
+
+    def __init__(self, experiment: Experiment, theta: Array, options: NewtonOptions | None) -> None:
+        self.experiment, self.theta = experiment, theta
+        self.body = experiment.body
+        self.options = options or NewtonOptions()
+        self.solvers = Solvers(experiment, options)
+
+    def start(self) -> _State:
+        """The experiment's start."""
+        time_s = float(self.experiment.t_s[0])
+        solver = self._solver(time_s)
+        x, v = start_state(self.experiment, self.theta, solver)
+        memory = None
+        if self.body.remembers:
+            loaded_s = self.experiment.loaded_since_s
+            memory = Remembered.at_start(self.body, x, self.theta, loaded_s)
+        state = _State(time_s, x, v, np.zeros_like(x), memory)
+        return self._balanced(state, time_s, solver.free)
+
+    def advance(self, state: _State, goal_s: float) -> _State:
+        """Advance to `goal_s`, in halves where Newton fails."""
+        step = goal_s - state.t_s
+        smallest = step * 0.5**self.options.halvings
+        state = self._after_a_change(state, goal_s)
+        while goal_s - state.t_s > 0.5 * smallest:
+            solver = self._solver(goal_s)
+            try:
+                end_s = goal_s if step >= goal_s - state.t_s else state.t_s + step
+                state = self._step(solver, state, end_s, goal_s)
+            except NewtonFailure as failure:
+                step /= 2
+                if step < smallest:
+                    raise simulation_error(
+                        solver, failure, state.t_s, "a Newmark step"
+                    ) from failure
+        return state
+
+    def felt(self, state: _State, dofs: Index) -> tuple[Array, Array]:
+        """The reactions on some dofs in a state, and where they are."""
+        if not len(dofs):
+            return np.zeros(0), np.zeros(0)
+        reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
+        return reaction[dofs], state.x[dofs]
+
+    def _force(self, state: _State, load_s: float) -> Array:
+        """All forces (3n,) in a state, under the loads of a time."""
+        now = state.memory.now if state.memory else None
+        return Forces.of(self.experiment, load_s).total(state.x, state.v, self.theta, now)[0]
+
+    def _solver(self, time_s: float) -> Solver:
+        return self.solvers.holding(self.experiment.held(time_s)[0])
+
+    def _mass(self, time_s: float) -> Array:
+        return Weight.of(self.experiment, time_s).mass.row(0, self.theta)
+
+    def _after_a_change(self, state: _State, goal_s: float) -> _State:
+        """The state with the accelerations after nodes are let go."""
+        before, after = self._solver(state.t_s), self._solver(goal_s)
+        if before is after:
+            return state
+        return self._balanced(state, goal_s, np.setdiff1d(after.free, before.free))
+
+    def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
+        """The state with accelerations of some dofs from the forces on them."""
+        acceleration = state.a.copy()
+        acceleration[dofs] = (self._force(state, load_s) / self._mass(load_s))[dofs]
+        return replace(state, a=acceleration)
+
+    def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
+        """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
+        theta, h = self.theta, end_s - state.t_s
+        forces = Forces.of(self.experiment, load_s)
+        mass = forces.mass.row(0, theta)
+        carried = state.memory.ahead(h) if state.memory else None
+        x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
+        slope = 2.0 / h
+        known_v = -slope * state.x - state.v
+        known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
+
+        def kinematics(x: Array) -> tuple[Array, Array]:
+            v, a = slope * x + known_v, slope**2 * x + known_a
+            # Finite differences of a grasp's motion ring under this rule; its own motion does not.
+            v[solver.held], a[solver.held] = v_held, a_held
+            return v, a
+
+        def residual(x: Array) -> Array:
+            v, a = kinematics(x)
+            return forces.total(x, v, theta, carried)[0] - mass * a
+
+        def linearise(x: Array) -> tuple[Array, Array, Array]:
+            v, a = kinematics(x)
+            at = forces.linearise(x, v, theta, carried=carried)
+            matrix = -(at.by_position[0] + slope * at.by_velocity[0])
+            matrix[forces.pattern.diagonal] += slope**2 * mass
+            return at.force[0] - mass * a, matrix, -at.by_position_skew[0]
+
+        guess = state.x + h * state.v + 0.5 * h * h * state.a
+        guess[solver.held] = x_held
+        if not solver.is_upright(guess):
+            guess = state.x.copy()
+            guess[solver.held] = x_held
+        x = solver.newton(guess, residual, linearise)
+        memory = state.memory.after(x, h) if state.memory else None
+        return _State(end_s, x, *kinematics(x), memory)
+
+    def _held_motion(
+        self, solver: Solver, time_s: float, h: float, holding_s: float
+    ) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration of the held dofs, by central differences."""
+        experiment, nodes_m = self.experiment, self.experiment.body.nodes_m
+        motion = np.zeros((3, *nodes_m.shape))
+        for grasp in experiment.grasps:
+            if not grasp.holds(holding_s):
+                continue
+            # What it does before it holds and after it has let go means nothing.
+            first = max(grasp.from_s, float(experiment.t_s[0]))
+            last = min(grasp.until_s, float(experiment.t_s[-1]))
+            times = np.clip([time_s - h, time_s, time_s + h], first, last)
+            before, now, after = grasp.carry(nodes_m, times)[..., grasp.columns]
+            velocity = (after - before) / (times[2] - times[0])
+            whole = times[2] - times[1] > 0.5 * h
+            acceleration = (after - 2 * now + before) / h**2 if whole else np.zeros_like(now)
+            place = np.ix_(grasp.nodes, grasp.columns)
+            motion[:, *place] = now, velocity, acceleration
+        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.held]
+        return now, velocity, acceleration

@@ -1,0 +1,303 @@
+"""Newton's method for the static problem and for one implicit timestep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..errors import SimulationError
+from ..recording.experiment import Experiment
+from .factorisation import Factor, Factoriser
+from .stopwatch import Stopwatch
+
+Residual = Callable[[Array], Array]
+# Residual, and the lower triangles of the symmetric and the skew part of its slope's negative.
+Linearise = Callable[[Array], tuple[Array, Array, Array]]
+T = TypeVar("T")
+
+# With the factor of the iterate before, a last step must be this much shorter.
+STALE = 0.01
+# Steps with the factor of the solution before are taken while each is this much shorter than the
+# last, so often at most, and until what is left is this share of a last step.
+FAST, OFTEN, LEFT = 0.1, 8, 1e-5
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Newton's method for one implicit step or the rest state.
+
+    Attributes
+    ----------
+    tolerance : float
+        Length of the last Newton step over the body's size.
+    iterations : int
+        Iterations before a step is given up.
+    backtracks : int
+        Halvings of a Newton step before it is given up.
+    halvings : int
+        How often a time step (Newmark) or the grasp's motion in it (schemes) is halved.
+    """
+
+    tolerance: float = 1e-10
+    iterations: int = 30
+    backtracks: int = 25
+    halvings: int = 8
+
+
+class NewtonFailure(Exception):
+    """Newton did not converge; carries the worst state for the message."""
+
+    def __init__(self, x: Array, reason: str) -> None:
+        self.x = x
+        self.reason = reason
+        super().__init__(x, reason)
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+class Solver:
+    """Newton with backtracking on the free dofs of a body with given held dofs.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Its body and grasps.
+    options : NewtonOptions
+    stopwatch : Stopwatch, optional
+    held : (n, 3) bool, optional
+        Which coordinates are held; those at the experiment's first time by default.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        options: NewtonOptions | None = None,
+        stopwatch: Stopwatch | None = None,
+        held: NDArray[np.bool_] | None = None,
+    ) -> None:
+        self.stopwatch = stopwatch or Stopwatch()
+        self.body = experiment.body
+        self.options = options or NewtonOptions()
+        at_start = experiment.held(experiment.t_s[:1])[0]
+        holding = at_start if held is None else held
+        self.free, self.held = np.flatnonzero(~holding), np.flatnonzero(holding)
+        self.pattern = experiment.pattern
+        self.factoriser = Factoriser.of(self.pattern, self.free)
+        self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+        self._kept: Factor | None = None
+
+    def newton(
+        self,
+        x: Array,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool = False,
+        goal: Array | None = None,
+    ) -> Array:
+        """Solve residual(x) = 0 for the free dofs, starting at x (3n,).
+
+        A step is accepted when the next one, computed with the same factor, is shorter
+        (Deuflhard's natural monotonicity test), no element is inverted, and with
+        `keep_definite` only while −∂r/∂x stays positive definite. Without, the factor of the
+        solution before serves as long as steps shrink fast.
+
+        Parameters
+        ----------
+        residual : x -> (3n,)
+        linearise : x -> residual (3n,), and lower triangles of the symmetric part (m,) and the
+            skew part, (m,) or (0,), of −∂r/∂x
+        goal : (held,) ndarray, optional
+            Where the held dofs are to be, if not where they are. The body goes with them as its
+            stiffness at x has it: moved alone, they would crush the elements next to them.
+        """
+        x = x.copy() if goal is None else self._moved(x, goal, linearise)
+        self._require_upright(x)
+        if self._kept is not None and not keep_definite:
+            x, done = self._nearer(x, residual, self._kept)
+            if done:
+                return x
+        value, *matrix = self._timed(linearise, x)
+        factor = self._factorise(matrix, x, keep_definite)
+        step = self._step(factor, value)
+        for _ in range(self.options.iterations):
+            if self._is_last(step):
+                self._kept = factor
+                x[self.free] += step
+                return x
+            x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
+        raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
+
+    def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
+        """As near to the solution as the kept factor leads fast, and whether that is there."""
+        found, before, done = x.copy(), None, False
+        for _ in range(OFTEN):
+            step = self._step(kept, self._timed(residual, found))
+            length = float(np.linalg.norm(step))
+            rate = length / before if before else 1.0
+            if not rate <= 1.0:
+                return x, False
+            found[self.free] += step
+            done = self._is_last(rate * step, LEFT)
+            if done or (before and rate > FAST):
+                break
+            before = length
+        return (found, done) if self.is_upright(found) else (x, False)
+
+    def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
+        """The state with the held dofs at their goal, to first order in equilibrium."""
+        found, way = x.copy(), np.zeros_like(x)
+        way[self.held] = goal - x[self.held]
+        found[self.held] = goal
+        if not self._is_last(way):
+            self._require_upright(x)
+            value, *matrix = self._timed(linearise, x)
+            pulled = self.pattern.products(matrix[0][None], way[None])[0]
+            factor = self._factorise(matrix, x, keep_definite=False)
+            found[self.free] += self._step(factor, value - pulled)
+        return found
+
+    def _backtrack(
+        self,
+        x: Array,
+        step: Array,
+        factor: Factor,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool,
+    ) -> tuple[Array, Factor, Array]:
+        """The next iterate, its factor and its step."""
+        length = np.linalg.norm(step)
+        share = 1.0
+        for _ in range(self.options.backtracks):
+            trial = x.copy()
+            trial[self.free] += share * step
+            if self.is_upright(trial):
+                # A whole step is mostly taken: it is evaluated with its derivatives at once.
+                if share == 1:
+                    value, *matrix = self._timed(linearise, trial)
+                else:
+                    value, matrix = self._timed(residual, trial), None
+                next_step = self._step(factor, value)
+                if np.linalg.norm(next_step) <= (1 - share / 4) * length:
+                    if self._is_last(next_step, STALE) and not keep_definite:
+                        return trial, factor, next_step
+                    if matrix is None:
+                        value, *matrix = self._timed(linearise, trial)
+                    try:
+                        own = self._factorise(matrix, trial, keep_definite)
+                        return trial, own, self._step(own, value)
+                    except NewtonFailure:
+                        pass
+            share /= 2
+        raise NewtonFailure(x, "no step along Newton's direction makes progress")
+
+    def _is_last(self, step: Array, share: float = 1.0) -> bool:
+        tolerance = share * self.options.tolerance * self._size_m
+        return bool(np.abs(step).max(initial=0.0) <= tolerance)
+
+    def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
+        try:
+            with self.stopwatch.solving():
+                factor = self.factoriser.factorise(matrix[0], matrix[1])
+        except np.linalg.LinAlgError as error:
+            raise NewtonFailure(x, f"the equations are singular: {error}") from error
+        if keep_definite and not factor.positive_definite:
+            raise NewtonFailure(x, "the stiffness is not positive definite")
+        return factor
+
+    def _step(self, factor: Factor, residual: Array) -> Array:
+        with self.stopwatch.solving():
+            return factor.solve(residual[self.free])
+
+    def _timed(self, function: Callable[[Array], T], x: Array) -> T:
+        with self.stopwatch.evaluating():
+            return function(x)
+
+    def is_upright(self, x: Array) -> bool:
+        """Whether no element is inverted at x (3n,)."""
+        return bool(self.body.volume_ratios(x).min() > 0)
+
+    def _require_upright(self, x: Array) -> None:
+        if not self.is_upright(x):
+            raise NewtonFailure(x, "an element is inverted before the first iteration")
+
+    def worst_element(self, x: Array) -> int:
+        """The element with the smallest det F."""
+        return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
+
+
+def followed(
+    solve: Callable[[Array, float], Array], x: Array, halvings: int, guess: Array | None = None
+) -> Array:
+    """Follow x(s), what `solve(near, s)` finds, from x(0) to x(1) in steps that shrink on failure.
+
+    They grow again after two that succeed.
+
+    A guess of x(1) is tried first; where that fails the way there is taken, if it may be halved.
+
+    Raises
+    ------
+    NewtonFailure
+        Where a step that has been halved so often fails.
+    """
+    if guess is not None:
+        try:
+            return solve(guess, 1.0)
+        except NewtonFailure:
+            if not halvings:
+                raise
+    rate, reached, increment, easy = np.zeros_like(x), 0.0, 1.0, False
+    while reached < 1.0:
+        step = min(increment, 1.0 - reached)
+        try:
+            found = solve(x + step * rate, reached + step)
+        except NewtonFailure:
+            # What fails costs many times what succeeds: better short steps that grow.
+            increment, easy = step / 4, False
+            if increment < 0.5**halvings:
+                raise
+        else:
+            x, rate, reached = found, (found - x) / step, reached + step
+            # One step as long as that which failed would fail again.
+            increment, easy = (2 * step if easy else step), True
+    return x
+
+
+class Solvers:
+    """The solvers of an experiment, one for each set of dofs that is held at some time."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        options: NewtonOptions | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        self._arguments = (experiment, options, stopwatch)
+        self._known: dict[bytes, Solver] = {}
+
+    def holding(self, held: NDArray[np.bool_]) -> Solver:
+        """The solver with these coordinates (n, 3) held."""
+        key = held.tobytes()
+        if key not in self._known:
+            self._known[key] = Solver(*self._arguments, held)
+        return self._known[key]
+
+
+def simulation_error(
+    solver: Solver, failure: NewtonFailure, time_s: float, what: str
+) -> SimulationError:
+    """The error for the user: what failed, when, at which element, and what to change."""
+    element = solver.worst_element(failure.x)
+    ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
+    return SimulationError(
+        f"{what} failed: {failure.reason}; the worst element has det F = {ratio:.3g}. "
+        "Stiffer parameters, a smaller timestep or a finer mesh may help",
+        time_s,
+        element,
+    )

@@ -1,0 +1,110 @@
+"""One experiment at a point of the program: its parameters, its motion, and what is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..arrays import Array
+from ..fem.body import Linearisation
+from ..model.setting import Setting
+from .channel import Motion
+from .segment import Segment
+from .sensing import Sensing
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One experiment at a point of the NLP.
+
+    Attributes
+    ----------
+    segment : Segment
+    q : (nq,) shared parameters
+    phi : (k,) its nuisance parameters
+    x : (N, 3n) positions [m], or its first rows
+    brought : (N, …) or None
+        What the evaluations bring from the past, where it is given; see `Dynamics`.
+    given : mapping
+        Of readings, by their numbers, what they look at where that does not follow from x.
+    bent : bool
+        Whether readings are, or taken as linear in second derivatives.
+    """
+
+    segment: Segment
+    q: Array
+    phi: Array
+    x: Array
+    brought: Array | None = None
+    given: Mapping[int, Array] = field(default_factory=dict)
+    bent: bool = True
+
+    @cached_property
+    def setting(self) -> Setting:
+        """The physical parameters."""
+        found = self.segment.setting(self.q, self.phi)
+        if self.brought is None:
+            return found
+        return replace(found, dynamics=replace(found.dynamics, brought=self.brought))
+
+    @cached_property
+    def sensing(self) -> Sensing:
+        """What is looked at."""
+        return Sensing(self.segment, self.setting, self.phi)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """What channels look at."""
+        return self.sensing.motion(self.x)
+
+    @cached_property
+    def looked(self) -> list[Array]:
+        """Of each reading what it looks at (n, e, 3)."""
+        return [
+            self.given[k] if k in self.given else reading.channel.values(self.motion, self.phi)
+            for k, reading in enumerate(self.segment.readings)
+        ]
+
+    @property
+    def loss(self) -> float:
+        """Of all readings, without priors."""
+        pairs = zip(self.segment.readings, self.looked, strict=True)
+        return sum(reading.loss(looked, self.phi) for reading, looked in pairs)
+
+    @cached_property
+    def loss_slopes(self) -> list[tuple[Array, Array]]:
+        """Of each reading ∂loss by what it looks at (n, e, 3), and by its φ (k,)."""
+        pairs = zip(self.segment.readings, self.looked, strict=True)
+        return [reading.loss_slopes(looked, self.phi) for reading, looked in pairs]
+
+    def gradient(self) -> tuple[Array, Array]:
+        """∂loss/∂x (N, 3n) and ∂loss/∂(q, φ) (nq + k,), at what is given."""
+        nq, phi = self.segment.nq, self.phi
+        by_x, by_p, by_reaction = np.zeros_like(self.x), np.zeros(nq + len(phi)), None
+        pairs = zip(self.segment.readings, self.loss_slopes, strict=True)
+        for k, (reading, (by_looked, by_phi)) in enumerate(pairs):
+            by_p[nq:] += by_phi
+            if k not in self.given:
+                pulled = reading.channel.pulled(self.motion, phi, by_looked)
+                by_x, by_p[nq:] = by_x + pulled.by_x, by_p[nq:] + pulled.by_phi
+                if pulled.by_reaction is not None:
+                    by_reaction = pulled.by_reaction + (0.0 if by_reaction is None else by_reaction)
+        if by_reaction is not None:
+            through_x, through_p = self.sensing.pulled(self.x, by_reaction)
+            by_x += through_x
+            by_p[self.segment.moving] += through_p
+        return by_x, by_p
+
+    @cached_property
+    def forces(self) -> Linearisation:
+        """Those of the evaluations with their slopes, valid until others are formed."""
+        rows = self.segment.linearisation_rows
+        return self.setting.dynamics.linearise(self.x, self.setting.theta, rows)
+
+    @property
+    def residual_n(self) -> Array:
+        """(N, free dofs) violation of the equations of motion in newtons."""
+        return self.segment.residual_n(self.x, self.setting)

@@ -1,0 +1,98 @@
+"""The state an experiment starts from: equilibrium under its loads, undeformed, or given."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import Array
+from ..model.forces import Forces
+from ..model.viscoelasticity import start_carried
+from ..recording.experiment import Experiment
+from .factorisation import NONE
+from .lapack import one_blas_thread
+from .newton import NewtonFailure, Solver, followed, simulation_error
+
+
+@one_blas_thread()
+def rest_state(
+    experiment: Experiment,
+    theta: Array,
+    time_s: float | None = None,
+    start: Array | None = None,
+    solver: Solver | None = None,
+) -> Array:
+    """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
+
+    Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails, the
+    load is applied and the other grasps are moved in steps, from the shape carried. A body with
+    memory has relaxed, or has been loaded for as long as the experiment says.
+
+    Raises
+    ------
+    SimulationError
+        If no stable equilibrium is found.
+    """
+    solver = solver or Solver(experiment)
+    at_s = float(experiment.t_s[0] if time_s is None else time_s)
+    body = experiment.body
+    forces = Forces.of(experiment, at_s)
+    still = np.zeros((1, body.pattern.size))
+    shape = experiment.rigid_positions([at_s])[0]
+    carried = start_carried(body, theta, experiment.loaded_since_s)
+
+    def solve(x: Array, share: float) -> Array:
+        loaded = forces.scaled(share)
+
+        def residual(state: Array) -> Array:
+            return loaded.total(state, still, theta, carried)[0]
+
+        def linearise(state: Array) -> tuple[Array, Array, Array]:
+            # Nothing moves: there is no skew part.
+            at = loaded.linearise(state, still, theta, carried=carried)
+            return at.force[0], -at.by_position[0], NONE
+
+        goal = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
+        return solver.newton(x, residual, linearise, keep_definite=True, goal=goal)
+
+    try:
+        return followed(solve, shape.ravel(), solver.options.halvings, start)
+    except NewtonFailure as failure:
+        raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
+
+
+def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
+    """Held nodes (n, 3) when their grasps have come a share of their way from the carried body.
+
+    Each grasp turns about the middle of its nodes, which goes straight: none is squeezed or
+    sheared on the way, however far it turns. Other nodes stay where they are carried.
+    """
+    positions = carried.copy()
+    for grasp in experiment.grasps:
+        if not grasp.holds(time_s):
+            continue
+        start, nodes = carried[grasp.nodes], grasp.nodes
+        place = np.ix_(nodes, grasp.columns)
+        goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
+        if share == 1:
+            positions[place] = goal[:, grasp.columns]
+            continue
+        turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
+        part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
+        middle, way = start.mean(axis=0), (goal - start).mean(axis=0)
+        moved = middle + share * way + part.apply(start - middle)
+        positions[place] = moved[:, grasp.columns]
+    return positions
+
+
+def start_state(
+    experiment: Experiment, theta: Array, solver: Solver, near: Array | None = None
+) -> tuple[Array, Array]:
+    """x_0 and v_0, each (3n,), after the experiment's start rule; `near` is another x_0."""
+    velocity = experiment.start_velocities_m_s
+    v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
+    if experiment.start == "equilibrium":
+        return rest_state(experiment, theta, start=near, solver=solver), v0
+    if experiment.start_positions_m is not None:
+        return experiment.start_positions_m.ravel().copy(), v0
+    return experiment.rigid_positions(experiment.t_s[:1]).ravel(), v0

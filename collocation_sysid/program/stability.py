@@ -1,0 +1,190 @@
+"""Whether small disturbances of a state grow: eigenvalues s of M s² + D s + K with Re(s) > 0.
+
+K and D are −∂F/∂x and −∂F/∂v of the free dofs at a state, frozen and without velocity. Where both
+are positive definite nothing grows; to see that takes a factorisation each. A body that is
+compressed beyond buckling has a K that is not, and a damping law a D that is not where it feeds
+energy in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, eigsh, splu
+
+from ..arrays import Array, Index
+from ..fem.pattern import SymmetricPattern
+from ..model.forces import Forces
+from .collocation import Collocation, Part
+from .factorisation import Factoriser
+
+# States of a motion that are looked at.
+STATES = 8
+# Fewer dofs are solved densely; of more, so many of the most negative directions are tried.
+DENSE, DIRECTIONS = 150, 8
+# Singular matrices, of rigid motions, are not indefinite: a share of their largest entry per mass.
+SHIFT = 1e-9
+# Lanczos' iterations need no more to tell a sign.
+TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Instability:
+    """An experiment with states in which disturbances grow.
+
+    Attributes
+    ----------
+    experiment : str
+    time_s : float
+        Of the state in which they grow fastest.
+    growth_1_s : float
+        The largest Re(s) there.
+    e_foldings : float
+        What Re(s) > 0 adds up to over the recording: a disturbance may grow by e to this power.
+        Infinite for equilibria, which nothing that is disturbed returns to.
+    """
+
+    experiment: str
+    time_s: float
+    growth_1_s: float
+    e_foldings: float
+
+    @property
+    def sentence(self) -> str:
+        """What is said of it."""
+        return (
+            f"'{self.experiment}' is not stable at {self.time_s:.3g} s: disturbances grow by "
+            f"{self.growth_1_s:.2g} 1/s"
+        )
+
+
+def instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
+    """Those of the motions at z, one for each experiment that has unstable states."""
+    found = (_instability(part) for part in collocation.parts(z))
+    return tuple(each for each in found if each is not None)
+
+
+def _instability(part: Part) -> Instability | None:
+    experiment = part.segment.experiment
+    last = len(experiment.t_s) - 1
+    samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
+    t_s, rows = experiment.t_s[samples], part.segment.markers.grid_rows[samples]
+    held, theta = experiment.held(t_s).reshape(len(t_s), -1), part.setting.theta
+    growths = np.array(
+        [
+            growth_rate_1_s(Forces.of(experiment, time), x, np.flatnonzero(~there), theta)
+            for time, x, there in zip(t_s, part.x[rows], held, strict=True)
+        ]
+    )
+    worst = int(np.argmax(growths))
+    if growths[worst] <= 0:
+        return None
+    e_foldings = np.inf if experiment.static else float(np.trapezoid(growths, t_s))
+    return Instability(experiment.name, float(t_s[worst]), float(growths[worst]), e_foldings)
+
+
+def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, theta: Array) -> float:
+    """The largest Re(s) of M s² + D s + K at a state; 0 where none is positive.
+
+    Parameters
+    ----------
+    forces : Forces at one time
+    x : (3n,) the state
+    free_dofs : (k,) sorted dofs that are not held
+    theta : (k,) constants of the body
+    """
+    if not len(free_dofs):
+        return 0.0
+    state = x.reshape(1, -1)
+    at = forces.linearise(state, np.zeros_like(state), theta)
+    mass, pattern = forces.mass.row(0, theta)[free_dofs], forces.pattern
+    lowers = -at.by_position[0], -at.by_velocity[0]
+    if all(_definite(lower, pattern, free_dofs, mass) for lower in lowers):
+        return 0.0
+    root = sp.diags_array(1 / np.sqrt(mass))
+    stiffness, damping = (
+        sp.csc_array(root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root)
+        for lower in lowers
+    )
+    noise = SHIFT * np.sqrt(stiffness.diagonal().max())
+    found = _fastest(stiffness, damping)
+    return found if found > noise else 0.0
+
+
+def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
+    """Whether a matrix is positive definite, or as good as: none is."""
+    own = pattern.diagonal[free_dofs]
+    largest = float((lower[own] / mass).max())
+    if largest <= 0:
+        return not lower[own].any()
+    shifted = lower.copy()
+    shifted[own] += SHIFT * largest * mass
+    return Factoriser.of(pattern, free_dofs).factorise(shifted).positive_definite
+
+
+def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
+    """The largest Re(s) of s² + D s + K."""
+    size = len(stiffness.diagonal())
+    if size <= DENSE:
+        return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
+    lowest = [_lowest(each) for each in (stiffness, damping) if each.nnz]
+    basis, _ = np.linalg.qr(np.hstack(lowest))
+    in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
+    exponents = _exponents(*in_basis)
+    guess = exponents[np.argmax(exponents.real)]
+    return max(_near(stiffness, damping, float(abs(guess))), 0.0)
+
+
+def _lowest(matrix: sp.csc_array) -> Array:
+    """(n, k) directions in which it is most negative, or some where the search for them ends."""
+    start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
+    options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
+    try:
+        return np.asarray(eigsh(matrix, DIRECTIONS, **options)[1])
+    except ArpackNoConvergence as stopped:
+        return np.column_stack([stopped.eigenvectors, start])
+
+
+def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
+    """Every s of dense matrices."""
+    size = len(stiffness)
+    chain = np.block([[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]])
+    return np.linalg.eigvals(chain).astype(np.complex128)
+
+
+class _Turned(LinearOperator):
+    """(A + σ)/(A − σ) of A = [[0, 1], [−K, −D]] and a σ > 0.
+
+    Its eigenvalues (s + σ)/(s − σ) are beyond the unit circle where Re(s) > 0: those that
+    Arnoldi's iterations find first.
+    """
+
+    def __init__(self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> None:
+        size = len(stiffness.diagonal())
+        super().__init__(np.dtype(float), (2 * size, 2 * size))
+        self.damping, self.sigma = damping, sigma
+        self.solver = splu(
+            sp.csc_array(sigma**2 * sp.eye_array(size) + sigma * damping + stiffness)
+        )
+
+    def _matvec(self, x: Array) -> Array:
+        first, second = np.split(np.ravel(x), 2)
+        # (A − σ)(y, w) = (first, second), by way of (σ² + σ D + K) y.
+        y = self.solver.solve(-second - self.damping @ first - self.sigma * first)
+        w = first + self.sigma * y
+        return np.concatenate([first + 2 * self.sigma * y, second + 2 * self.sigma * w])
+
+
+def _near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
+    """The same of sparse ones, about as fast as σ."""
+    turning = _Turned(stiffness, damping, sigma)
+    try:
+        found = eigs(turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60)
+        turned = np.asarray(found[0])
+    except ArpackNoConvergence as stopped:
+        turned = np.asarray(stopped.eigenvalues)
+    exponents = sigma * (turned + 1) / (turned - 1)
+    return float(exponents.real.max(initial=0.0))

@@ -1,0 +1,262 @@
+"""One clock for an experiment: poses and markers on the same evenly spaced times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError
+from .clock import (
+    STEP_TOLERANCE,
+    even_times_s,
+    rounding_s,
+    sample_interval_s,
+    unrounded_s,
+)
+from .poses import PoseSequence
+from .readers import MarkerTable
+
+# Samples further apart than this many usual steps have lost ones between them.
+_GAP_STEPS = 1.5
+_SAME_TIME_STEPS = 1e-6
+_FEWEST_SAMPLES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """Poses and markers on one clock.
+
+    Attributes
+    ----------
+    t_s : (T,) array
+        The grid, evenly spaced.
+    poses : tuple of PoseSequence
+        One for each that was given.
+    table : MarkerTable
+        Markers on the grid.
+    notes : tuple of str
+        What was cut or interpolated, without a full stop.
+    """
+
+    t_s: Array
+    poses: tuple[PoseSequence, ...]
+    table: MarkerTable
+    notes: tuple[str, ...]
+
+
+def align(
+    poses: Sequence[PoseSequence],
+    table: MarkerTable,
+    window_s: tuple[float, float] | None = None,
+    resample_hz: float | None = None,
+    every: int = 1,
+    held_s: Sequence[tuple[float, float]] | None = None,
+    static: bool = False,
+) -> Aligned:
+    """Put poses and markers on one evenly spaced time grid over the time that they share.
+
+    Without `resample_hz` the grid is the markers' own time and no measurement is changed. With it,
+    markers are interpolated to that rate, linearly and only between two present neighbours. Poses
+    keep their samples: where these are at the grid's times to the rounding of either file, they
+    are moved onto it, else the motion between them, `PoseSequence.interpolation`, gives the poses
+    there. A single pose goes with any time.
+
+    Parameters
+    ----------
+    poses : sequence of PoseSequence
+        Poses of each grasp.
+    table : MarkerTable
+        Marker tracks on the same clock.
+    window_s : (float, float), optional
+        Samples before the first or after the second time are cut.
+    resample_hz : float, optional
+        Rate of the new grid, which starts at the first sample left.
+    every : int
+        Only every so-manieth sample of the markers is used.
+    held_s : sequence of (float, float), optional
+        First and last time at which each grasp holds; its poses need not go beyond. Throughout by
+        default.
+    static : bool
+        The grid is the markers' own time, however it is spaced, and one sample is enough.
+
+    Raises
+    ------
+    InputError
+        If the window is empty, the markers' time is uneven, or poses and markers share fewer than
+        three samples.
+    """
+    table = table if window_s is None else _cut(table, window_s)
+    held_s = held_s or [(-np.inf, np.inf)] * len(poses)
+    table, notes = _shared(table, poses, held_s, 1 if static else _FEWEST_SAMPLES)
+    if every > 1:
+        table = MarkerTable(table.t_s[::every], table.names, table.positions_m[::every])
+    if static:
+        t_s = grid = table.t_s
+    elif resample_hz is None:
+        sample_interval_s(table.t_s, "markers")
+        t_s, grid = table.t_s, even_times_s(table.t_s)
+        table = MarkerTable(grid, table.names, table.positions_m)
+    else:
+        t_s = grid = _grid(table.t_s, resample_hz)
+        table = MarkerTable(grid, table.names, _between_neighbours(table, grid))
+    moved = []
+    for k, sequence in enumerate(poses):
+        name = "the poses" if len(poses) == 1 else f"the poses of grasp {k + 1}"
+        matched = _matched(sequence, t_s, grid)
+        if matched is None:
+            matched = replace(sequence, t_s=unrounded_s(sequence.t_s))
+            notes.append(f"{name}{_interpolated(matched, grid)}")
+        notes += [f"{name}{note}" for note in _jumping(matched, grid)]
+        moved.append(matched)
+    return Aligned(grid, tuple(moved), table, tuple(notes))
+
+
+def _shared(
+    table: MarkerTable,
+    poses: Sequence[PoseSequence],
+    held_s: Sequence[tuple[float, float]],
+    fewest: int,
+) -> tuple[MarkerTable, list[str]]:
+    """The markers at times that have a pose in every grasp that holds then."""
+    t_s = table.t_s
+    kept = np.ones(len(t_s), dtype=bool)
+    moving = [(p, held) for p, held in zip(poses, held_s, strict=True) if len(p.t_s) > 1]
+    for sequence, (from_s, until_s) in moving:
+        slack_s = _tolerance_s(sequence, t_s)
+        # Beyond its first or last pose a grasp must not be asked for one.
+        if from_s < sequence.t_s[0] - slack_s:
+            kept &= t_s >= sequence.t_s[0] - slack_s
+        if until_s > sequence.t_s[-1] + slack_s:
+            kept &= t_s <= sequence.t_s[-1] + slack_s
+    if kept.all():
+        return table, []
+    spans = " and ".join(_span(sequence.t_s) for sequence, _ in moving)
+    if kept.sum() < fewest:
+        raise InputError(
+            f"poses run {spans}, markers {_span(t_s)}: they share {kept.sum()} marker samples; "
+            f"expected at least {fewest}: check that both are of one recording and one "
+            "clock, and window_s"
+        )
+    cut = t_s[kept]
+    ends = [
+        f"{length_s:.6g} s at the {end}"
+        for length_s, end in ((cut[0] - t_s[0], "start"), (t_s[-1] - cut[-1], "end"))
+        if length_s > 0
+    ]
+    note = (
+        f"the markers were cut to the time of the poses by {' and '.join(ends)}, "
+        f"{(~kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran {_span(t_s)}"
+    )
+    if cut[0] > t_s[0]:
+        note += f"; start tells the state at {cut[0]:.9g} s now"
+    return MarkerTable(cut, table.names, table.positions_m[kept]), [note]
+
+
+def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
+    first_s, last_s = window_s
+    steps = np.diff(table.t_s)
+    slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
+    kept = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
+    if not kept.any():
+        raise InputError(
+            f"window_s = [{first_s:g}, {last_s:g}] holds no marker sample; "
+            f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
+        )
+    return MarkerTable(table.t_s[kept], table.names, table.positions_m[kept])
+
+
+def _grid(t_s: Array, rate_hz: float) -> Array:
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
+    count = int(np.floor((t_s[-1] - t_s[0]) * rate_hz + _SAME_TIME_STEPS)) + 1
+    if count < 2:
+        raise InputError(
+            f"resample_hz = {rate_hz:g} leaves one sample between {t_s[0]:.9g} s and "
+            f"{t_s[-1]:.9g} s; raise it or widen window_s"
+        )
+    return t_s[0] + np.arange(count) / rate_hz
+
+
+def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
+    """Marker positions on the grid; NaN beside a missing sample or in a gap of the time."""
+    t_s, x = table.t_s, table.positions_m
+    k = np.clip(np.searchsorted(t_s, grid, side="right") - 1, 0, len(t_s) - 2)
+    step_s = t_s[k + 1] - t_s[k]
+    fraction = ((grid - t_s[k]) / step_s)[:, None, None]
+    between = (1.0 - fraction) * x[k] + fraction * x[k + 1]
+    between[step_s > _GAP_STEPS * np.median(np.diff(t_s))] = np.nan
+    # On a sample its neighbour does not matter, even if that one is missing.
+    on_earlier = fraction <= _SAME_TIME_STEPS
+    on_later = fraction >= 1.0 - _SAME_TIME_STEPS
+    return np.where(on_earlier, x[k], np.where(on_later, x[k + 1], between))
+
+
+def _matched(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
+    """Poses of the time of the markers, with their samples moved onto the grid.
+
+    None if there is not one at each marker time within their span.
+    """
+    if len(poses.t_s) == 1:
+        return poses
+    slack_s = _tolerance_s(poses, t_s)
+    within = (t_s >= poses.t_s[0] - slack_s) & (t_s <= poses.t_s[-1] + slack_s)
+    times = t_s[within]
+    if len(times) < 2:
+        return poses
+    later = np.clip(np.searchsorted(poses.t_s, times), 1, len(poses.t_s) - 1)
+    nearest = later - (times - poses.t_s[later - 1] < poses.t_s[later] - times)
+    if (np.abs(poses.t_s[nearest] - times) > slack_s).any():
+        return None
+    moved = poses.t_s + np.interp(poses.t_s, times, grid[within] - poses.t_s[nearest])
+    moved[nearest] = grid[within]
+    kept = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
+    return replace(
+        poses,
+        t_s=moved[kept],
+        positions_m=poses.positions_m[kept],
+        quaternions_xyzw=poses.quaternions_xyzw[kept],
+    )
+
+
+def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
+    """How far a pose may be from a marker time and still be of that time."""
+    step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    return STEP_TOLERANCE * step_s + 0.5 * (rounding_s(t_s) + rounding_s(poses.t_s))
+
+
+def _interpolated(poses: PoseSequence, grid: Array) -> str:
+    """What to say of poses that have no sample at each grid time."""
+    how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
+    at = f"{_rate_hz(grid):.6g} Hz {_span(grid)}" if len(grid) > 1 else _span(grid)
+    told = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
+    steps = np.diff(poses.t_s)
+    lost = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
+    lost &= poses.t_s[:-1] < grid[-1]
+    if not lost.any():
+        return told
+    k = int(np.argmax(np.where(lost, steps, 0.0)))
+    return (
+        f"{told}, also across {lost.sum()} gap{'s' * int(lost.sum() > 1)} in them, the longest "
+        f"{_span(poses.t_s[k : k + 2])}"
+    )
+
+
+def _jumping(poses: PoseSequence, grid: Array) -> list[str]:
+    if poses.interpolation != "smooth":
+        return []
+    at_s = poses.jumps_s[(poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])]
+    if not at_s.size:
+        return []
+    others = f" and {at_s.size - 1} more times" if at_s.size > 1 else ""
+    return [f" jump after t = {at_s[0]:.6g} s{others}; the motion is linear there, not smooth"]
+
+
+def _rate_hz(t_s: Array) -> float:
+    return (len(t_s) - 1) / float(t_s[-1] - t_s[0])
+
+
+def _span(t_s: Array) -> str:
+    return f"from {t_s[0]:.9g} s to {t_s[-1]:.9g} s"

@@ -1,0 +1,300 @@
+"""MuJoCo: a flex of tetrahedra, each node a body on three slides, grasps as mocap bodies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import eigh
+from scipy.sparse.linalg import eigsh
+from scipy.spatial.transform import Rotation
+
+from ...arrays import Array
+from ...errors import InputError
+from ...model.forces import Forces
+from ...program.modes import natural_modes
+from ...recording import Grasp
+from .identified import Identified
+from .target import (
+    LINEAR_ONLY,
+    Comparison,
+    Exported,
+    heading,
+    left_out,
+    linear_cells,
+    numbers,
+)
+
+MODEL = "body.xml"
+# Share of the largest step at which explicit damping and elasticity are stable.
+SAFE = 0.5
+# Half the thickness of the skin that collides, in mean edges.
+SKIN = 0.02
+# Mass of the body that carries grasped nodes, over that of the whole: so that they do not move it.
+HEAVY = 1e3
+# How far nodes are moved to see the stiffness, in mean edges.
+PROBE = 1e-5
+MOST_STEPS = 2_000_000
+
+
+def export(body: Identified) -> Exported:
+    """The model, with the state at the first sample as its key "start".
+
+    Raises
+    ------
+    InputError
+        For grasps that hold single axes, or not throughout.
+    """
+    for k, grasp in enumerate(body.experiment.grasps, start=1):
+        if grasp.axes != "xyz" or not grasp.holds(body.experiment.t_s).all():
+            raise InputError(
+                f"grasp {k} holds only {grasp.axes}, from {grasp.from_s:g} s until "
+                f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
+                "throughout: export to calculix or json"
+            )
+    limits = _limits(body)
+    step_s = _step_s(body)
+    x = heading(body, limits, "<!-- ", " -->")
+    x += f"<mujoco model={quoteattr(body.title or 'body')}>\n"
+    gravity = numbers(body.experiment.gravity_m_s2)
+    x += f'<option timestep="{step_s!r}" gravity="{gravity}" jacobian="sparse"/>\n'
+    x += f"<worldbody>\n{_grasps(body)}{_nodes(body)}</worldbody>\n"
+    x += f"<deformable>\n{_flexes(body)}</deformable>\n"
+    x += f"<equality>\n{_welds(body, step_s)}</equality>\n"
+    x += f"<keyframe>\n{_start(body)}</keyframe>\n"
+    return Exported({MODEL: f"{x}</mujoco>\n"}, tuple(limits))
+
+
+def _limits(body: Identified) -> list[str]:
+    said = left_out(body)
+    for region in body.regions:
+        if region.material != "st-venant-kirchhoff":
+            said.append(
+                f"{region.name}: a flex is St. Venant and Kirchhoff's; {region.material} has "
+                "the same E and ν at small strain, another stress from its second order on"
+            )
+        if region.gamma_r_s:
+            said.append(
+                f"{region.name}: the damping of a flex is γ_r times the rate of its second "
+                f"Piola–Kirchhoff stress, which is that of {region.damping} at small strain"
+            )
+        if region.gamma_m_1_s:
+            said.append(
+                f"{region.name}: damping by mass, γ_m = {region.gamma_m_1_s:.4g} 1/s, is "
+                "not known, and MuJoCo refuses dampers on the nodes of a flex"
+            )
+    if body.body.element.nodes == 10:
+        said.append(LINEAR_ONLY)
+    if body.experiment.grasps:
+        said.append(
+            "the weld of grasped nodes to the mocap bodies lags two steps behind: for a motion, "
+            "set position and velocity of the free joints at every step, as --verify does"
+        )
+    if body.experiment.forces:
+        said.append("forces on nodes are left out")
+    return said
+
+
+def _grasped(body: Identified) -> Any:
+    return body.held.all(axis=1)
+
+
+def _grasps(body: Identified) -> str:
+    """Of each a free body that carries its nodes, and the hand that it is welded to.
+
+    Nodes of an elastic flex may not ride on a mocap body.
+    """
+    lines, mass, size = "", body.node_mass_kg.sum() * HEAVY, np.ptp(body.nodes_m, axis=0).max()
+    turning = float(mass * size**2)
+    for k, grasp in enumerate(body.experiment.grasps):
+        position, turn = _pose(grasp, body.start_s)
+        at = f'pos="{numbers(position)}" quat="{numbers(turn)}"'
+        lines += (
+            f'<body name="hand{k}" mocap="true" {at}/>\n<body name="grasp{k}" {at} gravcomp="1">'
+            f'<freejoint/><inertial pos="0 0 0" mass="{float(mass)!r}" '
+            f'diaginertia="{turning!r} {turning!r} {turning!r}"/></body>\n'
+        )
+    return lines
+
+
+def _welds(body: Identified, step_s: float) -> str:
+    return "".join(
+        f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
+        f'solref="{2 * step_s!r} 1" solimp="0.9999 0.9999 0.001"/>\n'
+        for k in range(len(body.experiment.grasps))
+    )
+
+
+def _pose(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
+    """Position and quaternion wxyz."""
+    rotations, positions = grasp.poses.at([t_s])
+    return positions[0], np.roll(Rotation.from_matrix(rotations[0]).as_quat(), 1)
+
+
+def _nodes(body: Identified) -> str:
+    """Every node that is free as a body on three slides."""
+    lines, mass = "", body.node_mass_kg + body.tied_kg
+    for n in np.flatnonzero(~_grasped(body)):
+        slides = "".join(
+            f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
+        )
+        turning = max(1e-6 * float(mass[n]), 1e-12)  # a node does not turn, but must have some
+        lines += (
+            f'<body name="node{n}" pos="{numbers(body.nodes_m[n])}">'
+            f'<inertial pos="0 0 0" mass="{float(mass[n])!r}" '
+            f'diaginertia="{turning!r} {turning!r} {turning!r}"/>{slides}</body>\n'
+        )
+    return lines
+
+
+def _flexes(body: Identified) -> str:
+    """A flex for each region: nodes in the frame of what carries them, and cells."""
+    names = np.array([f"node{n}" for n in range(len(body.nodes_m))], dtype=object)
+    places = np.zeros_like(body.nodes_m)
+    for k, grasp in enumerate(body.experiment.grasps):
+        names[grasp.nodes] = f"grasp{k}"
+        places[grasp.nodes] = body.body.nodes_m[grasp.nodes]
+    skin = SKIN * _edge_m(body)
+    lines = ""
+    for region, cells in zip(body.regions, linear_cells(body), strict=True):
+        used, elements = np.unique(cells, return_inverse=True)
+        lines += (
+            f'<flex name="{region.name}" dim="3" radius="{skin!r}" body="{" ".join(names[used])}" '
+            f'vertex="{numbers(places[used])}" element="{" ".join(map(str, elements.ravel()))}">\n'
+            '<contact contype="1" conaffinity="0" selfcollide="none"/>\n'
+            f'<elasticity young="{region.young_pa!r}" poisson="{region.poisson!r}" '
+            f'damping="{region.gamma_r_s!r}"/>\n</flex>\n'
+        )
+    return lines
+
+
+def _edge_m(body: Identified) -> float:
+    ends = body.body.nodes_m[body.body.mesh.edges]
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
+
+
+def _start(body: Identified) -> str:
+    """Displacements and velocities at the first sample, as we roll it out."""
+    free = ~_grasped(body)
+    shape = body.nodes_m if body.rolled_out_m is None else body.rolled_out_m[0]
+    given = body.experiment.start_velocities_m_s
+    velocity = np.zeros_like(shape) if given is None else given
+    grasps = body.experiment.grasps
+    carriers = [np.concatenate(_pose(grasp, body.start_s)) for grasp in grasps]
+    places = numbers(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
+    speeds = numbers(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
+    return f'<key name="start" qpos="{places}" qvel="{speeds}"/>\n'
+
+
+def _step_s(body: Identified) -> float:
+    """A step at which MuJoCo's explicit forces are stable, that divides the samples evenly."""
+    state = body.body.nodes_m.reshape(1, -1)
+    at = body.body.linearise(state, np.zeros_like(state), body.theta)
+    stiffness = body.body.pattern.matrix(-at.by_position[0])
+    root = 1 / np.sqrt(np.repeat(body.node_mass_kg, 3))
+    scaled = sp.diags_array(root) @ stiffness @ sp.diags_array(root)
+    start = np.random.default_rng(0).normal(size=len(root))
+    largest = eigsh(scaled, 1, which="LA", v0=start, return_eigenvectors=False)
+    omega = float(np.sqrt(largest[0]))
+    ratio = max(region.gamma_r_s for region in body.regions) * omega / 2
+    step_s = SAFE * 2 / omega * (np.hypot(1, ratio) - ratio)
+    interval_s = body.experiment.timestep_s
+    return interval_s / int(np.ceil(interval_s / step_s))
+
+
+def verify(body: Identified, folder: Path) -> list[Comparison]:
+    """The first natural frequency, and a motion predicted anew.
+
+    Raises
+    ------
+    InputError
+        If MuJoCo is missing or refuses the model.
+    """
+    mujoco = _mujoco()
+    try:
+        model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
+    except ValueError as error:
+        raise InputError(f"MuJoCo refuses the model: {error}", folder / MODEL) from error
+    found = [_first_frequency(body, mujoco, model)]
+    if not body.experiment.static and body.rolled_out_m is not None:
+        found.append(_motion(body, mujoco, model))
+    return found
+
+
+def _mujoco() -> ModuleType:
+    try:
+        import mujoco  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise InputError(
+            'mujoco is not installed: pip install "collocation-sysid[mujoco]"'
+        ) from error
+    return mujoco
+
+
+def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
+    """Of the undeformed body: MuJoCo's by differences of its forces, and ours."""
+    data, free, grasps = mujoco.MjData(model), ~_grasped(body), len(body.experiment.grasps)
+    probe, count = PROBE * _edge_m(body), 3 * int(free.sum())
+    columns = np.zeros((count, count))
+    for column in range(count):
+        ends = []
+        for way in (probe, -probe):
+            mujoco.mj_resetData(model, data)
+            data.qpos[7 * grasps + column] = way
+            mujoco.mj_forward(model, data)
+            ends.append(data.qfrc_passive[6 * grasps :].copy())
+        columns[:, column] = (ends[1] - ends[0]) / (2 * probe)
+    mass = np.repeat((body.node_mass_kg + body.tied_kg)[free], 3)
+    root = 1 / np.sqrt(mass)
+    squares = eigh((columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True)
+    oscillating = squares[squares > 1e-9 * squares[-1]]
+    theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
+    dofs = np.flatnonzero(np.repeat(free, 3))
+    forces = Forces.of(body.experiment, body.start_s)
+    ours = natural_modes(body.body, body.nodes_m, dofs, body.theta, 1, forces).frequencies_hz
+    return Comparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
+
+
+def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
+    """The recording: how far nodes move besides rigidly, in MuJoCo and in our roll-out."""
+    e, free = body.experiment, ~_grasped(body)
+    data = mujoco.MjData(model)
+    model.eq_active0[:] = 0
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    steps = round(e.timestep_s / model.opt.timestep)
+    if steps * len(e.t_s) > MOST_STEPS:
+        raise InputError(f"{steps * len(e.t_s)} steps are too many to predict the motion with")
+    first = 7 * len(e.grasps)
+    shapes = [data.qpos[first:].reshape(-1, 3).copy()]
+    for k in range(steps * (len(e.t_s) - 1)):
+        _drive(body, mujoco, data, (body.start_s + k * model.opt.timestep, model.opt.timestep))
+        mujoco.mj_step(model, data)
+        if (k + 1) % steps == 0:
+            shapes.append(data.qpos[first:].reshape(-1, 3).copy())
+    theirs = np.array(shapes) + body.nodes_m[free]
+    assert body.rolled_out_m is not None
+    ours = body.rolled_out_m[:, free]
+    carried = e.rigid_positions(e.t_s)[:, free]
+    size_m, apart_m = _rms(ours - carried), _rms(theirs - ours)
+    share = f", {apart_m / size_m:.2%} of it" if size_m else ""
+    remark = f"they are {apart_m:.3g} m apart (RMS){share}"
+    what = "RMS deformation over the recording"
+    return Comparison(what, _rms(theirs - carried), size_m, "m", remark)
+
+
+def _drive(body: Identified, mujoco: ModuleType, data: Any, step: tuple[float, float]) -> None:
+    """Put what carries the grasped nodes where it is, on its way to where it is a step later."""
+    (t_s, step_s), last_s, turning = step, float(body.experiment.t_s[-1]), np.zeros(3)
+    for k, grasp in enumerate(body.experiment.grasps):
+        here, there = (_pose(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s))
+        mujoco.mju_subQuat(turning, there[1], here[1])
+        data.qpos[7 * k : 7 * k + 7] = np.concatenate(here)
+        data.qvel[6 * k : 6 * k + 6] = np.concatenate([there[0] - here[0], turning]) / step_s
+
+
+def _rms(way: Array) -> float:
+    return float(np.sqrt((way**2).sum(axis=-1).mean()))

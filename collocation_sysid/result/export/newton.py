@@ -1,0 +1,103 @@
+"""Newton: a Python module that builds the soft mesh from the numbers beside it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from ...tree import content
+from .identified import Identified
+from .target import LINEAR_ONLY, Exported, heading, left_out, linear_cells
+
+MODULE = "body.py"
+NUMBERS = "body.json"
+_BUILD = '''
+import json
+from pathlib import Path
+
+import newton
+import numpy as np
+import warp as wp
+
+body = json.loads(Path(__file__).with_name("body.json").read_text(encoding="utf-8"))
+
+
+def add_to(builder):
+    """Add the body to a newton.ModelBuilder; particles that are grasped have no mass."""
+    first = len(builder.particle_mass)
+    builder.add_soft_mesh(
+        pos=wp.vec3(),
+        rot=wp.quat_identity(),
+        scale=1.0,
+        vel=wp.vec3(),
+        vertices=body["nodes_m"],
+        indices=np.ravel(body["cells"]).tolist(),
+        density=1.0,
+        k_mu=np.array(body["k_mu"]),
+        k_lambda=np.array(body["k_lambda"]),
+        k_damp=np.array(body["k_damp"]),
+    )
+    for k, (mass, held) in enumerate(zip(body["node_mass_kg"], body["held"])):
+        builder.particle_mass[first + k] = 0.0 if held else mass
+
+
+def model(device=None):
+    """A model of the body alone, for newton.solvers.SolverVBD."""
+    builder = newton.ModelBuilder(gravity=tuple(body["gravity_m_s2"]))
+    add_to(builder)
+    builder.color()
+    return builder.finalize(device=device)
+'''
+
+
+def export(body: Identified) -> Exported:
+    """The module, and its numbers in ``body.json``.
+
+    The elastic constants are those of `SolverVBD`, whose energy is the stable neo-Hookean one of λ
+    and μ (Smith, de Goes & Kim 2018).
+    """
+    limits = left_out(body, moving=False)
+    cells, constants = [], []
+    for region, own in zip(body.regions, linear_cells(body), strict=True):
+        cells.append(own)
+        # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
+        damping = region.gamma_r_s * region.mu_pa / 2
+        constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
+        if region.material != "stable-neo-hookean":
+            limits.append(
+                f"{region.name}: {region.material} becomes the stable neo-Hookean energy of the "
+                "same λ and μ at small strain"
+            )
+        if region.gamma_r_s:
+            limits.append(
+                f"{region.name}: damping γ_r becomes a viscosity, γ_r μ / 2 in Pa s, of shape "
+                "alone: changes of volume are damped less"
+            )
+        if region.gamma_m_1_s:
+            limits.append(f"{region.name}: γ_m = {region.gamma_m_1_s:.4g} 1/s is not known")
+    if body.body.element.nodes == 10:
+        limits.append(LINEAR_ONLY)
+    limits += [
+        "SolverSemiImplicit takes other constants for the same material, k_mu = 4/3 μ and "
+        "k_lambda = λ + 5/6 μ, and another damping",
+        "positions are single precision; a USD file would hold E, ν and density, but no damping",
+    ]
+    if body.experiment.forces:
+        limits.append("forces on nodes are left out")
+    k_mu, k_lambda, k_damp = np.concatenate(constants).T
+    numbers = {
+        "nodes_m": np.where(body.held, body.held_m, body.nodes_m),
+        "cells": np.concatenate(cells),
+        "k_mu": k_mu,
+        "k_lambda": k_lambda,
+        "k_damp": k_damp,
+        "node_mass_kg": body.node_mass_kg + body.tied_kg,
+        "held": body.held.all(axis=1),
+        "gravity_m_s2": body.experiment.gravity_m_s2,
+    }
+    files = {
+        MODULE: heading(body, limits, "# ") + _BUILD,
+        NUMBERS: json.dumps(content(numbers)) + "\n",
+    }
+    return Exported(files, tuple(limits))

@@ -1,0 +1,102 @@
+"""SOFA: a scene of the body in its grasp, implicit Euler with Rayleigh's damping."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...errors import InputError
+from .identified import Identified, IdentifiedRegion
+from .target import Exported, heading, left_out, numbers
+
+SCENE = "body.scn"
+PLUGINS = (
+    "Constraint.Projective",
+    "LinearSolver.Direct",
+    "Mass",
+    "ODESolver.Backward",
+    "SolidMechanics.FEM.Elastic",
+    "SolidMechanics.FEM.HyperElastic",
+    "StateContainer",
+    "Topology.Container.Dynamic",
+)
+
+
+def export(body: Identified) -> Exported:
+    """The scene.
+
+    Raises
+    ------
+    InputError
+        For quadratic elements, several regions, or grasps of single axes.
+    """
+    if body.body.element.nodes != 4 or len(body.regions) != 1:
+        raise InputError(
+            f"the body has {len(body.regions)} region(s) of {body.body.element.name}; the scene "
+            "for SOFA takes one of linear tetrahedra: export to calculix, febio or json"
+        )
+    if (body.held.any(axis=1) != body.held.all(axis=1)).any():
+        raise InputError("a grasp holds single axes, which the scene for SOFA does not take")
+    region = body.regions[0]
+    limits, force = left_out(body, moving=False), _law(region)
+    limits += _limits(region)
+    if (body.held & (np.abs(body.held_m - body.nodes_m) > 1e-9)).any():
+        limits.append("grasps beside the first hold the body undeformed, not where they hold it")
+    if body.experiment.forces:
+        limits.append("forces on nodes are left out")
+    limits.append(
+        "untested: written after the descriptions of its components, never read by SOFA itself"
+    )
+    mass = numbers(body.node_mass_kg + body.tied_kg)
+    held = " ".join(map(str, np.flatnonzero(body.held.all(axis=1))))
+    cells = " ".join(map(str, body.body.cells.ravel()))
+    x = '<?xml version="1.0"?>\n' + heading(body, limits, "<!-- ", " -->")
+    x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
+    x += f'gravity="{numbers(body.experiment.gravity_m_s2)}">\n'
+    x += "".join(f'<RequiredPlugin name="Sofa.Component.{name}"/>\n' for name in PLUGINS)
+    x += '<DefaultAnimationLoop/>\n<Node name="body">\n'
+    x += f'<EulerImplicitSolver rayleighStiffness="{region.gamma_r_s!r}" '
+    x += f'rayleighMass="{region.gamma_m_1_s!r}"/>\n'
+    x += '<SparseLDLSolver template="CompressedRowSparseMatrixMat3x3d"/>\n'
+    x += f'<TetrahedronSetTopologyContainer position="{numbers(body.nodes_m)}" '
+    x += f'tetrahedra="{cells}"/>\n<TetrahedronSetGeometryAlgorithms template="Vec3d"/>\n'
+    x += '<MechanicalObject template="Vec3d"/>\n'
+    x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n'
+    x += f'<FixedProjectiveConstraint indices="{held}"/>\n</Node>\n</Node>\n'
+    return Exported({SCENE: x}, tuple(limits))
+
+
+def _law(region: IdentifiedRegion) -> str:
+    if region.material == "linear":
+        return (
+            '<TetrahedronFEMForceField method="small" '
+            f'youngModulus="{region.young_pa!r}" poissonRatio="{region.poisson!r}"/>'
+        )
+    names = {"st-venant-kirchhoff": "StVenantKirchhoff", "stable-neo-hookean": "StableNeoHookean"}
+    moduli = numbers((region.mu_pa, region.lambda_pa))
+    return (
+        "<TetrahedronHyperelasticityFEMForceField "
+        f'materialName="{names.get(region.material, "NeoHookean")}" ParameterSet="{moduli}"/>'
+    )
+
+
+def _limits(region: IdentifiedRegion) -> list[str]:
+    said = [
+        "NeoHookean is that of λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in the versions of SOFA "
+        "that have StableNeoHookean too; older ones take other constants"
+    ]
+    if region.material not in (
+        "neo-hookean",
+        "stable-neo-hookean",
+        "st-venant-kirchhoff",
+        "linear",
+    ):
+        said.append(
+            f"{region.material} becomes the neo-Hookean material of the same λ and μ at "
+            "small strain"
+        )
+    if region.damping != "rayleigh" and region.gamma_r_s:
+        said.append(
+            "the damping is Rayleigh's, here Kelvin and Voigt's: the same at small strain, but it "
+            "brakes that a stretched body turns"
+        )
+    return said

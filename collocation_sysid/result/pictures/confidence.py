@@ -1,0 +1,184 @@
+"""What the data say about pairs of parameters: confidence ellipses and correlations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from scipy.stats import chi2, norm
+
+from ...arrays import Array
+from ...runs.result import Result
+from ...statistics.estimates import correlation_of
+from ..style import (
+    BLACK,
+    BLUE,
+    COLUMN_MM,
+    SKY,
+    SMALL_PT,
+    TEXT_PT,
+    dress,
+    framed_figure,
+    mathematical,
+)
+from .scene import round_length
+
+# Radius of an ellipse that holds two normal parameters with 95 %, in those of one parameter.
+JOINT = float(np.sqrt(chi2.ppf(0.95, 2)) / norm.ppf(0.975))
+# A wider interval, in logarithms, is drawn to the edge of the panel only.
+WIDEST = np.log(1e3)
+# Beyond this deviation per cents measure little, and factors more.
+FACTORS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Confidence:
+    """Estimates with the uncertainty of their logarithms, those that have one.
+
+    Attributes
+    ----------
+    names : (k,) str
+    values : (k,)
+    covariance : (k, k) of the logarithms, finite
+    quantiles : (k,) half widths of the 95 % intervals in standard deviations
+    """
+
+    names: Sequence[str]
+    values: Array
+    covariance: Array
+    quantiles: Array
+
+    @classmethod
+    def of(cls, result: Result) -> Confidence | None:
+        """Gather what is determined: what is at a bound has no uncertainty.
+
+        None where there are no error bars.
+        """
+        if (found := result.uncertainty) is None:
+            return None
+        known = np.isfinite(np.diag(found.covariance)) & np.isfinite(found.quantiles)
+        kept = np.flatnonzero(known).tolist()
+        names = [found.names[k] for k in kept]
+        values = np.array([result.parameters[name].value for name in names])
+        return cls(names, values, found.covariance[np.ix_(kept, kept)], found.quantiles[kept])
+
+
+def ellipse(found: Confidence, i: int, j: int, points: int = 181) -> Array:
+    """Outline (points, 2) of the 95 % region of two logarithms about their estimates."""
+    pair = [i, j]
+    angle = np.linspace(0.0, 2 * np.pi, points)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    deviation = np.sqrt(np.diag(found.covariance)[pair])
+    rho = float(np.clip(found.covariance[i, j] / deviation.prod(), -1.0, 1.0))
+    root = np.array([[1.0, 0.0], [rho, np.sqrt(1 - rho**2)]])
+    return JOINT * found.quantiles[pair] * deviation * (circle @ root.T)
+
+
+def confidence_ellipses(found: Confidence) -> Figure:
+    """Draw the 95 % region of every pair of parameters.
+
+    Axes are deviations from the estimate, in per cent, or factors where these are large; the
+    cross has the 95 % interval of each parameter alone. A thin slanted region says that the data
+    fix a combination of the two.
+
+    Parameters
+    ----------
+    found : Confidence of two parameters at least
+    """
+    count = len(found.names) - 1
+    half = (found.quantiles * np.sqrt(np.diag(found.covariance))).tolist()
+    scales = [_Scale.of(1.15 * min(JOINT * each, WIDEST)) for each in half]
+    figure = framed_figure(COLUMN_MM, COLUMN_MM if count > 1 else 62, 14, 2, 11, 2)
+    spaces = {"wspace": 0.12, "hspace": 0.12}
+    panels = figure.subplots(count, count, squeeze=False, gridspec_kw=spaces)
+    for (row, column), axes in np.ndenumerate(panels):
+        if column > row:
+            axes.set_axis_off()
+            continue
+        i, j = column, row + 1
+        _draw_pair(axes, ellipse(found, i, j), half[i], half[j])
+        dress(axes)
+        axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
+        last, first = row == count - 1, column == 0
+        axes.set_xticks(scales[i].ticks, scales[i].labels if last else [""] * 3)
+        axes.set_yticks(scales[j].ticks, scales[j].labels if first else [""] * 3)
+        axes.set_xlabel(scales[i].title(found.names[i]) if last else "", fontsize=TEXT_PT)
+        if first:
+            axes.set_ylabel(scales[j].title(found.names[j]), fontsize=TEXT_PT)
+            axes.yaxis.set_label_coords(-0.13 * count, 0.5)
+    note = "deviation from the estimate:\n95 % region of each pair,\n95 % interval of each alone"
+    figure.text(0.98, 0.97, note if count > 1 else "", ha="right", va="top", fontsize=SMALL_PT)
+    return figure
+
+
+def _draw_pair(axes: Axes, outline: Array, wide: float, high: float) -> None:
+    axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
+    for line in ([[-wide, wide], [0, 0]], [[0, 0], [-high, high]]):
+        axes.plot(*line, color=BLACK, lw=0.8, solid_capstyle="butt")
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Deviation of a logarithm from its estimate: how far it is shown, and how it reads."""
+
+    reach: float
+    ticks: tuple[float, float, float]
+    labels: tuple[str, str, str]
+    unit: str
+
+    @classmethod
+    def of(cls, reach: float) -> _Scale:
+        """Three round numbers within ± reach: per cents, or factors where it is wide."""
+        if reach > FACTORS:
+            factor = round_length(np.exp(0.9 * reach))
+            size = float(np.log(factor))
+            return cls(reach, (-size, 0.0, size), (f"÷{factor:g}", "1", f"×{factor:g}"), "")
+        share = round_length(1 - np.exp(-0.9 * reach))
+        number = f"{100 * share:g}"
+        ticks = (float(np.log1p(-share)), 0.0, float(np.log1p(share)))
+        return cls(reach, ticks, (f"−{number}", "0", f"+{number}"), " [%]")
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        return -self.reach, self.reach
+
+    def title(self, name: str) -> str:
+        return _label(name) + self.unit
+
+
+def _label(name: str) -> str:
+    return mathematical(name)
+
+
+def correlation_matrix(found: Confidence) -> Figure:
+    """Draw the correlation of every pair of parameters, as colours and numbers.
+
+    Parameters
+    ----------
+    found : Confidence of two parameters at least
+    """
+    correlation = correlation_of(found.covariance)
+    count = len(found.names)
+    figure = framed_figure(64, 52, 8, 7, 6, 5)
+    axes, beside = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
+    image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
+    for (i, j), value in np.ndenumerate(correlation):
+        axes.text(
+            j, i, f"{value:.2f}".replace("-", "−"), ha="center", va="center",
+            fontsize=SMALL_PT, color="white" if abs(value) > 0.65 else BLACK,
+        )  # fmt: skip
+    symbols = [_label(name) for name in found.names]
+    dress(axes, "correlation")
+    axes.grid(False)
+    axes.set_xticks(range(count), symbols, fontsize=TEXT_PT)
+    axes.set_yticks(range(count), symbols, fontsize=TEXT_PT)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    bar = figure.colorbar(image, cax=beside, ticks=(-1, 0, 1))
+    bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
+    bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+    return figure

@@ -1,0 +1,120 @@
+"""The structure of the constraint Jacobian as a picture, after the paper's Fig. 3."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy.sparse as sp
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from ...arrays import Array
+from ...program.collocation import Collocation
+from ...runs.check.derivatives import first_samples
+from ..style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
+
+SHOWN_STEPS = 6
+# Beyond those shown: rows of the last ones reach two steps ahead.
+SPARE_SAMPLES = 4
+# Picture elements across a panel, and decades of magnitude told apart.
+RASTER = 400
+DECADES = 6
+
+
+def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
+    """The constraint Jacobian's first timesteps, and one of its blocks, coloured by magnitude.
+
+    Left the dense columns of the parameters, beside them the block band of the positions; right
+    the last block on the diagonal of that view. Entries are scaled as in the NLP; structural
+    ones that are zero or tiny have the lightest colour.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Its first experiment is shown.
+    z : (variables,)
+    """
+    total = collocation.segments[0].grid_rows
+    collocation, z = _first_steps(collocation, z)
+    segment, nq = collocation.segments[0], collocation.nq
+    first, steps = segment.dynamics.first_row, min(SHOWN_STEPS, segment.grid_rows)
+    height, width = segment.rows_per_time, segment.dofs
+    rows = (steps - first) * height
+    matrix = abs(collocation.jacobian(z)[:, : nq + steps * width])[:rows]
+    band = matrix[:, nq:]
+    block = band[rows - height :, (steps - 1) * width :]
+    largest = float(np.nan_to_num(matrix.data).max(initial=1e-300))
+    norm = LogNorm(largest * 10.0**-DECADES, largest, clip=True)
+
+    figure = framed_figure(PAGE_MM, 88, 12, 13, 10.5, 6)
+    widths = (0.05 * max(1, nq), 1, 0.2, 0.95, 0.01, 0.03)
+    grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
+    left, middle, right, beside = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
+    if nq:
+        _draw(left, matrix[:, :nq], norm)
+    _draw(middle, band, norm)
+    image = _draw(right, block, norm)
+    dress(left, "", "", "equations of motion")
+    left.set_xticks(
+        np.arange(nq) + 0.5, [mathematical(p.name) for p in collocation.parameters.free]
+    )
+    left.set_ylim(rows, 0)
+    _tick_blocks(left, "y", "c", range(first, steps), height)
+    dress(middle, f"{steps} of {total} timesteps", "node positions")
+    _tick_blocks(middle, "x", "x", range(steps), width)
+    _tick_blocks(middle, "y", "c", range(first, steps), height)
+    middle.tick_params(labelleft=False, left=False)
+    name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
+    free = "" if segment.grasps_have_rows else ", free ones only"
+    dress(right, f"{name}: the mesh graph", "column, 3 node + axis", f"row{free}")
+    for axes in (left, middle, right):
+        axes.grid(False)
+        axes.spines[:].set_visible(True)
+    bar = figure.colorbar(image, cax=beside)
+    bar.set_label("|entry|, scaled", fontsize=SMALL_PT)
+    bar.ax.tick_params(which="both", labelsize=SMALL_PT, width=0.6)
+    bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+    return figure
+
+
+def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
+    """The first timesteps alone, without nuisance: the whole Jacobian may be gigabytes."""
+    count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
+    few = [first_samples(segment.experiment, count) for segment in collocation.segments]
+    short = replace(collocation, experiments=few, charts={})
+    p = np.concatenate([z[: collocation.nq], *(s.guess_phi for s in short.segments)])
+    pairs = zip(collocation.parts(z), short.segments, strict=True)
+    return short, short.pack(p, [part.x[: segment.grid_rows] for part, segment in pairs])
+
+
+def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
+    """Draw |entries| on a raster no finer than the picture, the largest of each pixel."""
+    rows, columns = matrix.shape  # type: ignore[misc]
+    entries = sp.coo_array(matrix)
+    raster = np.full((min(RASTER, rows), min(RASTER, columns)), -1.0)
+    places = (
+        entries.row.astype(np.int64) * raster.shape[0] // rows,
+        entries.col.astype(np.int64) * raster.shape[1] // columns,
+    )
+    np.maximum.at(raster, places, np.nan_to_num(entries.data))
+    return axes.imshow(
+        np.ma.masked_less(raster, 0.0),
+        norm=norm,
+        cmap="cividis_r",
+        aspect="auto",
+        interpolation="nearest",
+        extent=(0, columns, rows, 0),
+    )
+
+
+def _tick_blocks(axes: Axes, side: str, letter: str, times: Sequence[int], size: int) -> None:
+    """Name the blocks along one side and rule lines between them."""
+    labels = [f"${letter}_{{{t}}}$" for t in times]
+    axes.set(**{f"{side}ticks": (np.arange(len(times)) + 0.5) * size, f"{side}ticklabels": labels})
+    rule = axes.axvline if side == "x" else axes.axhline
+    for k in range(1, len(times)):
+        rule(k * size, color="#B0B0B0", lw=0.4)

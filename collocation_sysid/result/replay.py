@@ -1,0 +1,315 @@
+"""One experiment of a run as it is looked at: shapes and markers at its samples.
+
+Pictures, animations and the 3-D view need nothing else, so that they can be made again from the
+arrays of a run folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import count, takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..errors import InputError
+from ..fem.constants import bare, symbol_of
+from ..fem.quadratic import EDGES
+from ..files import RESULT_FILE, damage_refused, require_own
+from ..recording.experiment import Experiment
+from ..runs.result import Result
+
+ARRAYS_FILE = "trajectory.npz"
+# Of the body, and so the same for all experiments of a run.
+SHARED = ("undeformed_m", "tetrahedra", "surface", "surface_parts")
+# Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes.
+LAYOUT = {
+    "undeformed_m": ("f", "n3"),
+    "tetrahedra": ("iu", "E4"),
+    "surface": ("iu", "F3"),
+    "surface_parts": ("iu", "F"),
+    "surface_nodes": ("iu", "Fs"),
+    "t_s": ("f", "T"),
+    "held": ("b", "Tn"),
+    "up": ("f", "3"),
+    "marker_places_m": ("f", "M3"),
+    "given_places_m": ("f", "M3"),
+    "measured_m": ("f", "TM3"),
+    "positions_m": ("f", "Tn3"),
+    "markers_m": ("f", "TM3"),
+    "rolled_out_positions_m": ("f", "Tn3"),
+    "rolled_out_m": ("f", "TM3"),
+    "natural_hz": ("f", "k"),
+    "tendons_m": ("f", "p3"),
+}
+# Arrays that may hold NaN or infinity, and the largest length, time or frequency of any.
+GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
+LARGEST = 1e100
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Measured, fitted and rolled-out motion of an experiment; T samples, n nodes, M markers.
+
+    Attributes
+    ----------
+    name : str
+    t_s : (T,)
+    undeformed_m : (n, 3)
+    tetrahedra : (E, 4) corners of the elements
+    surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
+    surface_parts : (F,) number of the part of the body that each belongs to
+    surface_nodes : (F, 3) or (F, 6) nodes of each triangle, those on its sides besides its corners
+    part_names : (P,) str, "" for what no region claims
+    held : (T, n) bool, which nodes are grasped along some axis
+    up : (3,) unit vector against gravity; z where there is none
+    marker_names : (M,) str
+    marker_places_m : (M, 3) where the markers sit on the undeformed body, as found
+    given_places_m : (M, 3) the places given, NaN where there was none
+    measured_m : (T, M, 3) NaN where missing
+    positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
+    rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
+    natural_hz : (k,) natural frequencies with the answer, ascending
+    wrenches : sequence of (S, 19)
+        Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
+        out, NaN where there are none.
+    static : bool
+        Whether every sample is an equilibrium of its own.
+    tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
+    """
+
+    name: str
+    t_s: Array
+    undeformed_m: Array
+    tetrahedra: NDArray[np.integer]
+    surface: NDArray[np.integer]
+    surface_parts: NDArray[np.integer]
+    surface_nodes: NDArray[np.integer]
+    part_names: Sequence[str]
+    held: NDArray[np.bool_]
+    up: Array
+    marker_names: Sequence[str]
+    marker_places_m: Array
+    given_places_m: Array
+    measured_m: Array
+    positions_m: Array | None = None
+    markers_m: Array | None = None
+    rolled_out_positions_m: Array | None = None
+    rolled_out_m: Array | None = None
+    natural_hz: Array | None = None
+    wrenches: Sequence[Array] = ()
+    static: bool = False
+    tendons_m: Array | None = None
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        fitted: tuple[Array, Array] | None = None,
+        rolled_out: tuple[Array, Array] | None = None,
+        natural_hz: Array | None = None,
+        places_m: Array | None = None,
+        wrenches: Sequence[Array] = (),
+    ) -> Replay:
+        """Gather an experiment with (positions, markers) as fitted, and as rolled out.
+
+        Its markers are at `places_m` (M, 3), where they were estimated.
+        """
+        body, markers = experiment.body, experiment.markers
+        given_m = markers.observe(body.nodes_m)
+        pull = np.linalg.norm(experiment.gravity_m_s2)
+        return cls(
+            experiment.name,
+            experiment.t_s,
+            body.nodes_m,
+            body.mesh.tetrahedra,
+            body.mesh.surface,
+            body.part_of_cells[body.mesh.surface_cells],
+            nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
+            [part.name for part in body.parts],
+            np.asarray(experiment.held(experiment.t_s).any(axis=2)),
+            -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
+            markers.names,
+            given_m if places_m is None else places_m,
+            np.where(markers.located[:, None], given_m, np.nan),
+            markers.positions_m,
+            *(fitted or (None, None)),
+            *(rolled_out or (None, None)),
+            natural_hz,
+            wrenches,
+            experiment.static,
+            _apart([tendon.points_m for tendon in experiment.tendons]),
+        )
+
+    @property
+    def shapes_m(self) -> Array | None:
+        """(T, n, 3) positions to show where there is room for one: fitted, else rolled out."""
+        return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
+
+    def arrays(self, prefix: str = "") -> dict[str, Array]:
+        """Arrays for a file; those of the body without the prefix, and some as single numbers."""
+        own: dict[str, Any] = {
+            "t_s": self.t_s,
+            "positions_m": self.positions_m,
+            "markers_m": self.markers_m,
+            "measured_m": self.measured_m,
+            "residuals_m": None if self.markers_m is None else self.markers_m - self.measured_m,
+            "marker_names": np.array(self.marker_names),
+            "marker_places_m": self.marker_places_m,
+            "given_places_m": self.given_places_m,
+            "rolled_out_m": self.rolled_out_m,
+            "rolled_out_positions_m": _single(self.rolled_out_positions_m),
+            "held": self.held,
+            "up": self.up,
+            "natural_hz": self.natural_hz,
+            "tendons_m": self.tendons_m,
+            "static": np.array(True) if self.static else None,
+        } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
+        shared: dict[str, Any] = {
+            "undeformed_m": self.undeformed_m,
+            "tetrahedra": self.tetrahedra.astype(np.int32),
+            "surface": self.surface.astype(np.int32),
+            "surface_parts": self.surface_parts.astype(np.int32),
+            "surface_nodes": self.surface_nodes.astype(np.int32),
+            "part_names": np.array(self.part_names),
+        }
+        return shared | {prefix + key: value for key, value in own.items() if value is not None}
+
+    @classmethod
+    def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> Replay:
+        """Take an experiment out of a run's arrays.
+
+        Raises
+        ------
+        KeyError
+            If an array is missing.
+        """
+        prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
+        needed = ("t_s", "held", "up", "marker_places_m", "given_places_m", "measured_m")
+        optional = (
+            "positions_m",
+            "markers_m",
+            "rolled_out_positions_m",
+            "rolled_out_m",
+            "natural_hz",
+            "tendons_m",
+        )
+        found: dict[str, Any] = {key: arrays[key] for key in SHARED}
+        found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
+        found |= {key: arrays[prefix + key] for key in needed}
+        found |= {key: arrays.get(prefix + key) for key in optional}
+        keys = (f"{prefix}wrench_{k}" for k in count(1))
+        found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
+        found["static"] = bool(arrays.get(f"{prefix}static", False))
+        _require_shapes(found)
+        names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
+        parts = [str(part) for part in arrays["part_names"]]
+        numbers = found["surface_parts"]
+        if len(names) != len(found["marker_places_m"]):
+            raise ValueError(f"{len(names)} marker_names")
+        if numbers.min() < 0 or numbers.max() >= len(parts):
+            raise ValueError("surface_parts names parts that are not there")
+        return cls(name=name, marker_names=names, part_names=parts, **found)
+
+
+def _apart(lines_m: Sequence[Array]) -> Array | None:
+    """Polylines (P, 3) in one (p, 3), a row of NaN after each; None where there are none."""
+    if not lines_m:
+        return None
+    return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])
+
+
+def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Corners of each face (F, 3), and of quadratic cells (F, 10) the nodes on its sides too."""
+    if cells.shape[1] != 10:
+        return faces
+    ends = cells[:, np.array(EDGES)]  # (F, 6, 2)
+    on_face = (ends[..., None] == faces[:, None, None]).any(axis=3).all(axis=2)
+    return np.hstack([faces, cells[:, 4:][on_face].reshape(len(faces), 3)])
+
+
+def _require_shapes(arrays: Mapping[str, Any]) -> None:
+    """Refuse arrays whose sizes do not go together, or that hold what pictures cannot show."""
+    sizes: dict[str, int] = {}
+    for key, (kinds, letters) in LAYOUT.items():
+        if (array := arrays.get(key)) is None:
+            continue
+        wanted = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
+        here = array.shape
+        empty = any(not size for x, size in zip(letters, here, strict=False) if x not in "Mk")
+        if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
+            raise ValueError(f"{key} is {array.dtype} of shape {here}")
+        if any(size not in (None, found) for size, found in zip(wanted, here, strict=True)):
+            raise ValueError(f"{key} has shape {here}, which does not go with the others")
+        sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
+        if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
+            raise ValueError(f"{key} holds numbers that are not finite")
+        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
+            raise ValueError(f"{key} holds numbers above {LARGEST:g}")
+    for key in ("tetrahedra", "surface", "surface_nodes"):
+        if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
+            raise ValueError(f"{key} names nodes that are not there")
+    if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(np.linalg.norm(arrays["up"]), 1.0):
+        raise ValueError("t_s does not increase, or up is no direction")
+
+
+def _single(array: Array | None) -> NDArray[np.float32] | None:
+    return None if array is None else array.astype(np.float32)
+
+
+def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
+    """Read the content of result.json, and all experiments, from a run folder.
+
+    The fitted experiments are first, then those for validation that could be simulated.
+
+    Raises
+    ------
+    InputError
+        If it is not a run folder, or one that is damaged.
+    """
+    run, result = Path(folder), Result.read(folder)
+    rolled = result.rollout.experiments
+    predicted = [n for n, r in rolled.items() if not r.fitted and r.failed is None]
+    with reading_run(run):
+        arrays = read_arrays(run)
+        names = [*result.fit.experiments, *predicted]
+        return result, [Replay.from_arrays(name, arrays) for name in names]
+
+
+def headline(result: Result) -> str:
+    """Young's moduli with their standard errors, and the verdict, in one line."""
+    moduli = {symbol_of(n): each for n, each in result.values.items() if bare(n) == "young_pa"}
+    said = []
+    for name, each in moduli.items():
+        bar = f" ± {float(format(each.std_error, '.2g')):g}" if each.std_error else ""
+        said.append(f"{name} = {each.value:.5g}{bar} Pa")
+    return "; ".join([*said, f"verdict: {result.trust.verdict}"])
+
+
+def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a run folder.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    file = run / ARRAYS_FILE
+    require_own(file)
+    if not file.is_file():
+        raise InputError(f"this is not a run folder: it has no {ARRAYS_FILE}", run)
+    try:
+        with np.load(file) as stored:
+            return dict(stored)
+    except OSError as error:  # what NumPy says of a file that is none of its own
+        raise ValueError(error) from error
+
+
+def reading_run(run: Path) -> AbstractContextManager[None]:
+    """Within this, whatever the files of a run make go wrong is a refusal of the run."""
+    return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", "solve the problem again")

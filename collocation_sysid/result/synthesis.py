@@ -1,0 +1,183 @@
+"""Synthetic data sets: simulate a problem's experiments and write what a laboratory would."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import whole_file
+from ..model.schemes import SCHEMES
+from ..problem import Problem
+from ..program.simulation import Trajectory, simulate
+from ..recording import Experiment, write_markers_csv, write_poses_csv, write_wrench_csv
+from .writers import FRAMES_FILE, require_replaceable, run_folder, write_frames
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How data are made.
+
+    Attributes
+    ----------
+    integrator : str
+        newmark, or a scheme: midpoint, backward-euler, bdf2.
+    timestep_s : float
+        Newmark's step.
+    noise_m : float
+        Standard deviation of the noise.
+    noise_n : float
+        The same of measured forces.
+    noise_nm : float
+        The same of measured torques.
+    seed : int
+        Seed of the noise.
+    frames : --frames/--no-frames
+        Also write frames for ParaView.
+
+    Raises
+    ------
+    InputError
+        For an unknown integrator, and a timestep, noise or seed that cannot be.
+    """
+
+    integrator: str = "newmark"
+    timestep_s: float | None = None
+    noise_m: float = 0.0
+    noise_n: float = 0.0
+    noise_nm: float = 0.0
+    seed: int = 0
+    frames: bool = False
+
+    def __post_init__(self) -> None:
+        known = ("newmark", *SCHEMES)
+        if self.integrator not in known:
+            expected = f"expected one of {', '.join(known)}"
+            raise InputError(f"found {self.integrator!r}; {expected}", None, "--integrator")
+        if self.timestep_s is not None and not 0 < self.timestep_s < np.inf:
+            expected = "expected a number of seconds above 0"
+            raise InputError(f"found {self.timestep_s:g}; {expected}", None, "--timestep-s")
+        noises = {"-m": (self.noise_m, "metres"), "-n": (self.noise_n, "newtons")}
+        for end, (size, unit) in (noises | {"-nm": (self.noise_nm, "N m")}).items():
+            if not 0 <= size < np.inf:
+                message = f"found {size:g}; expected {unit}, 0 or more"
+                raise InputError(message, None, f"--noise{end}")
+        if self.seed < 0:
+            message = f"found {self.seed}; expected a whole number, 0 or more"
+            raise InputError(message, None, "--seed")
+
+
+def write_data(
+    problem: Problem,
+    folder: str | Path,
+    recipe: Recipe | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> list[Path]:
+    """Simulate every experiment at the parameters' guesses and write poses, markers and wrenches.
+
+    Parameters
+    ----------
+    problem : Problem
+    folder : str or Path
+        Made where it is missing; gets ``<experiment>_markers.csv``, ``<experiment>_poses.csv``
+        (``_poses_2`` … for further grasps), ``<experiment>_wrench.csv`` (``_wrench_2`` …) of
+        grasps whose wrench is measured, and ``<experiment>/`` with frames when asked for.
+    recipe : Recipe, optional
+        Without noise by default.
+    progress : callable, optional
+        Called with the share of a simulation that is done.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    InputError
+        For a parameter without a guess, and before a file that the problem reads is overwritten.
+    SimulationError
+        Before anything is written.
+    """
+    place, recipe = Path(folder), recipe or Recipe()
+    _refuse_unguessed(problem)
+    _refuse_inputs(problem, place)
+    for experiment in problem.experiments if recipe.frames else ():
+        require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
+    rng, how = np.random.default_rng(recipe.seed), (recipe.integrator, recipe.timestep_s)
+    simulated = [
+        simulate(e, problem.parameters, *how, problem.first_substeps, None, progress)
+        for e in problem.experiments
+    ]
+    written = []
+    with ExitStack() as whole:  # all files appear at its end, or none
+        for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
+            files = _tables(experiment, place)
+            drafts = [whole.enter_context(whole_file(file)) for file in files]
+            _write_tables(experiment, trajectory, drafts, rng, recipe)
+            written += files
+            if recipe.frames:
+                folder, body = place / experiment.name, experiment.body
+                there = run_folder(folder, mark=FRAMES_FILE, what="simulation")
+                at = whole.enter_context(there), trajectory.t_s, trajectory.positions_m
+                write_frames(*at, body.cells, body.element, body.nodes_m)
+                written.append(folder / FRAMES_FILE)
+    return written
+
+
+def _write_tables(
+    experiment: Experiment,
+    trajectory: Trajectory,
+    files: Sequence[Path],
+    rng: np.random.Generator,
+    recipe: Recipe,
+) -> None:
+    """Write markers, poses and wrenches into the files of `_tables`."""
+    noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
+    names, tracks = experiment.markers.names, trajectory.markers_m + noise
+    write_markers_csv(files[0], experiment.t_s, names, tracks)
+    count = len(experiment.grasps)
+    for file, grasp in zip(files[1 : 1 + count], experiment.grasps, strict=True):
+        write_poses_csv(file, grasp.poses)
+    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    sensed = zip(files[1 + count :], sensors, trajectory.wrenches, strict=True)
+    for file, sensor, wrench in sensed:
+        measured = np.where(sensor.measured, wrench, np.nan)
+        noise = np.repeat([recipe.noise_n, recipe.noise_nm], 3) * rng.normal(size=wrench.shape)
+        write_wrench_csv(file, sensor.t_s, measured + noise)
+
+
+def _refuse_unguessed(problem: Problem) -> None:
+    if names := problem.parameters.unguessed:
+        key = f"parameters.{names[0]}"
+        raise InputError(
+            f"has no guess, and a simulation needs a value; expected --set {key}.guess=VALUE",
+            problem.path,
+            key,
+        )
+
+
+def _refuse_inputs(problem: Problem, place: Path) -> None:
+    """Refuse to overwrite a file that the problem reads: it may be a recording."""
+    read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
+    for experiment in problem.experiments:
+        for file in _tables(experiment, place):
+            if file.exists() and file.resolve() in read:
+                raise InputError(
+                    f"{problem.path} reads this file, so it is not overwritten; choose another "
+                    "folder, or move it away",
+                    file,
+                )
+
+
+def _tables(experiment: Experiment, place: Path) -> list[Path]:
+    """The marker file, one of poses for each grasp, and one for each sensor."""
+    sensors = sum(grasp.wrench is not None for grasp in experiment.grasps)
+    kinds = [("poses", k) for k in range(len(experiment.grasps))]
+    kinds += [("wrench", k) for k in range(sensors)]
+    names = [f"{kind}_{k + 1}" if k else kind for kind, k in kinds]
+    return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]

@@ -1,0 +1,216 @@
+"""A solved problem with its checks: what is known of an answer, however it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, hint_at
+from ..fem.constants import unit_of
+from ..methods.solution import Solution
+from ..model.parameters import Parameters
+from ..problem import Problem
+from ..statistics.concern import Concern
+from ..statistics.diagnostics import MarkerDiagnosis
+from ..statistics.estimates import Estimate
+from ..statistics.hypothesis import Hypothesis
+from ..statistics.identifiability import verdicts
+from ..statistics.linearised import Derived
+from ..statistics.numerical import Refinement
+from ..statistics.places import Place, places_of
+from ..statistics.profile import Profile
+from ..statistics.trust import Trust, cause_concerns, numerical_concerns
+from ..statistics.uncertainty import Uncertainty
+from .check.motion import Motion
+from .forward_simulation import Rollout
+from .verdict import concerns, expected_rms_m, motions_of
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A solved problem with its checks.
+
+    Attributes
+    ----------
+    problem : Problem
+    solution : Solution
+    rollouts : mapping of experiment name to Rollout, or to the reason why there is none
+    uncertainty : Uncertainty or None, where the solve did not converge
+    diagnoses : tuple of MarkerDiagnosis, what the residuals suggest
+    profiles : tuple of Profile, those asked for
+    notes : tuple of str
+        What went wrong after the solve.
+    causes : tuple of Hypothesis
+        What is likely described wrongly, likeliest first.
+    refinement : Refinement or None
+        What the discretisation does: solved again where that was asked for, else what the step
+        does, to first order, from roll-outs with a finer one; None where these are missing.
+    missing : str
+        What Ctrl-C left out after there was an answer.
+    """
+
+    problem: Problem
+    solution: Solution
+    rollouts: Mapping[str, Rollout | str]
+    uncertainty: Uncertainty | None
+    diagnoses: tuple[MarkerDiagnosis, ...] = ()
+    profiles: tuple[Profile, ...] = ()
+    notes: tuple[str, ...] = ()
+    causes: tuple[Hypothesis, ...] = ()
+    refinement: Refinement | None = None
+    missing: str = ""
+
+    def __repr__(self) -> str:
+        solution = self.solution
+        free = [item.name for item in self.problem.parameters.free]
+        found = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
+        rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
+        said = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
+        return f"Run({said}: {found}; {rms})"
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Every parameter, by name."""
+        return self.solution.parameters
+
+    @property
+    def started_from(self) -> Parameters:
+        """The parameters with the guesses that the search started from."""
+        return self.solution.collocation.parameters
+
+    @cached_property
+    def derived(self) -> dict[str, float]:
+        """Moduli that follow from the parameters, by name."""
+        constants = (segment.constants for segment in self.solution.collocation.segments)
+        return dict(Derived.of(constants, self.solution.q).values)
+
+    @cached_property
+    def estimates(self) -> dict[str, Estimate]:
+        """Parameters and derived moduli, with intervals for all that `interval_holds` names."""
+        errors = {} if self.refinement is None else self.refinement.errors
+        return {
+            name: replace(estimate, ci95=errors[name].ci95) if name in errors else estimate
+            for name, estimate in self.noise_estimates.items()
+        }
+
+    @property
+    def interval_holds(self) -> tuple[str, ...]:
+        """What the intervals hold: "noise", and of "step" and "mesh" what is known."""
+        if self.uncertainty is None:
+            return ()
+        return ("noise",) if self.refinement is None else self.refinement.holds
+
+    @cached_property
+    def noise_estimates(self) -> dict[str, Estimate]:
+        """The same with intervals for the noise alone."""
+        found = self.uncertainty
+        known = {} if found is None else {**found.estimates, **found.derived}
+        values = self.parameters | self.derived
+        return {name: known.get(name, Estimate(value)) for name, value in values.items()}
+
+    @cached_property
+    def places(self) -> dict[str, dict[str, Place]]:
+        """Where the markers sit on the undeformed body, by fitted experiment and by marker."""
+        parts = self.solution.collocation.parts(self.solution.z)
+        return {p.segment.experiment.name: places_of(p, self.uncertainty) for p in parts}
+
+    @cached_property
+    def trust(self) -> Trust:
+        """How far the answer can be trusted, in one word, with the reasons."""
+        found = concerns(
+            self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
+        )
+        numerical = numerical_concerns(self.estimates, self.refinement)
+        if not self.missing:
+            return Trust.of((*cause_concerns(self.causes), *found, *numerical))
+        interrupted = Concern("solve/interrupted", "doubtful", {"said": self.missing})
+        return Trust.of((interrupted, *(found if self.uncertainty is not None else ())))
+
+    @cached_property
+    def motions(self) -> dict[str, Motion]:
+        """How each experiment's body oscillates with the answer, by name."""
+        return motions_of(self.problem, self.solution)
+
+    @property
+    def noise_rms_m(self) -> float:
+        """RMS distance of the fitted markers that noise of the sigma_m given would leave."""
+        return expected_rms_m(self.solution, self.uncertainty)
+
+    def interval(self, name: str) -> tuple[float, float] | None:
+        """95 % interval of a parameter or derived modulus; None where there is none.
+
+        It holds what `interval_holds` names.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        return self._estimate(name).ci95
+
+    def std_error(self, name: str) -> float | None:
+        """Standard error of a parameter or derived modulus; None where there is none.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        return self._estimate(name).std_error
+
+    def to_frame(self) -> Any:
+        """The estimates as a pandas DataFrame, a row each.
+
+        Columns value, std_error, lower, upper, interval_holds, verdict, guess, unit.
+
+        Raises
+        ------
+        InputError
+            Without pandas.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise InputError("a data frame needs pandas: pip install pandas") from error
+        items = self.started_from.items
+        guesses = {item.name: item.guess for item in items if item.tied is None}
+        rows = {}
+        for name, estimate in self.estimates.items():
+            lower, upper = estimate.ci95 or (np.nan, np.nan)
+            rows[name] = {
+                "value": estimate.value,
+                "std_error": np.nan if estimate.std_error is None else estimate.std_error,
+                "lower": lower,
+                "upper": upper,
+                "interval_holds": "" if estimate.ci95 is None else ", ".join(self.interval_holds),
+                "verdict": self.trust.verdict,
+                "guess": guesses.get(name, np.nan),
+                "unit": unit_of(name),
+            }
+        return pandas.DataFrame.from_dict(rows, orient="index")
+
+    def _estimate(self, name: str) -> Estimate:
+        if name not in self.estimates:
+            known = list(self.estimates)
+            expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
+            raise InputError(f"no parameter {name!r}; {expected}")
+        return self.estimates[name]
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """What the user should know after the solve, and what the data say of the parameters."""
+        if self.uncertainty is None:
+            return self.notes
+        said = (*self.notes, *self.uncertainty.notes, *verdicts(self.uncertainty))
+        return (*dict.fromkeys(said), *(profile.sentence for profile in self.profiles))
+
+
+def _with_error(estimate: Estimate) -> str:
+    error = "" if estimate.std_error is None else f" ± {estimate.std_error:.2g}"
+    interval = "" if estimate.ci95 is None else " [{:.5g}, {:.5g}]".format(*estimate.ci95)
+    return f"{estimate.value:.5g}{error}{interval}"

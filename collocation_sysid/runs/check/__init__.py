@@ -1,0 +1,339 @@
+"""Look at a problem before solving it: what it holds, what it will cost, and what will go wrong.
+
+Every warning is one sentence that ends with the remedy.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from ...arrays import Array
+from ...methods.reduced_space import ReducedSpace
+from ...methods.scan import SOFT_PA, started, usual_parameters
+from ...methods.start import initial_variables
+from ...model.schemes import as_scheme
+from ...problem import Problem
+from ...program.collocation import Collocation
+from ...program.reaction_rows import Reactions
+from ...program.stability import Instability, instabilities
+from ...program.viscoelastic_rows import Overstress
+from ...program.wrench_rows import WrenchRows
+from ...recording.turning import turning_warnings
+from ...statistics.concern import Concern, as_said
+from ...statistics.hypothesis import Hypothesis
+from ...statistics.numerical import MOST_SUBSTEPS
+from ...statistics.scale import scale_notes
+from ...statistics.stillness import stillness_notes
+from ...statistics.trust import stability_concerns
+from .cost import Cost, cost_notes, cost_warnings, costs
+from .derivatives import derivative_errors, shortened
+from .description import description_causes
+from .elements import ElementShape
+from .hold import Hold, hold_warnings, holds_of
+from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
+from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
+from .ram import nonzeros
+from .shape import BodyFinding, body_finding
+
+__all__ = [
+    "BodyFinding",
+    "Cost",
+    "ElementShape",
+    "Findings",
+    "Glance",
+    "Hold",
+    "MarkerFinding",
+    "ModeFinding",
+    "Motion",
+    "Recording",
+    "check_problem",
+    "glance",
+]
+
+
+# A simulation of the whole recordings that takes longer than this is left out unless asked for.
+PATIENCE_S = 10.0
+# Agreement with fourth-order central differences that rounding allows.
+AGREEMENT = 1e-6
+CHOSEN = (
+    "numbers of steps hold for one a sample: solve takes as many as the error bars ask for, up to "
+    f"{MOST_SUBSTEPS}, where transcription.substeps states none"
+)
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What `check` sees without a simulation, see `Findings`."""
+
+    bodies: tuple[BodyFinding, ...]
+    recordings: tuple[Recording, ...]
+    holds: tuple[Hold, ...]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What `check` reports.
+
+    Attributes
+    ----------
+    bodies : tuple of BodyFinding
+    samples, missing : int
+        Marker samples that are there and that are not, of all experiments.
+    largest_marker_distance_m : float
+    rms_at_guess_m : float or None
+        Distance of the markers from their measurements in the simulation at the guess; None where
+        that is left out.
+    recordings : tuple of Recording, one for each experiment
+    motions : tuple of Motion, one for each fitted experiment that moves
+    variables, constraints : int
+        Of the program, without memory and wrenches.
+    overstresses, wrenches : int
+        As many of either are there beside them, of bodies with memory and of sensors, for interior
+        point and others that see the whole program.
+    jacobian_nonzeros, hessian_nonzeros : int
+        With these.
+    method : str
+        The chosen one; `memory_mb` is what it takes, if it is among the `costs`.
+    costs : tuple of Cost, one for each method of which they are known
+    jacobian_error, hessian_error : float
+        Largest relative deviation from central differences along random directions.
+    holds : tuple of Hold, one for each grasp
+    causes : tuple of Hypothesis
+        What is likely described wrongly; their sentences are the first warnings.
+    notes : tuple of str
+    concerns : tuple of Concern
+        What will go wrong, with the remedy; `warnings` are their sentences.
+    """
+
+    bodies: tuple[BodyFinding, ...]
+    experiments: int
+    timesteps: int
+    samples: int
+    missing: int
+    largest_marker_distance_m: float
+    rms_at_guess_m: float | None
+    recordings: tuple[Recording, ...]
+    motions: tuple[Motion, ...]
+    variables: int
+    constraints: int
+    overstresses: int
+    wrenches: int
+    jacobian_nonzeros: int
+    hessian_nonzeros: int
+    method: str
+    memory_mb: float | None
+    costs: tuple[Cost, ...]
+    jacobian_error: float
+    hessian_error: float
+    holds: tuple[Hold, ...]
+    causes: tuple[Hypothesis, ...]
+    notes: tuple[str, ...] = ()
+    concerns: tuple[Concern, ...] = ()
+
+    @property
+    def chosen_cost(self) -> Cost | None:
+        """That of the chosen method."""
+        return next((cost for cost in self.costs if cost.method == self.method), None)
+
+    @property
+    def derivatives_agree(self) -> bool:
+        """Whether both derivative checks pass."""
+        return max(self.jacobian_error, self.hessian_error) < AGREEMENT
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What will go wrong, a sentence each that ends with the remedy."""
+        return tuple(concern.sentence for concern in self.concerns)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON and tables."""
+        causes = [cause.as_dict() for cause in self.causes]
+        return asdict(replace(self, causes=())) | {"causes": causes, "warnings": self.warnings}
+
+
+def glance(problem: Problem) -> Glance:
+    """What is seen at once: bodies, recordings and grasps; missing guesses are usual ones."""
+    usual = usual_parameters(problem.parameters, SOFT_PA)
+    bodies = _bodies(replace(problem, parameters=usual))
+    recordings = tuple(recording_of(e, None) for e in problem.experiments)
+    return Glance(bodies, recordings, _holds(problem, bodies))
+
+
+def check_problem(
+    problem: Problem, say: Callable[[str], None] | None = None, full: bool = False
+) -> Findings:
+    """Validate a loaded problem further and measure it.
+
+    Where parameters have no guess, a scan finds where a solve would start.
+
+    Parameters
+    ----------
+    problem : Problem
+    say : callable, optional
+        Called with what is being done now, a text.
+    full : bool
+        Whether the whole recordings are simulated at the guess however long that takes; by default
+        their first samples where it is more than some ten seconds.
+
+    Raises
+    ------
+    InputError
+        Where no start is found.
+    """
+    say = say or (lambda _: None)
+    collocation, notes = problem.collocation(), []
+    if problem.parameters.unguessed:
+        say("looking for a start, as there is no guess")
+        collocation, scan = started(collocation)
+        problem = replace(problem, parameters=collocation.parameters)
+        notes = [scan.sentence] if scan else []
+    say("simulating the first samples at the guess")
+    began, first = time.perf_counter(), shortened(problem).collocation()
+    first_z, start_notes = initial_variables(first)
+    whole_s = (time.perf_counter() - began) * _rows(collocation) / _rows(first)
+    say("comparing derivatives with differences")
+    jacobian_error, hessian_error = derivative_errors(first, first_z)
+    say("estimating what methods take")
+    program = _program(problem, collocation, first, first_z)
+    simulated, z = first, first_z
+    if full or whole_s <= PATIENCE_S:
+        say(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
+        simulated, (z, start_notes) = collocation, initial_variables(collocation)
+    say("looking at modes and at the description")
+    findings = Findings(
+        **_measured(problem, simulated, z),
+        timesteps=_rows(collocation),
+        rms_at_guess_m=None if simulated is first else collocation.rms_m(z),
+        motions=_motions(problem, collocation),
+        **program,
+        jacobian_error=jacobian_error,
+        hessian_error=hessian_error,
+        causes=description_causes(problem),
+    )
+    concerns = _concerns(problem, findings, instabilities(simulated, z))
+    notes += [*start_notes, *_notes(findings)]
+    if simulated is first:
+        notes.append(
+            f"the recordings were not simulated at the guess but for their first samples: it would "
+            f"take about {whole_s:.2g} s; check --full does it"
+        )
+    notes += [CHOSEN] * (problem.substeps == "auto" and bool(findings.motions))
+    findings = replace(findings, concerns=concerns)
+    known = [note for note in problem.notes if note not in findings.warnings]
+    return replace(findings, notes=(*known, *notes))
+
+
+def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
+    """Bodies, recordings and grasps; the program may be of the first samples."""
+    positions_m = {}
+    for part in collocation.parts(z):
+        at_samples = part.x[part.segment.markers.grid_rows]
+        positions_m[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
+    bodies = _bodies(problem)
+    recordings = [recording_of(e, positions_m.get(e.name)) for e in problem.experiments]
+    distances_m = [r.farthest.distance_m for r in recordings if r.markers]
+    return {
+        "bodies": bodies,
+        "experiments": len(recordings),
+        "samples": sum(recording.samples for recording in recordings),
+        "missing": sum(recording.missing for recording in recordings),
+        "largest_marker_distance_m": max(distances_m, default=0.0),
+        "recordings": tuple(recordings),
+        "holds": _holds(problem, bodies),
+    }
+
+
+def _rows(collocation: Collocation) -> int:
+    return sum(segment.grid_rows for segment in collocation.segments)
+
+
+def _program(
+    problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
+) -> dict[str, Any]:
+    """How large the program is, and what methods take for it: fields of `Findings`."""
+    whole = collocation.made_explicit()
+    jacobian, hessian = nonzeros(problem, whole)
+    # Reduced space as the file has it, whichever method is chosen.
+    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
+    reduced = next(each for each in named if isinstance(each, ReducedSpace))
+    method = problem.method
+    name = method if isinstance(method, str) else getattr(method, "name", repr(method))
+    counted = costs(collocation, first, first_z, jacobian + hessian, reduced.factorisation)
+    return {
+        "variables": collocation.variables,
+        "constraints": collocation.constraints,
+        "overstresses": whole.added(Overstress),
+        "wrenches": whole.added(Reactions, WrenchRows),
+        "jacobian_nonzeros": jacobian,
+        "hessian_nonzeros": hessian,
+        "method": name,
+        "memory_mb": next((cost.memory_mb for cost in counted if cost.method == name), None),
+        "costs": counted,
+    }
+
+
+def _motions(problem: Problem, collocation: Collocation) -> tuple[Motion, ...]:
+    scheme, guesses = as_scheme(collocation.scheme), problem.parameters.guesses
+    return tuple(
+        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
+        for s in collocation.segments
+        if not s.experiment.static
+    )
+
+
+def _concerns(
+    problem: Problem, findings: Findings, unstable: Sequence[Instability]
+) -> tuple[Concern, ...]:
+    """What will go wrong, the likeliest mistakes first."""
+    experiments, parameters = problem.experiments, problem.parameters
+    bodies, chosen = findings.bodies, findings.chosen_cost
+    body_of = {name: body for body in bodies for name in body.experiments}
+    holds = (warning for hold in findings.holds for warning in hold_warnings(hold))
+    turns = (w for e in experiments for w in turning_warnings(e, problem.first_substeps))
+    seen = (w for r in findings.recordings for w in recording_warnings(r, body_of[r.experiment]))
+    costly = cost_warnings(chosen, findings.costs) if chosen else []
+    return (
+        *as_said("description/doubt", (cause.sentence for cause in findings.causes)),
+        *as_said("information/still", stillness_notes(experiments, parameters)),
+        *as_said("scale/unknown", scale_notes(experiments, parameters)),
+        *as_said("mesh/elements", _body_warnings(bodies)),
+        *as_said("description/grasp", holds),
+        *(concern for motion in findings.motions for concern in motion_warnings(motion)),
+        *stability_concerns(unstable),
+        *as_said("scheme/turn", turns),
+        *as_said("markers/recording", seen),
+        *as_said("memory/short", costly),
+    )
+
+
+def _notes(findings: Findings) -> list[str]:
+    """What is worth knowing of the motions, and of the method."""
+    chosen = findings.chosen_cost
+    notes = [note for motion in findings.motions for note in motion_notes(motion)]
+    return notes + (cost_notes(chosen, findings.costs) if chosen else [])
+
+
+def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
+    """Each body, with the names of the experiments that it is in."""
+    guesses = problem.parameters.guesses
+    names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
+    pairs = zip(problem.bodies, names, strict=True)
+    return tuple(body_finding(body, body.theta(guesses), own) for body, own in pairs)
+
+
+def _holds(problem: Problem, bodies: tuple[BodyFinding, ...]) -> tuple[Hold, ...]:
+    edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
+    return tuple(hold for e in problem.experiments for hold in holds_of(e, edges_m[e.name]))
+
+
+def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
+    if len(bodies) == 1:
+        return list(bodies[0].warnings)
+    return [
+        f"in the body of {', '.join(map(repr, body.experiments))}: {warning}"
+        for body in bodies
+        for warning in body.warnings
+    ]

@@ -1,0 +1,98 @@
+"""Derivatives at the guess against differences, on the first samples of every experiment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ...arrays import Array
+from ...problem import Problem
+from ...program.collocation import Collocation, carried_over
+from ...recording.experiment import Experiment
+from ...recording.wrench import Wrench
+from ...recording.wrench_files import FEWEST
+
+# All kinds of rows are among these samples, those of equilibria among fewer; derivatives do not
+# depend on how many follow.
+SAMPLES, STATIC_SAMPLES = 12, 3
+STEP = 1e-5
+# With more entries memory and wrenches are not laid out as variables: their slopes are checked.
+LAID_OUT = 5e6
+
+
+def few(experiment: Experiment) -> int:
+    """How many first samples have all kinds of rows."""
+    return STATIC_SAMPLES if experiment.static else SAMPLES
+
+
+def shortened(problem: Problem) -> Problem:
+    """The same problem with a few first samples of every experiment only."""
+    short = tuple(first_samples(e, few(e)) for e in problem.experiments)
+    return replace(problem, experiments=short)
+
+
+def first_samples(experiment: Experiment, samples: int) -> Experiment:
+    """The same experiment with its first samples only."""
+    markers, here = experiment.markers, slice(samples)
+    tracks = markers.positions_m[here]
+    if not np.isfinite(tracks).any():
+        tracks = np.nan_to_num(tracks)  # at least one sample has to be there
+    markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
+    t_s = experiment.t_s[here]
+    fewest = 1 if experiment.static else FEWEST
+    grasps = [replace(g, wrench=_begun(g.wrench, t_s, fewest)) for g in experiment.grasps]
+    return replace(experiment, t_s=t_s, markers=markers, grasps=grasps)
+
+
+def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
+    """The wrench up to the last of some times, if that leaves enough of it."""
+    if wrench is None:
+        return None
+    here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
+    if here.sum() < fewest or not wrench.present[here].any():
+        return None
+    return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
+
+
+def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
+    """Largest relative deviations of J and H along a random direction at a disturbed start."""
+    rng, of_slopes = np.random.default_rng(0), 0.0
+    program, plain = collocation.made_explicit(), collocation
+    if program.explicit:  # methods use these without memory and wrenches as variables
+        of_slopes = _slope_error(plain.objective, plain.gradient, z, rng)
+        if plain.remembers:
+            forces = rng.normal(size=plain.constraints)
+            through = partial(plain.pulled_back, multipliers=forces)
+            along = _slope_error(lambda at: forces @ plain.constraint_values(at), through, z, rng)
+            of_slopes = max(of_slopes, along)
+        if sum(program.carried_nonzeros) > LAID_OUT:
+            return of_slopes, 0.0
+        collocation, z = program, carried_over(z, plain, program)
+    point = z + 1e-3 * rng.normal(size=len(z))
+    direction = rng.normal(size=len(z))
+    multipliers = rng.normal(size=collocation.constraints)
+
+    def lagrangian_gradient(at: Array) -> Array:
+        return collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
+
+    hessian = collocation.hessian(point, 1.0, multipliers)
+    along = collocation.jacobian(point) @ direction
+    first = _deviation(collocation.constraint_values, along, point, direction)
+    second = _deviation(lagrangian_gradient, hessian @ direction, point, direction)
+    return max(first, of_slopes), second
+
+
+def _slope_error(function, gradient, z: Array, rng: np.random.Generator) -> float:
+    """That of a gradient along a random direction."""
+    point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
+    return _deviation(function, gradient(point) @ direction, point, direction)
+
+
+def _deviation(function, exact: Array, point: Array, direction: Array) -> float:
+    ahead, behind, far_ahead, far_behind = (
+        function(point + k * STEP * direction) for k in (1, -1, 2, -2)
+    )
+    differences = (8 * (ahead - behind) - (far_ahead - far_behind)) / (12 * STEP)
+    return float(np.abs(differences - exact).max() / np.abs(exact).max())

@@ -1,0 +1,132 @@
+"""What was recorded: how long, how often, and each marker's samples and place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...arrays import Array
+from ...recording.experiment import Experiment
+from .shape import BodyFinding
+
+# Of the mean edge length: beyond this, a marker's place is mostly extrapolation.
+FAR = 0.5
+# Of the body's diagonal: a marker that starts farther from where the guess puts it is in another
+# frame or unit, or on another place.
+ASTRAY = 0.5
+MOSTLY_MISSING = 0.5
+
+
+@dataclass(frozen=True)
+class MarkerFinding:
+    """One marker of a recording.
+
+    Attributes
+    ----------
+    name : str
+    distance_m : float
+        From the body, or from the node it was attached to.
+    samples, missing : int
+    start_miss_m : float or None
+        From its first sample to where the simulation at the guess has it then; None without one.
+    """
+
+    name: str
+    distance_m: float
+    samples: int
+    missing: int
+    start_miss_m: float | None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One experiment's measurements."""
+
+    experiment: str
+    validation: bool
+    static: bool
+    duration_s: float
+    rate_hz: float
+    frames: int
+    samples: int
+    missing: int
+    markers: tuple[MarkerFinding, ...]
+
+    @property
+    def farthest(self) -> MarkerFinding:
+        """The marker farthest from the body."""
+        return max(self.markers, key=lambda marker: marker.distance_m)
+
+    @property
+    def least_seen(self) -> MarkerFinding:
+        """The marker with most samples missing."""
+        return max(self.markers, key=lambda marker: marker.missing)
+
+
+def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording:
+    """What an experiment measured.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    positions_m : (T, n, 3) or None
+        Its simulation at the guess, at the samples or the first of them.
+    """
+    markers = experiment.markers
+    miss = np.zeros((0, len(markers.names)))
+    if positions_m is not None:
+        seen_m = markers.positions_m[: len(positions_m)]
+        miss = np.linalg.norm(markers.observe(positions_m) - seen_m, axis=2)
+    findings = []
+    for k, name in enumerate(markers.names):
+        seen = np.flatnonzero(markers.present[:, k])
+        findings.append(
+            MarkerFinding(
+                name,
+                float(markers.placement.distance_m[k]),
+                len(seen),
+                int(markers.missing[k]),
+                float(miss[seen[0], k]) if len(seen) and seen[0] < len(miss) else None,
+            )
+        )
+    return Recording(
+        experiment.name,
+        experiment.validation,
+        experiment.static,
+        experiment.duration_s,
+        1 / experiment.timestep_s,
+        len(experiment.t_s),
+        markers.samples,
+        int(markers.missing.sum()),
+        tuple(findings),
+    )
+
+
+def recording_warnings(recording: Recording, body: BodyFinding) -> list[str]:
+    """What is wrong with the measurements, one sentence each; the worst marker stands for all."""
+    if not recording.markers:
+        return []
+    warnings = []
+    name, far, lost = recording.experiment, recording.farthest, recording.least_seen
+    if far.distance_m > FAR * body.edges_m[1]:
+        warnings.append(
+            f"marker '{far.name}' of '{name}' lies {1e3 * far.distance_m:.3g} mm from its place on "
+            "the body and is extrapolated: give its reference_m, or check the frame and unit"
+        )
+    if lost.samples == 0:
+        warnings.append(f"marker '{lost.name}' of '{name}' is never seen: leave it out of names")
+    elif lost.missing > MOSTLY_MISSING * recording.frames:
+        warnings.append(
+            f"marker '{lost.name}' of '{name}' is missing in {lost.missing} of {recording.frames} "
+            "samples: shorten window_s to where it is seen, or leave it out of names"
+        )
+    astray = [m for m in recording.markers if (m.start_miss_m or 0.0) > ASTRAY * body.diagonal_m]
+    if astray:
+        worst = max(astray, key=lambda marker: marker.start_miss_m or 0.0)
+        warnings.append(
+            f"marker '{worst.name}' of '{name}' is first seen {1e3 * (worst.start_miss_m or 0):.3g}"
+            " mm from where the guess has it: check length_unit, the frame of the poses, "
+            "reference_m, and whether the guess is far too soft"
+        )
+    return warnings

@@ -1,0 +1,193 @@
+"""The check of an answer: every experiment simulated forward with it, and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import Array, root_mean
+from ..errors import SimulationError
+from ..fem.kernels import side_by_side
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution, wrench_rms
+from ..model.schemes import MOST_STEPS, as_scheme
+from ..problem import Problem
+from ..program.segment import Segment
+from ..program.simulation import Trajectory, simulate
+from ..recording import Experiment
+from ..statistics.estimates import Estimate
+from ..statistics.linearised import Derived, LinearisedFit
+from ..statistics.numerical import Refinement, changes_towards, numerical_errors
+
+# Grid steps over those of a roll-out that tells the step's error, with room for rounding.
+LEAST_FINER = 1.99
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A forward simulation with the answer's parameters, against the measurements.
+
+    Attributes
+    ----------
+    rms_m, max_m : distance of the markers from the measurements; the tip error is in `max_m`
+    trajectory : Trajectory
+        Its markers are read with the experiment's nuisance parameters.
+    nuisance : mapping of name to value
+        Nuisance parameters of an experiment for validation, fitted with the material as found.
+        Of places they are the way from where these were started.
+    places_m : mapping of marker to place [x, y, z], for validation likewise
+    wrenches : tuple of (S, 6)
+        What the sensors of its grasps should read, NaN where that is not known.
+    wrench_rms : RMS of force [N] and torque [N m], None where there is none
+    """
+
+    rms_m: float
+    max_m: float
+    trajectory: Trajectory
+    nuisance: Mapping[str, float]
+    places_m: Mapping[str, list[float]]
+    wrenches: Sequence[Array] = ()
+    wrench_rms: tuple[float | None, float | None] = (None, None)
+
+
+def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
+    """Those of all experiments by their names, see `roll_out`."""
+    threads = solution.collocation.threads
+    found = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
+    return {e.name: each for e, each in zip(problem.experiments, found, strict=True)}
+
+
+def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
+    """Simulate an experiment with a solution's parameters; or say why that fails."""
+    options = problem.rollout
+    integrator = problem.scheme if options.integrator == "scheme" else "newmark"
+    try:
+        segment, phi = _seen(experiment, solution)
+        trajectory = simulate(
+            segment.corrected(phi),
+            experiment.body.theta(solution.parameters),
+            integrator,
+            timestep_s=_step_s(problem, segment),
+            substeps=segment.substeps,
+        )
+    except SimulationError as error:
+        return str(error)
+    readings = segment.markers.of_samples(trajectory.positions_m, phi)
+    distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
+    present = distances[experiment.markers.present]
+    nuisance, wrenches = segment.nuisance, _read(segment, phi, trajectory)
+    return Rollout(
+        root_mean(present**2),
+        float(present.max(initial=0.0)),
+        replace(trajectory, markers_m=readings),
+        dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True))
+        if experiment.validation
+        else {},
+        dict(zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True))
+        if experiment.validation
+        else {},
+        wrenches,
+        wrench_rms(experiment, wrenches),
+    )
+
+
+def _read(segment: Segment, phi: Array, trajectory: Trajectory) -> list[Array]:
+    """What the experiment's sensors read, with its φ, of what was simulated."""
+    grid, forced = trajectory.reactions
+    return [sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors]
+
+
+def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
+    """The experiment with its φ: those of the fit, or fitted with θ as found."""
+    collocation = solution.collocation
+    for part in collocation.parts(solution.z):
+        if part.segment.experiment is experiment:
+            return part.segment, part.phi
+    found, body = solution.parameters, experiment.body
+    alone = replace(
+        collocation,
+        experiments=[replace(experiment, validation=False)],
+        parameters=collocation.parameters.fixed_at(
+            {name: found[name] for name in body.used_names(list(found))}
+        ),
+    )
+    (segment,) = alone.segments
+    # All that is left to estimate is φ.
+    if not alone.nphi:
+        return segment, np.zeros(0)
+    return segment, alone.parameters_of(ReducedSpace()(alone).unless_interrupted().z)
+
+
+def step_error(
+    problem: Problem,
+    solution: Solution,
+    fit: LinearisedFit,
+    rollouts: Mapping[str, Rollout | str],
+    estimates: Mapping[str, Estimate],
+) -> Refinement | None:
+    """What the step does to every parameter and modulus, to first order.
+
+    From a Gauss–Newton step towards the roll-outs; None where these are missing or no finer, and
+    where all is static.
+    """
+    apart: list[Array] = []
+    collocation = solution.collocation
+    if all(segment.experiment.static for segment in collocation.segments):
+        return None
+    for segment, readings in zip(collocation.segments, solution.readings_m, strict=True):
+        experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)
+        share = _share(problem, segment)
+        if not isinstance(rollout, Rollout) or share is None:
+            return None
+        way = share * (rollout.trajectory.markers_m - readings)
+        apart.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
+        fitted = solution.wrenches.get(experiment.name, [])
+        for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
+            way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
+            apart.append(way.reshape(-1, 2, 3))
+        apart += _of_gauges(solution, segment, rollout.trajectory, share)
+    change = changes_towards(fit, apart)[: collocation.nq]
+    q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
+    moduli = Derived.of((s.constants for s in collocation.segments), q).values
+    halved = {**moduli, **collocation.parameters.values(q)}
+    linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
+    return Refinement(numerical_errors(estimates, [halved], [], order, linear))
+
+
+def _of_gauges(
+    solution: Solution, segment: Segment, trajectory: Trajectory, share: float
+) -> list[Array]:
+    """A share of the way of the readings of one's own to a roll-out, of each (S, G, 3)."""
+    if not segment.gauges:
+        return []
+    (part,) = (p for p in solution.collocation.parts(solution.z) if p.segment is segment)
+    samples, found = part.x[segment.markers.grid_rows], []
+    for gauge in segment.gauges:
+        fitted, rolled = (
+            gauge.of_samples(x.reshape(len(x), -1, 3), segment.experiment.t_s, part.phi)
+            for x in (samples, trajectory.positions_m)
+        )
+        found.append(share * (rolled - fitted) / gauge.sigmas[:, None])
+    return found
+
+
+def _share(problem: Problem, segment: Segment) -> float | None:
+    """Of the way to a roll-out, the part that half the step would go; None if it is no finer."""
+    experiment, options = segment.experiment, problem.rollout
+    if experiment.static:
+        return 1.0
+    steps = experiment.timestep_s / _step_s(problem, segment) / segment.substeps
+    if options.integrator != "newmark" or steps < LEAST_FINER:
+        return None
+    order = as_scheme(problem.scheme).order
+    # Newmark's own error is of second order: beside one of the first it is none.
+    left = steps**-order if order > 1 else 0.0
+    return (1 - 0.5**order) / (1 - left)
+
+
+def _step_s(problem: Problem, segment: Segment) -> float:
+    """Of the roll-outs: a quarter of the samples' distance at most, and half the grid's."""
+    count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
+    return problem.rollout.timestep_s or segment.experiment.timestep_s / count

@@ -1,0 +1,141 @@
+"""The answer again with half the step, and on a mesh twice as fine: its numerical error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from ..errors import InputError
+from ..fem.refinement import refined
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution
+from ..model.schemes import as_scheme
+from ..problem import Problem
+from ..recording import refinement
+from ..statistics.estimates import Estimate
+from ..statistics.numerical import Level, Refinement, numerical_errors
+from .answer import Answer
+from .solving import solve
+from .warm_start import Earlier
+
+A = TypeVar("A", bound=Answer)
+MOST_LEVELS = 3
+# Last step of the logarithms: far below any error bar.
+TOLERANCE = 1e-6
+
+
+def finer_step(problem: Problem) -> Problem:
+    """The problem with half the step."""
+    return replace(problem, substeps=2 * problem.first_substeps)
+
+
+def finer_mesh(problem: Problem) -> Problem:
+    """The problem with every tetrahedron split into eight."""
+    bodies = {id(body): refined(body) for body in problem.bodies}
+    experiments = [refinement.refined(e, bodies[id(e.body)]) for e in problem.experiments]
+    return replace(problem, experiments=experiments)
+
+
+FINER = {"step": finer_step, "mesh": finer_mesh}
+
+
+def refine(finished: A, levels: int = 2, say: Callable[[str], None] | None = None) -> A:
+    """A converged run with its numerical error, see `refinement_of`."""
+    answer = Earlier.of(finished.solution)
+    problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
+    found = refinement_of(problem, answer, finished.noise_estimates, levels, say)
+    return replace(finished, refinement=found)
+
+
+def refinement_of(
+    problem: Problem,
+    answer: Earlier,
+    estimates: Mapping[str, Estimate],
+    levels: int = 2,
+    say: Callable[[str], None] | None = None,
+    known: Sequence[Level] = (),
+    keep: Callable[[Refinement], object] | None = None,
+) -> Refinement:
+    """Solve again at finer discretisations, each from the answer before.
+
+    The step and the mesh are halved by themselves: their errors add up to first order. Finer
+    problems are solved by the reduced space, whatever method found the answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    answer : Earlier
+    estimates : mapping of name to Estimate
+        The answer's, with the intervals for noise.
+    levels : int
+        2, or 3 to observe the orders.
+    say : callable, optional
+        Called with what is being done now.
+    known : sequence of Level
+        Those that were solved before.
+    keep : callable, optional
+        Called after each level with what is found so far.
+
+    Raises
+    ------
+    InputError
+        For another number of levels, or where a finer problem is not solved.
+    KeyboardInterrupt
+        Where a solve was interrupted; what `keep` was given stays.
+    """
+    if not 2 <= levels <= MOST_LEVELS:
+        raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
+    fitted = [experiment for experiment in problem.experiments if not experiment.validation]
+    coarse = replace(problem, experiments=fitted, notes=())
+    moving = any(not experiment.static for experiment in fitted)
+    solved = {(each.halved, each.times): each for each in known}
+    found: list[Level] = []
+    for kind, finer in FINER.items():
+        at, start = coarse, answer
+        for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
+            at = finer(at)
+            if (kind, level) in solved:
+                found.append(solved[kind, level])
+                start = replace(answer, values={**answer.values, **found[-1].values})
+                continue
+            if say is not None:
+                say(f"solving again: {kind} halved {level}×")
+            solution = _solved(at, start, f"{kind} halved {level}×")
+            start = Earlier.of(solution)
+            found.append(_level(kind, level, solution))
+            if keep is not None:
+                keep(_of_levels(found, problem, estimates))
+    return _of_levels(found, problem, estimates)
+
+
+def _of_levels(
+    levels: Sequence[Level], problem: Problem, estimates: Mapping[str, Estimate]
+) -> Refinement:
+    by_step, by_mesh = ([each.values for each in levels if each.halved == kind] for kind in FINER)
+    order = as_scheme(problem.scheme).order
+    errors = numerical_errors(estimates, by_step, by_mesh, order, problem.parameters.linear)
+    return Refinement(errors, tuple(levels))
+
+
+def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
+    solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
+    if not solution.unless_interrupted().status.converged:
+        raise InputError(
+            f"the problem with the {what} was not solved ({solution.status.value}: "
+            f"{solution.message}); solve it by itself to see why"
+        )
+    return solution
+
+
+def _level(kind: str, level: int, solution: Solution) -> Level:
+    segments = solution.collocation.segments
+    return Level(
+        halved=kind,
+        times=level,
+        timesteps=sum(segment.grid_rows for segment in segments),
+        nodes=sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
+        iterations=solution.iterations,
+        time_s=solution.timing.total,
+        values=dict(Earlier.of(solution).values),
+    )

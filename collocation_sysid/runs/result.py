@@ -1,0 +1,260 @@
+"""What ``result.json`` holds: one tree of plain values, from which pages and pictures are made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..arrays import Array
+from ..errors import InputError
+from ..files import RESULT_FILE, damage_refused, read_json
+from ..methods.solution import Timing
+from ..statistics.diagnostics import MarkerDiagnosis
+from ..statistics.estimates import Estimate
+from ..statistics.numerical import NumericalError
+from ..statistics.places import Place
+from ..statistics.trust import Trust
+from ..tree import optional, read
+
+
+@dataclass(frozen=True)
+class FoundValue(Estimate):
+    """A parameter or a modulus that follows from parameters; `guess` and `fixed` of the first.
+
+    Attributes
+    ----------
+    ci95_holds : tuple of str
+        What `ci95` allows for: "noise", and of "step" and "mesh" what is known.
+    ci95_noise : (lower, upper) or None
+        The interval for the noise alone.
+    """
+
+    ci95_holds: tuple[str, ...] = ()
+    ci95_noise: tuple[float, float] | None = None
+    numerical_error: NumericalError | None = None
+    guess: float | None = optional()
+    fixed: bool | None = optional()
+
+    @property
+    def by_noise(self) -> Estimate:
+        """With the interval for the noise alone."""
+        return Estimate(self.value, self.std_error, self.ci95_noise, self.at_bound, self.reason)
+
+
+@dataclass(frozen=True)
+class FoundNuisance:
+    """A nuisance parameter in its unit, with the deviation of its prior."""
+
+    value: float
+    prior: float
+    std_error: float | None
+
+
+@dataclass(frozen=True)
+class RecordingsAgreement:
+    """What each recording says by itself of a parameter, to first order, and how they agree."""
+
+    values: Mapping[str, float]
+    deviations: Mapping[str, float]
+    chi_squared: float
+    degrees_of_freedom: int
+    disagree: bool
+
+
+@dataclass(frozen=True)
+class FoundProfile:
+    """A profile likelihood, as how much the loss rises."""
+
+    interval: tuple[float | None, float | None]
+    values: Array
+    rises: Array
+    threshold: float
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class FoundUncertainty:
+    """Where the error bars come from; covariance of the logarithms, by `names`."""
+
+    noise: str
+    errors: str
+    reduced_chi_squared: float
+    noise_factors: Mapping[str, float]
+    autocorrelation: float
+    names: tuple[str, ...]
+    correlation: Array
+    covariance: Array
+    quantiles: Array
+    verdicts: tuple[str, ...]
+    recordings: Mapping[str, RecordingsAgreement] | None
+    profiles: Mapping[str, FoundProfile]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundScan:
+    """The scan of the stiffness that found a start."""
+
+    reason: str
+    young_pa: Array
+    misfit: Array
+    best: int
+    samples: int
+    time_s: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class FittedExperiment:
+    """How far an experiment's markers and wrenches are from the fit."""
+
+    rms_m: float
+    samples: int
+    missing: int
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+
+
+@dataclass(frozen=True)
+class FoundFit:
+    """The same of all experiments."""
+
+    rms_m: float
+    noise_rms_m: float
+    experiments: Mapping[str, FittedExperiment]
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+
+
+@dataclass(frozen=True)
+class SimulatedExperiment:
+    """An experiment simulated with the answer; of one that `failed` all else is missing."""
+
+    fitted: bool
+    failed: str | None = optional()
+    rms_m: float | None = optional()
+    max_m: float | None = optional()
+    nuisance: Mapping[str, float] | None = optional()
+    places_m: Mapping[str, tuple[float, ...]] | None = optional()
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+
+
+@dataclass(frozen=True)
+class FoundRollout:
+    """Forward simulations with the answer; distances of those that were fitted."""
+
+    rms_m: float | None
+    max_m: float | None
+    experiments: Mapping[str, SimulatedExperiment]
+
+
+@dataclass(frozen=True)
+class FoundDynamics:
+    """How far the equations of motion are violated."""
+
+    max_violation_n: float
+    max_violation_relative: float
+    largest: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ProgramSize:
+    """The discretised problem."""
+
+    nodes: int
+    elements: int
+    substeps: int
+    timesteps: int
+    variables: int
+    constraints: int
+    scheme: str
+
+
+@dataclass(frozen=True)
+class HistoryLine:
+    """An iterate, see `Iteration`, which has the same fields in the same order."""
+
+    iteration: int
+    loss: float
+    rms_m: float
+    violation_n: float
+    parameters: Mapping[str, float]
+    time_s: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What made the result, of which problem."""
+
+    version: str
+    casadi: str
+    numpy: str
+    python: str
+    platform: str
+    problem_file: str | None
+    problem_sha256: str | None
+    mesh_sha256: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The content of ``result.json``, whose names are its keys."""
+
+    schema: int
+    status: str
+    converged: bool
+    message: str
+    missing: str
+    trust: Trust
+    method: str
+    title: str
+    parameters: Mapping[str, FoundValue]
+    derived: Mapping[str, FoundValue]
+    places: Mapping[str, Mapping[str, Place]]
+    nuisance: Mapping[str, Mapping[str, FoundNuisance]]
+    uncertainty: FoundUncertainty | None
+    scan: FoundScan | None
+    fit: FoundFit
+    residuals: tuple[MarkerDiagnosis, ...]
+    dynamics: FoundDynamics
+    rollout: FoundRollout
+    iterations: int
+    evaluations: int
+    timing_s: Timing
+    problem: ProgramSize
+    notes: tuple[str, ...]
+    history: tuple[HistoryLine, ...]
+    provenance: Provenance
+
+    @classmethod
+    def read(cls, run: str | Path, what: str = "a run folder") -> Result:
+        """Read a run folder, which is said to be `what` where it is none.
+
+        Raises
+        ------
+        InputError
+            If it is no run folder, or damaged.
+        """
+        folder = Path(run)
+        found = read_json(folder / RESULT_FILE, what)
+        with damage_refused(folder, RESULT_FILE, "solve the problem again"):
+            return read(cls, found)
+
+    @property
+    def values(self) -> dict[str, FoundValue]:
+        """Parameters, then moduli that follow."""
+        return {**self.parameters, **self.derived}
+
+    def home(self, run: str | Path, needs: str) -> Path:
+        """The folder of the problem file, which `needs` one.
+
+        Raises
+        ------
+        InputError
+            If the run is of no problem file.
+        """
+        if self.provenance.problem_file is None:
+            raise InputError(f"the run is of no problem file, {needs}", run)
+        return Path(self.provenance.problem_file).parent

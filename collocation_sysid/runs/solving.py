@@ -1,0 +1,165 @@
+"""Solving a problem: where to start, again from elsewhere where that helps, and no checks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from ..arrays import Array
+from ..errors import InputError
+from ..methods.method import Method, Watch
+from ..methods.reduced_space import ReducedSpace
+from ..methods.scan import Scan, rescue, started
+from ..methods.solution import Solution, Status
+from ..methods.start import placed_at_guess
+from ..methods.workers import Workers, workers_of
+from ..problem import Problem
+from ..program.collocation import Collocation
+from .check.ram import require_memory
+from .second_start import USUAL, second_start
+from .warm_start import Earlier
+
+# How a search ends that went astray; another start may help.
+LOST = (
+    Status.INFEASIBLE,
+    Status.STALLED,
+    Status.DIVERGED,
+    Status.NUMERICAL_FAILURE,
+    Status.NOT_SIMULABLE,
+)
+# By how much χ² must be lower for another answer to count.
+NOTICEABLE = 1e-3
+# A solve is repeated so often where markers turn out to sit in other elements.
+REREADINGS = 5
+
+
+def solve(
+    problem: Problem,
+    method: str | Method | None = None,
+    watch: Watch | None = None,
+    start: str | Path | Earlier | None = None,
+    scheduler: str | None = None,
+) -> Solution:
+    """Solve a problem, without the checks of `run`.
+
+    Parameters
+    ----------
+    problem : Problem
+    method : str or Method, optional
+        A name, or anything that solves a `Collocation`, such as a method with other options; the
+        problem's own by default.
+    watch : callable, optional
+        Called with every `Iteration`.
+    start : str, Path or Earlier, optional
+        An earlier answer or the folder of its run, of any mesh or timestep; it takes the place of
+        the guesses where names match.
+    scheduler : str, optional
+        Address of a dask.distributed scheduler, whose workers share the experiments of the search;
+        for reduced space only.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, a start that is no run or has no parameter of these, where no start
+        is found, for a scheduler that does not answer or has lost its workers, and when the
+        solver refuses the problem.
+    """
+    solver = problem.solver(method)
+    if scheduler is not None and not isinstance(solver, ReducedSpace):
+        raise InputError(
+            f"{getattr(solver, 'name', solver)} does not share its experiments; expected "
+            "the method 'reduced-space', or leave the scheduler out",
+            None,
+            "--scheduler",
+        )
+    with workers_of(scheduler) as workers:
+        return _solved(problem, solver, watch, start, workers)
+
+
+def _solved(
+    problem: Problem,
+    solver: Method,
+    watch: Watch | None,
+    start: str | Path | Earlier | None,
+    workers: Workers | None,
+) -> Solution:
+    earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start
+    problem = problem if earlier is None else earlier.started(problem)
+    try:
+        whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
+        require_memory(problem, collocation, solver)
+        collocation, scan = started(collocation, whole)
+        collocation, variables = placed_at_guess(collocation), None
+        if earlier is not None and not scan:
+            collocation = earlier.placed(collocation)
+            variables = earlier.variables(collocation)
+        solver = shared(solver, workers)
+        solution = read_where_found(solver, collocation, watch, variables)
+        if scan is None and solution.status in LOST:
+            scan, solution = _again(solver, solution, watch)
+        if solution.status.converged and earlier is None and solution.method == ReducedSpace.name:
+            solution = _from_elsewhere(solver, solution, watch)
+    except InputError as error:
+        raise error.located(problem.path) from error
+    if solution.status is Status.REFUSED:
+        reasons = "; ".join(solution.notes)
+        raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
+    if scan is None:
+        return solution
+    return replace(solution, scan=scan, notes=(scan.sentence, *solution.notes))
+
+
+def shared(solver: Method, workers: Workers | None) -> Method:
+    """The method with the workers that share its experiments, where there are any."""
+    if workers is None or not isinstance(solver, ReducedSpace):
+        return solver
+    return partial(solver, workers=workers)
+
+
+def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | None, Solution]:
+    """Solve from a scan what could not be solved from its guess; the loser where that fails too."""
+    reason = f"the search from the guess was lost ({lost.status.value})"
+    whole = getattr(solver, "needs_whole_start", False)
+    scan = rescue(lost.collocation, reason, whole)
+    if scan is None:
+        return None, lost
+    again = placed_at_guess(replace(lost.collocation, parameters=scan.parameters))
+    found = read_where_found(solver, again, watch)
+    ended = found.status.converged or found.status is Status.INTERRUPTED
+    return (scan, found) if ended else (None, lost)
+
+
+def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Solution:
+    """The better of an answer and that of a second start, where there is reason for one."""
+    other = second_start(first)
+    if other is None:
+        return first
+    again = placed_at_guess(replace(first.collocation, parameters=other))
+    second = read_where_found(solver, again, watch)
+    gain = first.history[-1].loss - second.history[-1].loss
+    if second.status is Status.INTERRUPTED:
+        return replace(first, status=second.status, message=second.message)
+    if not second.status.converged or gain <= NOTICEABLE:
+        return first
+    note = (
+        f"Poisson's ratio ended near one half; a second start, from the usual {USUAL}, found an "
+        f"answer that fits better (χ² lower by {gain:.3g})"
+    )
+    return replace(second, notes=(note, *second.notes))
+
+
+def read_where_found(
+    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
+) -> Solution:
+    """Solve, and again from there as long as estimates leave where the recordings are read."""
+    solution = solver(collocation, watch, start)
+    for _ in range(REREADINGS):
+        if not solution.status.converged:
+            break
+        p, positions = solution.collocation.unpack(solution.z)
+        collocation, moved = solution.collocation.following(p)
+        if collocation is solution.collocation:
+            break
+        solution = solver(collocation, watch, collocation.pack(moved, positions))
+    return solution

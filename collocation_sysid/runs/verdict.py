@@ -1,0 +1,154 @@
+"""Everything about a finished run that gives concern, see `statistics.trust`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from ..errors import SimulationError
+from ..methods.solution import Solution, Status, pooled_wrench_rms
+from ..model.schemes import as_scheme
+from ..problem import Problem
+from ..program.stability import instabilities
+from ..recording.nuisance import TIME
+from ..recording.turning import TOO_FAST, fastest_turn
+from ..statistics.concern import Concern
+from ..statistics.diagnostics import MarkerDiagnosis
+from ..statistics.plausible import odd_material, oddities
+from ..statistics.scale import scale_concern
+from ..statistics.trust import (
+    clock_concerns,
+    fit_concerns,
+    marker_concerns,
+    noise_rms_m,
+    nuisance_concerns,
+    parameter_concerns,
+    rollout_concerns,
+    scheme_concerns,
+    stability_concerns,
+)
+from ..statistics.uncertainty import Uncertainty
+from .check.motion import Motion, motion_of
+from .forward_simulation import Rollout
+
+# Noise of cameras over a body's size is less.
+NO_CAMERA = 0.01
+
+
+def concerns(
+    solution: Solution,
+    rollouts: Mapping[str, Rollout | str],
+    motions: Iterable[Motion],
+    uncertainty: Uncertainty | None,
+    diagnoses: Sequence[MarkerDiagnosis],
+) -> Iterator[Concern]:
+    """What speaks against an answer."""
+    status = solution.status
+    yield from body_concerns(solution)
+    if not status.converged:
+        yield Concern("solve/lost", "doubtful", {"said": solution.message})
+        return
+    if status is Status.ACCEPTABLE:
+        yield Concern("solve/acceptable")
+    if uncertainty is not None:
+        yield from fit_concerns(uncertainty)
+        yield from parameter_concerns(uncertainty)
+    elif solution.collocation.nq:
+        yield Concern("solve/no-error-bars", "doubtful")
+    yield from allowance_concerns(solution)
+    yield from marker_concerns(diagnoses)
+    for part in solution.collocation.parts(solution.z):
+        nuisance = part.segment.nuisance
+        low, high = nuisance.limits(part.segment.chart.samples)
+        # A lag and a tool may well be none.
+        low = np.where(low == 0, -np.inf, low)
+        yield from nuisance_concerns(nuisance.names, part.phi, low, high)
+        for k in nuisance.places(TIME):
+            scale, name = float(nuisance.scales[k]), part.segment.experiment.name
+            yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
+    yield from stability_concerns(instabilities(solution.collocation, solution.z))
+    for name, rollout in rollouts.items():
+        yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
+    collocation = solution.collocation
+    for segment in collocation.segments:
+        turn = fastest_turn(segment.experiment, collocation.substeps)
+        if turn.angle_rad > TOO_FAST:
+            yield Concern("scheme/turn", data={"said": turn.brief})
+    for motion in motions:
+        if motion.first is not None and motion.first.damping_ratio < 1:
+            yield from scheme_concerns(
+                motion.experiment,
+                motion.first.damping_ratio,
+                motion.first.numerical_damping_ratio,
+                motion.first.period_error,
+            )
+
+
+def body_concerns(solution: Solution) -> Iterator[Concern]:
+    """Bodies of a size or a density that is hardly meant, not with the stiffness, or not known."""
+    for body in dict.fromkeys(segment.body for segment in solution.collocation.segments):
+        said = [oddity.sentence for oddity in oddities(body)]
+        if not said and (odd := odd_material(body, body.theta(solution.parameters))) is not None:
+            said = [odd]
+        for sentence in said:
+            yield Concern("description/body", "doubtful", {"said": sentence})
+    experiments = [segment.experiment for segment in solution.collocation.segments]
+    unscaled = scale_concern(experiments, solution.collocation.parameters)
+    if unscaled is not None:
+        yield Concern("scale/unknown", "doubtful", {"said": unscaled})
+
+
+def allowance_concerns(solution: Solution) -> Iterator[Concern]:
+    """A `sigma_m` of equilibria that allows for more than cameras miss.
+
+    Recordings that go on in time tell it by their autocorrelation; of these nothing does.
+    """
+    for experiment in (segment.experiment for segment in solution.collocation.segments):
+        if not experiment.static or not experiment.markers.samples:
+            continue
+        sigma_m = float(np.max(experiment.markers.sigma_m))
+        share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
+        if share > NO_CAMERA:
+            yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
+
+
+def _of_rollout(
+    name: str, rollout: Rollout | str, solution: Solution, noise_m: float
+) -> list[Concern]:
+    fit_rms_m = solution.rms_by_experiment_m
+    if isinstance(rollout, Rollout):
+        fitted = name in fit_rms_m
+        fit_m = fit_rms_m.get(name, solution.rms_m)
+        found = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+        predicted_n, fit_n = rollout.wrench_rms[0], pooled_wrench_rms(solution)[0]
+        if not fitted and not found and predicted_n is not None and fit_n is not None:
+            found = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+        return found
+    return [Concern("roll-out/failed", "doubtful", {"experiment": name, "said": rollout})]
+
+
+def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
+    """RMS distance of the fitted markers that noise of the σ given would leave."""
+    markers = [segment.experiment.markers for segment in solution.collocation.segments]
+    samples = np.concatenate([each.present.sum(axis=0) for each in markers]).astype(float)
+    sigma_m = np.concatenate([each.sigma_m for each in markers])
+    measured = solution.collocation.measurements
+    fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
+    return noise_rms_m(sigma_m, samples, float(fitted))
+
+
+def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
+    """How each body oscillates with the answer; a solve that failed has none worth the search."""
+    found, substeps = {}, solution.collocation.substeps
+    scheme = as_scheme(solution.collocation.scheme)
+    moving = [experiment for experiment in problem.experiments if not experiment.static]
+    for experiment in moving if solution.status.converged else ():
+        theta = experiment.body.theta(solution.parameters)
+        try:
+            found[experiment.name] = motion_of(
+                experiment, scheme, experiment.timestep_s / substeps, theta
+            )
+        except SimulationError:
+            continue
+    return found
