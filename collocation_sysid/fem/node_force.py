@@ -128,21 +128,24 @@ class NodeForce:
         return self._skew[0] > SYMMETRIC
 
     @cached_property
-    def timed(self) -> bool:
-        """Whether it depends on time."""
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """u, data, and the force."""
         u, data = ca.SX.sym("u", self.inputs), ca.SX.sym("data", DATA)
-        return ca.depends_on(self.expression(u, data), data[0])
+        return u, data, self.expression(u, data)
+
+    @cached_property
+    def _slopes(self) -> ca.Function:
+        """The force and its slope by u."""
+        u, data, y = self._symbols
+        return ca.Function("slopes", [u, data], [y, ca.jacobian(y, u)])
 
     @cached_property
     def _skew(self) -> tuple[float, float]:
         """How far the derivatives by x and by v are from symmetric, at some points."""
-        u, data = ca.SX.sym("u", self.inputs), ca.SX.sym("data", DATA)
-        y = self.expression(u, data)
-        slopes = ca.Function("slopes", [u, data], [ca.jacobian(y, u)])
         rng, found = np.random.default_rng(0), np.zeros(2)
         for _ in range(3):
             some = [rng.uniform(0.5, 1.0, size) for size in (self.inputs, DATA)]
-            values = slopes(*some).full()
+            values = self._slopes(*some)[1].full()
             for k, part in enumerate((values[:, :3], values[:, 3:6])):
                 size = np.abs(part).max() or 1.0
                 found[k] = max(found[k], np.abs(part - part.T).max() / size)
@@ -150,9 +153,7 @@ class NodeForce:
 
     def _check(self) -> None:
         try:
-            u, data = ca.SX.sym("u", self.inputs), ca.SX.sym("data", DATA)
-            y = self.expression(u, data)
-            shape = y.shape
+            shape = self._symbols[2].shape
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
@@ -161,8 +162,7 @@ class NodeForce:
         if shape != (3, 1):
             raise InputError(f"force {self.name!r} has the shape {shape}; expected (3, 1)")
         still = np.concatenate([[0.1, 0.2, 0.3], np.zeros(3), np.ones(len(self.constants))])
-        at_rest = ca.Function("rest", [u, data], [y, ca.jacobian(y, u)])(still, np.ones(DATA))
-        if not all(np.isfinite(each.full()).all() for each in at_rest):
+        if not all(np.isfinite(e.full()).all() for e in self._slopes(still, np.ones(DATA))):
             raise InputError(
                 f"force {self.name!r} or its slope is not finite where the node is at rest; "
                 "expected a smooth law, such as sqrt(v·v + 1e-12) in place of |v|"

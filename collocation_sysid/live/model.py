@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
 from ..model.forces import Forces
+from ..model.point_forces import generated
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.least_squares import LeastSquares
@@ -281,7 +282,7 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a material with memory", "one without Prony branches")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
-    if any(force.timed for force in experiment.body.forces):
+    if any(generated(force).takes(0) for force in experiment.body.forces):
         raise refused("a force that depends on time", "one that does not")
     if not experiment.markers.names:
         raise refused("an experiment without markers", "markers")

@@ -127,7 +127,7 @@ class Forces:
         return replace(self, weight=self.weight.towards(other.weight, share), further=further)
 
     def undriven(self) -> Forces:
-        """The same without tensions and pressures."""
+        """Weight and loads alone, without what drives the body or acts by a law of its own."""
         return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
 
     def external_n(self, theta: Theta) -> Array:

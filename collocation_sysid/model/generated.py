@@ -1,6 +1,7 @@
 """Small expressions of a few numbers, at many instances, with derivatives that nobody writes.
 
-Instances come last: inputs u are (k, …), data (d, …), and values (m, …), for any shape … of them.
+Instances come last: inputs u are (k, …), or (k,) where they are the same of all, data (d, …), and
+values (m, …), for any shape … of them.
 """
 
 from __future__ import annotations
@@ -109,6 +110,8 @@ class Generated:
         """Outputs (rows, columns, …) of a function."""
         shape = others[0].shape[1:]
         count = int(np.prod(shape))
+        if u.ndim == 1:
+            u = np.broadcast_to(u.reshape(-1, *(1 for _ in shape)), (len(u), *shape))
         sizes = [function.size_out(k) for k in range(function.n_out())]
         if not count:
             return [np.zeros((*size, *shape)) for size in sizes]

@@ -72,26 +72,29 @@ class Grasping:
 
     def places(self, phi: Array) -> tuple[Array, Array]:
         """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
-        places, by_own = self.nuisance.in_grasps.slopes(*self._instances(phi))
+        places, by_own = self.nuisance.in_grasps.slopes(self._own(phi), self._points)
         slopes = np.zeros((3, len(self.nuisance.moving), places.shape[1]))
         slopes[:, self._columns] = by_own
         return places.T[self._node], np.moveaxis(slopes, 2, 0)[self._node]
 
     def curvature(self, phi: Array, weights: Array) -> Array:
         """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
-        u, points = self._instances(phi)
         pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._poses[0]), weights)
-        of_nodes = np.zeros_like(points.T)
+        of_nodes = np.zeros_like(self._points.T)
         np.add.at(of_nodes, self._node, pulled)
         found = np.zeros((len(self.nuisance.moving),) * 2)
-        second = self.nuisance.in_grasps.curvature(u, points, of_nodes.T).sum(axis=2)
-        found[np.ix_(self._columns, self._columns)] = second
+        second = self.nuisance.in_grasps.curvature(self._own(phi), self._points, of_nodes.T)
+        found[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
         return found
 
-    def _instances(self, phi: Array) -> tuple[Array, Array]:
-        """φ and X of the grasped nodes."""
-        points = self.experiment.body.nodes_m[self._nodes[0]].T
-        return np.repeat(phi[self.nuisance.of_grasps, None], points.shape[1], axis=1), points
+    def _own(self, phi: Array) -> Array:
+        """The φ of the grasps."""
+        return phi[self.nuisance.of_grasps]
+
+    @property
+    def _points(self) -> Array:
+        """(3, nodes) X of the grasped nodes."""
+        return self.experiment.body.nodes_m[self._nodes[0]].T
 
     @cached_property
     def _zeros(self) -> Array:

@@ -63,7 +63,7 @@ class Inputs:
         values, slopes = [], []
         rows = max((e.data.shape[1] for e in self.inputs), default=1)
         for each, generated in zip(self.inputs, self._generated, strict=True):
-            value, slope = generated.slopes(_repeated(p, each.data), each.data)
+            value, slope = generated.slopes(p, each.data)
             values.append(np.broadcast_to(value.T, (rows, each.size)))
             shape = (rows, each.size, self.parameters)
             slopes.append(np.broadcast_to(np.moveaxis(slope, 2, 0), shape))
@@ -81,7 +81,7 @@ class Inputs:
             own = weights[:, first : first + each.size].T
             if each.data.shape[1] == 1:
                 own = own.sum(axis=1, keepdims=True)
-            found += generated.curvature(_repeated(p, each.data), each.data, own).sum(axis=2)
+            found += generated.curvature(p, each.data, own).sum(axis=2)
             first += each.size
         return found
 
@@ -97,7 +97,3 @@ class Inputs:
             if each.by_state:
                 found |= generated.depends
         return found
-
-
-def _repeated(p: Array, data: Array) -> Array:
-    return np.broadcast_to(p[:, None], (len(p), data.shape[1]))

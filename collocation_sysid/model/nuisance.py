@@ -332,7 +332,7 @@ class NuisanceMap:
     def in_grasp(self, phi: Array) -> Array:
         """H as a 4×4 matrix [[R, p], [0, 1]]."""
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
-        images = self.in_grasps.value(np.repeat(phi[self.of_grasps, None], 4, axis=1), points)
+        images = self.in_grasps.value(phi[self.of_grasps], points)
         matrix = np.eye(4)
         matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
         return matrix

@@ -427,11 +427,11 @@ class ThetaMap:
 
     def theta(self, q: Sequence[float] | Array) -> Array:
         """(k,) constants at q."""
-        return self._theta.value(*_once(q))[:, 0]
+        return self._theta.value(_numbers(q), NOTHING)
 
     def slopes(self, q: Array) -> Array:
         """∂θ/∂q (k, nq)."""
-        return self._theta.slopes(*_once(q))[1][..., 0]
+        return self._theta.slopes(_numbers(q), NOTHING)[1]
 
     @property
     def derived_names(self) -> tuple[str, ...]:
@@ -440,8 +440,7 @@ class ThetaMap:
 
     def derived(self, q: Array) -> tuple[Array, Array]:
         """Their values, and derivatives by q."""
-        values, slopes = self._derived[1].slopes(*_once(q))
-        return values[:, 0], slopes[..., 0]
+        return self._derived[1].slopes(_numbers(q), NOTHING)
 
     @cached_property
     def _theta(self) -> Generated:
@@ -458,9 +457,12 @@ class ThetaMap:
         return found, Generated(values, self._theta.inputs, 0)
 
 
-def _once(q: Sequence[float] | Array) -> tuple[Array, Array]:
-    """One instance at q."""
-    return np.asarray(q, dtype=np.float64)[:, None], np.zeros((0, 1))
+# Data of an expression of q alone.
+NOTHING = np.zeros(0)
+
+
+def _numbers(q: Sequence[float] | Array) -> Array:
+    return np.asarray(q, dtype=np.float64)
 
 
 def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str, ...], ca.SX]:

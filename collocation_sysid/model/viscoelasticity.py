@@ -61,7 +61,7 @@ class Recursion:
     Attributes
     ----------
     branch : Branch
-    u, data : (2, N) and (3, N) of `COEFFICIENTS`
+    u, data : (2,) and (3, N) of `COEFFICIENTS`
     c, d, a : (N,)
     by : (3, 2, N) their slopes
     """
@@ -78,7 +78,7 @@ class Recursion:
     def of(cls, branch: Branch, theta: Array, until_next_s: Array, loaded_s: float) -> Recursion:
         """Of a branch, from the times (N,) from each evaluation to the next."""
         count = len(until_next_s)
-        u = np.repeat(theta[[branch.share, branch.tau]][:, None], count, axis=1)
+        u = theta[[branch.share, branch.tau]]
         since_s = np.append(min(loaded_s, LONG * theta[branch.tau]), until_next_s[:-1])
         data = np.stack([since_s, np.arange(count) == 0, until_next_s])
         (c, d, a), by = COEFFICIENTS.slopes(u, data)

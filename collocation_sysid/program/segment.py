@@ -43,7 +43,7 @@ from .wrench_channel import Grid
 
 T = TypeVar("T", bound=np.generic)
 
-CHARTED = ("markers", "readings", "local_loss")
+CHARTED = ("markers", "readings", "local_loss", "_loss_scale")
 
 
 @dataclass(frozen=True)
@@ -690,7 +690,7 @@ class Segment:
         # Experiments that share a φ need not have them in the same order.
         return [(np.minimum(*each), np.maximum(*each)) for each in found]
 
-    @property
+    @cached_property
     def _loss_scale(self) -> Array:
         """Of each entry of the loss, its factor in scaled variables."""
         rows, columns = self.local_loss.structure

@@ -220,7 +220,7 @@ class GraspWrench:
         return ca.vertcat(axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull))
 
     def tool_at(self, phi: Array, count: int) -> tuple[Array, Array]:
-        """Inputs (k, n) and data (33, n) of `tool`.
+        """Inputs (k,) and data (33, n) of `tool`.
 
         These are Q, the turn of the grasp with its rate, and its shift from o with its rate.
         """
@@ -228,8 +228,8 @@ class GraspWrench:
         turns, shifts = self._poses(self.grid[:count])
         turn_rates, shift_rates = self._accelerations(count)
         parts = (axes, turns, turn_rates, shifts - points, shift_rates)
-        own = np.broadcast_to(phi[self.tool_phi, None], (len(self.tool_phi), count))
-        return own, np.concatenate([each.reshape(count, -1) for each in parts], axis=1).T
+        data = np.concatenate([each.reshape(count, -1) for each in parts], axis=1)
+        return phi[self.tool_phi], data.T
 
     def _accelerations(self, count: int) -> tuple[Array, Array]:
         """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
