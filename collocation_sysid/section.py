@@ -10,7 +10,7 @@ from typing import Any, Literal, Optional, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
 from .checked import Boundless, Finite
-from .stated import documented, keys_of, optional_keys
+from .stated import attributes, documented, keys_of, optional_keys
 
 Vector = tuple[Finite, Finite, Finite]
 Corner = tuple[Boundless, Boundless, Boundless]
@@ -18,9 +18,19 @@ Unit = Literal["m", "cm", "mm", "in"]
 
 
 class Section(BaseModel):
-    """A table of the problem file; messages quote the fields' descriptions as what is expected."""
+    """A table of the problem file.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    The docstring says what it and its keys are; messages quote that as what is expected.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        for name, (_, said) in attributes(cls).items():
+            if name in cls.model_fields:
+                cls.model_fields[name].description = said
+        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
 
 
 def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:

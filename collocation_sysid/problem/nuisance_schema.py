@@ -27,21 +27,31 @@ def _scope(word: str) -> str:
 
 
 class Scoped(Section):
-    """Something of a recording, or of several."""
+    """Something of a recording, or of several.
 
-    scope: Annotated[str, AfterValidator(_scope)] = Field(
-        "recording",
-        description="Whose it is: that of each recording by itself, or the same in all that say "
-        + SCOPES
-        + ".",
-    )
+    Attributes
+    ----------
+    scope : str
+        Whose it is: that of each recording by itself, or the same in all that say "shared", or
+        "shared" and a word for each of several groups.
+    """
+
+    scope: Annotated[str, AfterValidator(_scope)] = "recording"
 
 
 class OwnRow(Scoped):
-    """A nuisance parameter of the user's own: a NuisanceRow in a Python file."""
+    """A nuisance parameter of the user's own: a NuisanceRow in a Python file.
 
-    file: Text = Field(description="Python file; it is run, which needs --allow-code.")
-    row: Text = Field(description="Name of the NuisanceRow in it.")
+    Attributes
+    ----------
+    file : str
+        Python file; it is run, which needs --allow-code.
+    row : str
+        Name of the NuisanceRow in it.
+    """
+
+    file: Text
+    row: Text
 
 
 class Prior(Scoped):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, replace
+from dataclasses import KW_ONLY, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,7 +22,6 @@ from ..stated import key, stated
 from ..statistics.plausible import oddities
 from ..statistics.scale import scale_notes
 from ..statistics.stillness import stillness_notes
-from .loading import contents_of
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
@@ -76,8 +75,8 @@ class Problem:
     huber: float | None = None
     method: str | Method = "reduced-space"
     methods: Mapping[str, Method] = key(converter=dict[str, Method], default_factory=dict)
-    rollout: RolloutOptions = RolloutOptions()
-    uncertainty: UncertaintyOptions = UncertaintyOptions()
+    rollout: RolloutOptions = field(default_factory=RolloutOptions)
+    uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     title: str = ""
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
     origin: Origin | None = None
@@ -125,6 +124,8 @@ class Problem:
         InputError
             One clear message for the first thing that is wrong.
         """
+        from .loading import contents_of  # the schema is only built to read a file
+
         path = Path(path)
         contents = contents_of(path, overrides, allow_code, simulation, folder)
         try:

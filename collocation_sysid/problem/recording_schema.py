@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..checked import Boundless, Finite, Flag, NotNegative, Positive, Text
+from ..checked import AtLeastOne, Boundless, Finite, Flag, NotNegative, Positive, Text
 from ..recording import Force, PointMass, Pressure, Tendon
 from ..recording.poses import QUATERNION_NORM_TOLERANCE
 from ..recording.selected import Nodes
@@ -19,12 +19,18 @@ from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 
 class TransformSection(Section):
-    """A constant rigid motion."""
+    """A constant rigid motion.
 
-    position_m: Vector = Field((0.0, 0.0, 0.0), description="Shift [x, y, z].")
-    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = Field(
-        (0.0, 0.0, 0.0, 1.0), description="Turn before the shift [x, y, z, w]."
-    )
+    Attributes
+    ----------
+    position_m : (3,) array
+        Shift [x, y, z].
+    quaternion_xyzw : list
+        Turn before the shift [x, y, z, w].
+    """
+
+    position_m: Vector = (0.0, 0.0, 0.0)
+    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 1.0)
 
     @model_validator(mode="after")
     def _unit_norm(self) -> TransformSection:
@@ -46,22 +52,25 @@ class TransformSection(Section):
 
 
 class TableSection(Section):
-    """Columns of a file, with units in their names."""
+    """Columns of a file, with units in their names.
 
-    file: Text | None = Field(
-        None, description="A table of columns with units; the experiment's file by default."
-    )
-    columns: dict[str, Text] = Field(
-        default_factory=dict,
-        description="Column of the file by what it is, where its name is not recognised; with a "
-        'unit behind, "Load (N)", that the file does not state.',
-    )
-    axis: Literal["x", "y", "z"] = Field(
-        "z", description="Axis of the world along which a machine measures."
-    )
-    sign: Literal[1, -1] = Field(
-        1, description="-1 where the file's positive values are against the axis, as compression."
-    )
+    Attributes
+    ----------
+    file : str, optional
+        A table of columns with units; the experiment's file by default.
+    columns : mapping of name to str
+        Column of the file by what it is, where its name is not recognised; with a unit behind,
+        "Load (N)", that the file does not state.
+    axis : {"x", "y", "z"}
+        Axis of the world along which a machine measures.
+    sign : {1, -1}
+        -1 where the file's positive values are against the axis, as compression.
+    """
+
+    file: Text | None = None
+    columns: dict[str, Text] = Field(default_factory=dict)
+    axis: Literal["x", "y", "z"] = "z"
+    sign: Literal[1, -1] = 1
 
     @property
     def layout(self) -> dict[str, Any]:
@@ -74,11 +83,14 @@ class DisplacementSection(TableSection):
 
     Columns t_s and any of x_m, y_m, z_m, in these or other units; or a machine's displacement, or
     engineering strain with a length.
+
+    Attributes
+    ----------
+    length_m : float, optional
+        Undeformed length that an engineering strain multiplies.
     """
 
-    length_m: Positive | None = Field(
-        None, description="Undeformed length that an engineering strain multiplies."
-    )
+    length_m: Positive | None = None
 
 
 class WrenchSection(TableSection):
@@ -86,30 +98,32 @@ class WrenchSection(TableSection):
 
     Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
     own rate; or a machine's force, or engineering stress with an area. Blank cells are missing.
+
+    Attributes
+    ----------
+    area_m2 : float, optional
+        Undeformed area that an engineering stress multiplies.
+    symmetry : int
+        The mesh is one of so many equal parts of what was measured, 4 for a quarter: forces and
+        sigmas are divided by it.
+    sigma_n : float
+        Standard deviation of the noise of each force [N].
+    sigma_nm : float, optional
+        Standard deviation of the noise of each torque [N m]; needed with any.
+    frame : {"world", "grasp"}
+        Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
+        body as the grasp carries it.
+    point_m : (3,) array
+        Point [x, y, z] of the torque: fixed in the world, or on the undeformed body and moving
+        along.
     """
 
-    area_m2: Positive | None = Field(
-        None, description="Undeformed area that an engineering stress multiplies."
-    )
-    symmetry: Annotated[int, Field(strict=True, ge=1)] = Field(
-        1,
-        description="The mesh is one of so many equal parts of what was measured, 4 for a quarter: "
-        "forces and sigmas are divided by it.",
-    )
-    sigma_n: Positive = Field(description="Standard deviation of the noise of each force [N].")
-    sigma_nm: Positive | None = Field(
-        None, description="Standard deviation of the noise of each torque [N m]; needed with any."
-    )
-    frame: Literal["world", "grasp"] = Field(
-        "world",
-        description='Axes of the components: those of the poses\' world, or "grasp" for those of '
-        "the undeformed body as the grasp carries it.",
-    )
-    point_m: Vector = Field(
-        (0.0, 0.0, 0.0),
-        description="Point [x, y, z] of the torque: fixed in the world, or on the undeformed body "
-        "and moving along.",
-    )
+    area_m2: Positive | None = None
+    symmetry: AtLeastOne = 1
+    sigma_n: Positive
+    sigma_nm: Positive | None = None
+    frame: Literal["world", "grasp"] = "world"
+    point_m: Vector = (0.0, 0.0, 0.0)
 
 
 def _displacement_form(value: Any) -> str:
@@ -131,64 +145,65 @@ else:
 
 
 class GraspSection(Section):
-    """Nodes held by a gripper or a test bench, and how it moves."""
+    """Nodes held by a gripper or a test bench, and how it moves.
 
-    nodes: Nodes = Field(
-        description="Selection: a table of box_m, ball_m or indices, or the name of a point array "
-        "or physical group."
-    )
-    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = Field(
-        "xyz",
-        description="Axes of the world along which it holds; the nodes slide along the others.",
-    )
-    poses: Text | None = Field(
-        None, description="Poses, CSV or .npz; held where they are without poses or markers."
-    )
-    displacement: Displacement | None = Field(
-        None,
-        description="A file with t_s and any of x_m, y_m, z_m, or a table of file, columns, axis, "
-        "sign: shifts from the undeformed place, as of a crosshead, in place of poses.",
-    )
-    quaternion: Literal["xyzw", "wxyz"] | None = Field(
-        None, description="Order of a quaternion whose columns in poses do not name it."
-    )
-    length_unit: Unit | None = Field(
-        None, description="Unit of the positions in poses, where they do not state it."
-    )
-    markers: dict[str, Vector] | None = Field(
-        None,
-        description="Place [x, y, z] on the undeformed body for each marker that is tied to the "
-        "gripper, by name; poses are fitted to their tracks.",
-    )
-    weights: dict[str, NotNegative] = Field(
-        default_factory=dict, description="Weight in that fit by marker name, 1 by default."
-    )
-    max_residual_m: Positive | None = Field(
-        None, description="Residual of that fit above which a frame is reported."
-    )
-    gripper_to_body: TransformSection | None = Field(
-        None,
-        description="Place of the undeformed body in the frame that poses tell of, G in "
-        "x = U(t) G X: position_m, quaternion_xyzw.",
-    )
-    interpolation: Literal["smooth", "linear", "hold"] = Field(
-        "smooth", description="Motion between the samples of poses."
-    )
-    sigma_m: NotNegative | None = Field(
-        None, description="Standard deviation of the noise in each position of poses."
-    )
-    sigma_rad: NotNegative | None = Field(
-        None, description="Standard deviation of the noise in each rotation, about each axis [rad]."
-    )
-    wrench: WrenchSection | None = Field(
-        None, description="What it was measured to give the body: file, sigma_n, sigma_nm, …"
-    )
-    from_s: Finite | None = Field(None, description="First time at which it holds.")
-    until_s: Finite | None = Field(
-        None,
-        description="Last time at which it holds; at the start's, the body is let go from its "
-        "equilibrium in this grasp.",
-    )
+    Attributes
+    ----------
+    nodes : Nodes
+        Selection: a table of box_m, ball_m or indices, or the name of a point array or physical
+        group.
+    axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
+        Axes of the world along which it holds; the nodes slide along the others.
+    poses : str, optional
+        Poses, CSV or .npz; held where they are without poses or markers.
+    displacement : Displacement, optional
+        A file with t_s and any of x_m, y_m, z_m, or a table of file, columns, axis, sign: shifts
+        from the undeformed place, as of a crosshead, in place of poses.
+    quaternion : {"xyzw", "wxyz"}, optional
+        Order of a quaternion whose columns in poses do not name it.
+    length_unit : {"m", "cm", "mm", "in"}, optional
+        Unit of the positions in poses, where they do not state it.
+    markers : mapping of name to (3,) array, optional
+        Place [x, y, z] on the undeformed body for each marker that is tied to the gripper, by name;
+        poses are fitted to their tracks.
+    weights : mapping of name to float
+        Weight in that fit by marker name, 1 by default.
+    max_residual_m : float, optional
+        Residual of that fit above which a frame is reported.
+    gripper_to_body : TransformSection, optional
+        Place of the undeformed body in the frame that poses tell of, G in x = U(t) G X: position_m,
+        quaternion_xyzw.
+    interpolation : {"smooth", "linear", "hold"}
+        Motion between the samples of poses.
+    sigma_m : float, optional
+        Standard deviation of the noise in each position of poses.
+    sigma_rad : float, optional
+        Standard deviation of the noise in each rotation, about each axis [rad].
+    wrench : WrenchSection, optional
+        What it was measured to give the body: file, sigma_n, sigma_nm, …
+    from_s : float, optional
+        First time at which it holds.
+    until_s : float, optional
+        Last time at which it holds; at the start's, the body is let go from its equilibrium in this
+        grasp.
+    """
+
+    nodes: Nodes
+    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = "xyz"
+    poses: Text | None = None
+    displacement: Displacement | None = None
+    quaternion: Literal["xyzw", "wxyz"] | None = None
+    length_unit: Unit | None = None
+    markers: dict[str, Vector] | None = None
+    weights: dict[str, NotNegative] = Field(default_factory=dict)
+    max_residual_m: Positive | None = None
+    gripper_to_body: TransformSection | None = None
+    interpolation: Literal["smooth", "linear", "hold"] = "smooth"
+    sigma_m: NotNegative | None = None
+    sigma_rad: NotNegative | None = None
+    wrench: WrenchSection | None = None
+    from_s: Finite | None = None
+    until_s: Finite | None = None
 
     @model_validator(mode="after")
     def _window(self) -> GraspSection:
@@ -242,60 +257,59 @@ ReferenceSigma = Annotated[
 
 
 class MarkersSection(Section):
-    """Tracked points."""
+    """Tracked points.
 
-    file: Text | None = Field(
-        None,
-        description="Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; only "
-        "`simulate` can do without.",
-    )
-    sigma_m: Sigma = Field(
-        1e-3, description="Standard deviation of a coordinate, for all or by marker name."
-    )
-    names: list[str] | None = Field(
-        None, description="List of the names of markers to use; all by default."
-    )
-    labels: dict[str, Text] = Field(
-        default_factory=dict, description="Name here for a label in the file, by label."
-    )
-    weights: dict[str, NotNegative] = Field(
-        default_factory=dict,
-        description="Weight in the loss by marker name, 1 by default; 0 leaves the marker out.",
-    )
-    length_unit: Unit | None = Field(
-        None, description="Unit of the coordinates, where the file does not state it."
-    )
-    rate_hz: Positive | None = Field(
-        None, description="Frame rate, where the file states neither it nor times."
-    )
-    template_m: dict[str, Vector] | None = Field(
-        None,
-        description="Place [x, y, z] in the body's frame for at least three markers, by name; all "
-        "tracks are moved rigidly so that these fit.",
-    )
-    template_window_s: tuple[Finite, Finite] | None = Field(
-        None, description="First and last time [start, end] to average for the template."
-    )
-    max_template_residual_m: Positive | None = Field(
-        None, description="Farthest a marker may be from its place in the template."
-    )
-    reference_m: dict[str, Vector] = Field(
-        default_factory=dict,
-        description="Place [x, y, z] on the undeformed body for each marker, by name; the others' "
-        "places are estimated.",
-    )
-    reference_sigma_m: ReferenceSigma | None = Field(
-        None,
-        description="Standard deviation of the places in reference_m, for all or by marker name; "
-        "0 for exact ones. That of nuisance.marker_offsets by default.",
-    )
-    places: Literal["free", "surface"] = Field(
-        "free", description="Places that are estimated may be anywhere, or stay on the surface."
-    )
+    Attributes
+    ----------
+    file : str, optional
+        Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; only `simulate` can do
+        without.
+    sigma_m : Sigma
+        Standard deviation of a coordinate, for all or by marker name.
+    names : list of str, optional
+        List of the names of markers to use; all by default.
+    labels : mapping of name to str
+        Name here for a label in the file, by label.
+    weights : mapping of name to float
+        Weight in the loss by marker name, 1 by default; 0 leaves the marker out.
+    length_unit : {"m", "cm", "mm", "in"}, optional
+        Unit of the coordinates, where the file does not state it.
+    rate_hz : float, optional
+        Frame rate, where the file states neither it nor times.
+    template_m : mapping of name to (3,) array, optional
+        Place [x, y, z] in the body's frame for at least three markers, by name; all tracks are
+        moved rigidly so that these fit.
+    template_window_s : list, optional
+        First and last time [start, end] to average for the template.
+    max_template_residual_m : float, optional
+        Farthest a marker may be from its place in the template.
+    reference_m : mapping of name to (3,) array
+        Place [x, y, z] on the undeformed body for each marker, by name; the others' places are
+        estimated.
+    reference_sigma_m : ReferenceSigma, optional
+        Standard deviation of the places in reference_m, for all or by marker name; 0 for exact
+        ones. That of nuisance.marker_offsets by default.
+    places : {"free", "surface"}
+        Places that are estimated may be anywhere, or stay on the surface.
+    max_distance_m : float, optional
+        Farthest a marker may be from the body; the mean edge length by default.
+    """
+
+    file: Text | None = None
+    sigma_m: Sigma = 0.001
+    names: list[str] | None = None
+    labels: dict[str, Text] = Field(default_factory=dict)
+    weights: dict[str, NotNegative] = Field(default_factory=dict)
+    length_unit: Unit | None = None
+    rate_hz: Positive | None = None
+    template_m: dict[str, Vector] | None = None
+    template_window_s: tuple[Finite, Finite] | None = None
+    max_template_residual_m: Positive | None = None
+    reference_m: dict[str, Vector] = Field(default_factory=dict)
+    reference_sigma_m: ReferenceSigma | None = None
+    places: Literal["free", "surface"] = "free"
     attach: Literal["auto", "vertex", "embedded"] = "auto"
-    max_distance_m: Positive | None = Field(
-        None, description="Farthest a marker may be from the body; the mean edge length by default."
-    )
+    max_distance_m: Positive | None = None
 
     @model_validator(mode="after")
     def _template(self) -> MarkersSection:
@@ -353,64 +367,63 @@ Grasps = Annotated[
 
 
 class ExperimentSection(Section):
-    """One recording."""
+    """One recording.
+
+    Attributes
+    ----------
+    kind : {"dynamic", "static"}
+        A motion; or samples each of which is an equilibrium of its own, at any times (with memory,
+        quasi-static in time).
+    file : str, optional
+        Table that displacements and wrenches are read from which name no file: CSV as a test bench
+        writes it.
+    grasp : Grasps
+        A table of nodes and poses, or a list of them.
+    markers : MarkersSection
+        Tracked points; none are needed where the wrench of a grasp is measured.
+    loaded_since_s : float, optional
+        How long a body with memory has been in the shape of its equilibrium; it has relaxed by
+        default.
+    gravity_m_s2 : (3,) array
+        Acceleration of gravity [x, y, z].
+    window_s : list, optional
+        First and last time to use [start, end].
+    resample_hz : float, optional
+        Put the markers on this rate; their own times by default.
+    every : int
+        Use every so-manieth sample of the markers.
+    mass : list of MassSection
+        [[experiment.mass]] tables: point masses tied to the body.
+    force : list of ForceSection
+        [[experiment.force]] tables: forces besides gravity.
+    tendon : list of TendonSection
+        [[experiment.tendon]] tables: tendons in the body.
+    pressure : list of PressureSection
+        [[experiment.pressure]] tables: pressures in cavities or on held patches.
+    nuisance : NuisanceOrNone
+        What is estimated of this recording alone, as a table; or "none".
+    validation : bool
+        Not fitted, only predicted.
+    """
 
     name: Annotated[str, AfterValidator(_file_name)]
-    kind: Literal["dynamic", "static"] = Field(
-        "dynamic",
-        description="A motion; or samples each of which is an equilibrium of its own, at any times "
-        "(with memory, quasi-static in time).",
-    )
-    file: Text | None = Field(
-        None,
-        description="Table that displacements and wrenches are read from which name no file: CSV "
-        "as a test bench writes it.",
-    )
-    grasp: Grasps = Field(
-        default_factory=list, description="A table of nodes and poses, or a list of them."
-    )
-    markers: MarkersSection = Field(
-        default_factory=lambda: MarkersSection.model_construct(),
-        description="Tracked points; none are needed where the wrench of a grasp is measured.",
-    )
+    kind: Literal["dynamic", "static"] = "dynamic"
+    file: Text | None = None
+    grasp: Grasps = Field(default_factory=list)
+    markers: MarkersSection = Field(default_factory=lambda: MarkersSection.model_construct())
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     start_rule: Literal["standard", "paper"] = "standard"
-    loaded_since_s: NotNegative | None = Field(
-        None,
-        description="How long a body with memory has been in the shape of its equilibrium; it has "
-        "relaxed by default.",
-    )
-    gravity_m_s2: Vector = Field(
-        (0.0, 0.0, -9.81), description="Acceleration of gravity [x, y, z]."
-    )
-    window_s: tuple[Boundless, Boundless] | None = Field(
-        None, description="First and last time to use [start, end]."
-    )
-    resample_hz: Positive | None = Field(
-        None, description="Put the markers on this rate; their own times by default."
-    )
-    every: Annotated[int, Field(strict=True, ge=1)] = Field(
-        1, description="Use every so-manieth sample of the markers."
-    )
-    mass: list[MassSection] = Field(
-        default_factory=list,
-        description="[[experiment.mass]] tables: point masses tied to the body.",
-    )
-    force: list[ForceSection] = Field(
-        default_factory=list, description="[[experiment.force]] tables: forces besides gravity."
-    )
-    tendon: list[TendonSection] = Field(
-        default_factory=list, description="[[experiment.tendon]] tables: tendons in the body."
-    )
-    pressure: list[PressureSection] = Field(
-        default_factory=list,
-        description="[[experiment.pressure]] tables: pressures in cavities or on held patches.",
-    )
-    nuisance: NuisanceOrNone = Field(
-        default_factory=lambda: NuisanceSection.model_construct(),
-        description='What is estimated of this recording alone, as a table; or "none".',
-    )
-    validation: Flag = Field(False, description="Not fitted, only predicted.")
+    loaded_since_s: NotNegative | None = None
+    gravity_m_s2: Vector = (0.0, 0.0, -9.81)
+    window_s: tuple[Boundless, Boundless] | None = None
+    resample_hz: Positive | None = None
+    every: AtLeastOne = 1
+    mass: list[MassSection] = Field(default_factory=list)
+    force: list[ForceSection] = Field(default_factory=list)
+    tendon: list[TendonSection] = Field(default_factory=list)
+    pressure: list[PressureSection] = Field(default_factory=list)
+    nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
+    validation: Flag = False
 
     @property
     def marked(self) -> bool:

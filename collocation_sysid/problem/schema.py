@@ -30,17 +30,33 @@ else:
 
 
 class CodeSection(Section):
-    """A material of the user's own: a Python function of F and named constants."""
+    """A material of the user's own: a Python function of F and named constants.
 
-    file: Text = Field(description="Python file; it is run, which needs --allow-code.")
-    function: Text = Field(description="Name of the energy function in it.")
+    Attributes
+    ----------
+    file : str
+        Python file; it is run, which needs --allow-code.
+    function : str
+        Name of the energy function in it.
+    """
+
+    file: Text
+    function: Text
 
 
 class NodeForceSection(CodeSection):
-    """A force of the user's own: a Python function of x, v, at and named constants."""
+    """A force of the user's own: a Python function of x, v, at and named constants.
 
-    function: Text = Field(description="Name of the function of the force in it.")
-    nodes: Nodes | None = Field(None, description="Selection of nodes; all by default.")
+    Attributes
+    ----------
+    function : str
+        Name of the function of the force in it.
+    nodes : Nodes, optional
+        Selection of nodes; all by default.
+    """
+
+    function: Text
+    nodes: Nodes | None = None
 
 
 def _material_form(value: Any) -> str:
@@ -54,85 +70,103 @@ Material = Annotated[
 
 
 class RegionSection(Section):
-    """Cells that differ from the rest; its parameters have its name in front."""
+    """Cells that differ from the rest; its parameters have its name in front.
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(
-        description="Letters, digits, - and _."
-    )
-    cells: Nodes = Field(
-        description="Selection of cells, by their centres: a table of box_m, ball_m or indices, or "
-        "the name of a cell array or of a physical group."
-    )
+    Attributes
+    ----------
+    name : str
+        Letters, digits, - and _.
+    cells : Nodes
+        Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
+        cell array or of a physical group.
+    """
+
+    name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
+    cells: Nodes
     material: Material | None = None
     damping: DampingName | None = None
     density_kg_m3: Positive | None = None
 
 
 class PronySection(Section):
-    """A branch of the material's memory; its parameters are prony_1.share and prony_1.tau_s."""
+    """A branch of the material's memory; its parameters are prony_1.share and prony_1.tau_s.
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(
-        description="Letters, digits, - and _."
-    )
-    region: Text | None = Field(
-        None,
-        description="Region that it belongs to; all without their own by default.",
-    )
+    Attributes
+    ----------
+    name : str
+        Letters, digits, - and _.
+    region : str, optional
+        Region that it belongs to; all without their own by default.
+    """
+
+    name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
+    region: Text | None = None
 
 
 class CylinderSection(Section):
-    """An upright cylinder, its base on z = 0 about the origin."""
+    """An upright cylinder, its base on z = 0 about the origin.
+
+    Attributes
+    ----------
+    quarter : bool
+        Only its part x, y ≥ 0, between planes of symmetry.
+    """
 
     diameter_m: Positive
     height_m: Positive
-    quarter: Flag = Field(
-        default=False, description="Only its part x, y ≥ 0, between planes of symmetry."
-    )
+    quarter: Flag = False
 
 
 class ObjectSection(Section):
-    """The soft object: its mesh, surface or shape, mass and material."""
+    """The soft object: its mesh, surface or shape, mass and material.
 
-    mesh: Text | None = Field(None, description="Tetrahedral mesh in any meshio format.")
-    surface: Text | None = Field(None, description="Closed surface to fill with tetrahedra.")
-    cylinder: CylinderSection | None = Field(
-        None, description="A cylinder to mesh: diameter_m, height_m, quarter."
-    )
-    box_m: tuple[Positive, Positive, Positive] | None = Field(
-        None, description="Lengths [x, y, z] of a box to mesh, with a corner at the origin."
-    )
-    edge_length_m: Positive | None = Field(
-        None, description="Wanted edge length of a surface, cylinder or box."
-    )
-    length_unit: Unit = Field("m", description="Unit of the coordinates in the file.")
-    mass_kg: Positive | None = Field(
-        None,
-        description="Weighed mass of the whole object; or a parameter, then it may be left out.",
-    )
-    density_kg_m3: Positive | None = Field(
-        None, description="Uniform density instead of a mass; likewise."
-    )
-    material: Material = Field(
-        "neo-hookean", description="A material's name, or a table of file and function."
-    )
-    damping: DampingName = Field(
-        "kelvin-voigt", description="Law of γ_r; rayleigh, the paper's, brakes rotation."
-    )
+    Attributes
+    ----------
+    mesh : str, optional
+        Tetrahedral mesh in any meshio format.
+    surface : str, optional
+        Closed surface to fill with tetrahedra.
+    cylinder : CylinderSection, optional
+        A cylinder to mesh: diameter_m, height_m, quarter.
+    box_m : list, optional
+        Lengths [x, y, z] of a box to mesh, with a corner at the origin.
+    edge_length_m : float, optional
+        Wanted edge length of a surface, cylinder or box.
+    length_unit : {"m", "cm", "mm", "in"}
+        Unit of the coordinates in the file.
+    mass_kg : float, optional
+        Weighed mass of the whole object; or a parameter, then it may be left out.
+    density_kg_m3 : float, optional
+        Uniform density instead of a mass; likewise.
+    material : Material
+        A material's name, or a table of file and function.
+    damping : DampingName
+        Law of γ_r; rayleigh, the paper's, brakes rotation.
+    region : list of RegionSection
+        [[object.region]] tables: cells that differ.
+    prony : list of PronySection
+        [[object.prony]] tables: a material with memory, branch by branch.
+    force : list of NodeForceSection
+        [[object.force]] tables: forces of the user's own on the nodes.
+    evaluator : {"auto", "simd", "casadi"}
+        How element kernels are evaluated.
+    """
+
+    mesh: Text | None = None
+    surface: Text | None = None
+    cylinder: CylinderSection | None = None
+    box_m: tuple[Positive, Positive, Positive] | None = None
+    edge_length_m: Positive | None = None
+    length_unit: Unit = "m"
+    mass_kg: Positive | None = None
+    density_kg_m3: Positive | None = None
+    material: Material = "neo-hookean"
+    damping: DampingName = "kelvin-voigt"
     element: ElementName = "tet4"
-    region: list[RegionSection] = Field(
-        default_factory=list, description="[[object.region]] tables: cells that differ."
-    )
-    prony: list[PronySection] = Field(
-        default_factory=list,
-        description="[[object.prony]] tables: a material with memory, branch by branch.",
-    )
-    force: list[NodeForceSection] = Field(
-        default_factory=list,
-        description="[[object.force]] tables: forces of the user's own on the nodes.",
-    )
-    evaluator: Literal["auto", "simd", "casadi"] = Field(
-        "auto", description="How element kernels are evaluated."
-    )
+    region: list[RegionSection] = Field(default_factory=list)
+    prony: list[PronySection] = Field(default_factory=list)
+    force: list[NodeForceSection] = Field(default_factory=list)
+    evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ObjectSection:
@@ -155,15 +189,19 @@ class ObjectSection(Section):
 
 
 class PriorSection(Section):
-    """A normal prior: on the logarithm of a positive parameter, or on a linear one."""
+    """A normal prior: on the logarithm of a positive parameter, or on a linear one.
+
+    Attributes
+    ----------
+    relative : float, optional
+        Relative standard deviation, such as 0.2 for 20 %.
+    deviation : float, optional
+        Standard deviation of a linear parameter, in its unit.
+    """
 
     mean: Finite
-    relative: Positive | None = Field(
-        None, description="Relative standard deviation, such as 0.2 for 20 %."
-    )
-    deviation: Positive | None = Field(
-        None, description="Standard deviation of a linear parameter, in its unit."
-    )
+    relative: Positive | None = None
+    deviation: Positive | None = None
 
     @model_validator(mode="after")
     def _one(self) -> PriorSection:
@@ -172,23 +210,33 @@ class PriorSection(Section):
 
 
 class ParameterSection(Section):
-    """One parameter: estimated within bounds, fixed, or tied to another; {} is estimated."""
+    """One parameter: estimated within bounds, fixed, or tied to another; {} is estimated.
 
-    guess: Finite | None = Field(
-        None, description="Where the search starts; found by a scan where none is given."
-    )
+    Attributes
+    ----------
+    guess : float, optional
+        Where the search starts; found by a scan where none is given.
+    fixed : float, optional
+        Value that is not estimated.
+    scale : {"log", "linear"}, optional
+        Estimate the logarithm, or the number itself, which may be negative.
+    typical : float, optional
+        What a linear parameter may change by in a step.
+    tied_to : str, optional
+        Parameter that this one is a multiple of.
+    ratio : float, optional
+        The multiple, 1 by default.
+    """
+
+    guess: Finite | None = None
     lower: Finite | None = None
     upper: Finite | None = None
-    fixed: Finite | None = Field(None, description="Value that is not estimated.")
+    fixed: Finite | None = None
     prior: PriorSection | None = None
-    scale: Literal["log", "linear"] | None = Field(
-        None, description="Estimate the logarithm, or the number itself, which may be negative."
-    )
-    typical: Positive | None = Field(
-        None, description="What a linear parameter may change by in a step."
-    )
-    tied_to: Text | None = Field(None, description="Parameter that this one is a multiple of.")
-    ratio: Finite | None = Field(None, description="The multiple, 1 by default.")
+    scale: Literal["log", "linear"] | None = None
+    typical: Positive | None = None
+    tied_to: Text | None = None
+    ratio: Finite | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> ParameterSection:
@@ -241,40 +289,44 @@ Parameters = Annotated[
 
 
 class TranscriptionSection(Section):
-    """How the equations of motion become constraints."""
+    """How the equations of motion become constraints.
+
+    Attributes
+    ----------
+    substeps : str
+        Grid steps between samples; auto: as many, up to 8, as move no parameter by more than half a
+        standard error.
+    explicit_grasps : bool
+        Grasped nodes as constraint rows (the paper's c^g) instead of bounds.
+    """
 
     scheme: SchemeName = "midpoint"
     substeps: Annotated[
         Annotated[Literal["auto"], Tag("<auto>")]
         | Annotated[Whole, Field(ge=1, le=MOST_STEPS), Tag("<number>")],
         Discriminator(lambda value: "<auto>" if isinstance(value, str) else "<number>"),
-    ] = Field(
-        default="auto",
-        description="Grid steps between samples; auto: as many, up to 8, as move no parameter by "
-        "more than half a standard error.",
-    )
-    explicit_grasps: Flag = Field(
-        default=False,
-        description="Grasped nodes as constraint rows (the paper's c^g) instead of bounds.",
-    )
+    ] = "auto"
+    explicit_grasps: Flag = False
 
 
 class ProblemFile(Section):
-    """A problem file (TOML)."""
+    """A problem file (TOML).
+
+    Attributes
+    ----------
+    parameters : Parameters
+        Names of the model's constants: each {} or a guess to estimate it, a value, or a tie.
+    experiment_defaults : mapping of name to Any
+        Keys that every [[experiment]] has which does not give them itself.
+    experiment : list of ExperimentSection
+        At least one [[experiment]] table, one for each recording.
+    """
 
     title: str = ""
     object: ObjectSection
-    parameters: Parameters = Field(
-        description="Names of the model's constants: each {} or a guess to estimate it, a value, "
-        "or a tie."
-    )
-    experiment_defaults: dict[str, Any] = Field(
-        default_factory=dict,
-        description="Keys that every [[experiment]] has which does not give them itself.",
-    )
-    experiment: list[ExperimentSection] = Field(
-        min_length=1, description="At least one [[experiment]] table, one for each recording."
-    )
+    parameters: Parameters
+    experiment_defaults: dict[str, Any] = Field(default_factory=dict)
+    experiment: list[ExperimentSection] = Field(min_length=1)
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()

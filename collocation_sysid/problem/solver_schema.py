@@ -43,13 +43,16 @@ else:
 
 
 class MethodSection(Section):
-    """The method, the loss, and a table of options for each method."""
+    """The method, the loss, and a table of options for each method.
+
+    Attributes
+    ----------
+    huber : float, optional
+        Samples farther off than this many sigmas count linearly, not squared.
+    """
 
     method: MethodName = DEFAULT
-    huber: Positive | None = Field(
-        default=None,
-        description="Samples farther off than this many sigmas count linearly, not squared.",
-    )
+    huber: Positive | None = None
 
     @model_validator(mode="before")
     @classmethod

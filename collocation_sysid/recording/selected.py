@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Tag, model_validator
 
 from ..arrays import Index
 from ..checked import Positive, Text, Whole
@@ -21,22 +21,25 @@ if TYPE_CHECKING:
 
 
 class NodesSection(Section):
-    """A selection of mesh nodes, by exactly one of these."""
+    """A selection of mesh nodes, by exactly one of these.
 
-    box_m: tuple[Corner, Corner] | None = Field(
-        None, description="Lowest and highest corner [[x, y, z], [x, y, z]]."
-    )
-    ball_m: tuple[Vector, Positive] | None = Field(
-        None, description="Centre and radius [[x, y, z], radius]."
-    )
-    indices: list[Whole] | None = Field(
-        None, description="List of node numbers as in the mesh file, counted from 0."
-    )
-    name: Text | None = Field(
-        None,
-        description="A point array of the mesh, 1 where selected, or a physical group of elements "
-        "of any dimension.",
-    )
+    Attributes
+    ----------
+    box_m : list, optional
+        Lowest and highest corner [[x, y, z], [x, y, z]].
+    ball_m : list, optional
+        Centre and radius [[x, y, z], radius].
+    indices : list of int, optional
+        List of node numbers as in the mesh file, counted from 0.
+    name : str, optional
+        A point array of the mesh, 1 where selected, or a physical group of elements of any
+        dimension.
+    """
+
+    box_m: tuple[Corner, Corner] | None = None
+    ball_m: tuple[Vector, Positive] | None = None
+    indices: list[Whole] | None = None
+    name: Text | None = None
 
     @model_validator(mode="after")
     def _one(self) -> NodesSection:
