@@ -18,7 +18,7 @@ from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
-from collocation_sysid.recording import Experiment, Gauge, Look, Markers
+from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
 
 LOW_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
@@ -33,6 +33,18 @@ def strain(at: Look, scale):
     """Of the way between two points, with a factor that is not known."""
     way = at.position_m[:, 1] - at.position_m[:, 0]
     return (1 + scale) * (ca.norm_2(way) / 0.06 - 1)
+
+
+CLAMPED = {"expression": lambda at: at.force_n, "unknowns": {}}
+
+
+def pull(at: Look, gain):
+    """One axis of a load cell between the clamp and the robot, its gain not known."""
+    return (1 + gain) * at.force_n[2]
+
+
+def speed(at: Look):
+    return ca.norm_2(at.velocity_m_s)
 
 
 def accelerometer(t_s: np.ndarray, **changes) -> Gauge:
@@ -129,6 +141,19 @@ def test_error_bars_and_verdict_know_them():
         ({"points_m": [[0.0, 0.0]]}, "points_m of the reading 'accelerometer'"),
         ({"values": np.full((9, 3), np.nan)}, "has no sample"),
         ({"t_s": np.zeros(9)}, "of the reading 'accelerometer'"),
+        ({"values": np.zeros((9, 2))}, "gives 3 numbers; expected 2"),
+        ({"expression": lambda at: at.position_m}, "cannot be evaluated .*bias_m_s2"),
+        ({"expression": pull, "unknowns": {"gain": 1.0}}, "has t_s, position_m, velocity_m_s"),
+        (
+            {"expression": speed, "unknowns": {}, "values": np.zeros(9)},
+            "not finite where .* at rest",
+        ),
+        ({"grasp": 0}, "has both points_m and grasp"),
+        ({"points_m": ()}, "has neither points_m nor grasp"),
+        (
+            {"frame": "hand"},
+            "frame of the reading 'accelerometer' is 'hand'; expected one of world",
+        ),
     ],
 )
 def test_what_a_reading_lacks_is_said(changes: dict, words: str):
@@ -137,17 +162,63 @@ def test_what_a_reading_lacks_is_said(changes: dict, words: str):
         replace(good, **changes)
 
 
-def test_an_expression_of_another_length_than_the_values_is_refused():
-    cube = replace(hung_cube(9), nuisance=IDEAL)
-    wrong = replace(accelerometer(cube.t_s), values=np.zeros((len(cube.t_s), 2)))
-    with pytest.raises(InputError, match="gives 3 numbers; expected 2"):
-        simulate(instrumented(cube, wrong), TRUTH, "midpoint")
-
-
 def test_a_reading_of_another_time_or_place_is_refused():
     cube = hung_cube(9)
     with pytest.raises(InputError, match="accelerometer"):
         instrumented(cube, accelerometer(cube.t_s + 100))
+    nobody = replace(accelerometer(cube.t_s), points_m=(), grasp=1, **CLAMPED)
+    with pytest.raises(InputError, match="looks at the grasp 1, but there are 1"):
+        instrumented(cube, nobody)
     far = instrumented(cube, accelerometer(cube.t_s, points_m=[[1.0, 0, 0]]))
     with pytest.raises(InputError, match="accelerometer 1"):
         simulate(far, TRUTH, "midpoint")
+
+
+# At a grasp ---------------------------------------------------------------------------------------
+
+
+def clamped(steps: int = 16) -> Experiment:
+    """The cube in a hand, a load cell of one axis in it and a foil on the cube; nothing sees it."""
+    cube = replace(hung_cube(steps), nuisance=IDEAL)
+    inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
+    cell = Gauge("cell", pull, inner, np.zeros(len(inner)), 1e-3, unknowns={"gain": 0.1}, grasp=0)
+    made = replace(cube, markers=Markers.none(cube.t_s), readings=[cell, strain_gauge(cube.t_s)])
+    felt, strains = simulate(made, TRUTH, "midpoint").readings
+    return with_readings(made, [1.05 * felt, 1.04 * strains])
+
+
+def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
+    cube = replace(hung_cube(20), nuisance=IDEAL)
+    for frame in ("grasp", "world"):
+        wrench = Wrench(cube.t_s, np.zeros((len(cube.t_s), 6)), 1.0, 1.0, frame)
+        (grasp,) = cube.grasps
+        both = Gauge(
+            "both",
+            lambda at: ca.vertcat(at.force_n, at.torque_nm),
+            cube.t_s,
+            np.zeros((len(cube.t_s), 6)),
+            1.0,
+            grasp=0,
+            frame=frame,
+        )
+        made = replace(cube, grasps=[replace(grasp, wrench=wrench)], readings=[both])
+        found = simulate(made, TRUTH, "midpoint", substeps=20)
+        there = np.isfinite(found.wrenches[0]) & np.isfinite(found.readings[0])
+        assert there.any(axis=0).all()
+        size = np.nanmax(np.abs(found.wrenches[0]))
+        assert np.abs(found.wrenches[0] - found.readings[0])[there].max() < 1e-4 * size
+
+
+@pytest.mark.parametrize("huber", [None, 2.0])
+def test_slopes_of_a_load_cell_forward_and_backward(huber: float | None):
+    assert_slopes(Collocation([noisy(clamped(12))], GUESS, "midpoint", huber=huber))
+
+
+@pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
+def test_the_truth_is_found_from_a_load_cell_and_a_foil_alone(method):
+    solution = method(Collocation([clamped()], GUESS))
+    (part,) = solution.collocation.parts(solution.z)
+    found = part.phi * part.segment.nuisance.scales
+    np.testing.assert_allclose(found, [0.05, 0.04], atol=2e-3)
+    for name in ("lambda_pa", "mu_pa"):
+        assert solution.parameters[name] == pytest.approx(TRUTH[name], rel=0.02)

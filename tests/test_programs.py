@@ -112,6 +112,18 @@ def instruments(huber: float | None = None) -> Collocation:
     return program(replace(made, readings=blunt), huber=huber)
 
 
+def clamp(**changes) -> Collocation:
+    """A user's load cell in the hand, beside a sensor and markers."""
+    cube = wristed_cube(6, ALL_UNKNOWN, frame="grasp")
+    cell = cs.Gauge("cell", bent, cube.t_s, np.ones((7, 2)), 0.3, unknowns={"gain": 0.1}, grasp=0)
+    return program(replace(cube, readings=[cell]), **changes)
+
+
+def bent(at: cs.Look, gain):
+    """Curved in all that it looks at."""
+    return ca.vertcat(gain + at.force_n[2] ** 2, (1 + gain) * at.torque_nm[0] * at.force_n[1])
+
+
 def users_nuisances() -> Collocation:
     """Beside all others, and shared by two recordings."""
     bar = bar_with_nuisance(5)
@@ -248,6 +260,8 @@ PROGRAMS: dict[str, Make] = {
     ),
     "instruments": instruments,
     "instruments, huber": lambda: instruments(1e3),
+    "load cell": clamp,
+    "load cell, bdf2, huber": lambda: clamp(scheme="bdf2", huber=2.0),
     "memory, relaxed": lambda: memory("hung-cube"),
     "memory, loaded": lambda: memory("hung-cube", loaded_since_s=0.04),
     "memory, loaded, bdf2": lambda: memory("hung-cube", "bdf2", loaded_since_s=0.04),

@@ -18,16 +18,17 @@ def require_second_derivatives(collocation: Collocation) -> None:
     Raises
     ------
     InputError
-        For materials with memory, and measured wrenches.
+        For materials with memory, and what is measured of grasps.
     """
     if collocation.remembers:
         raise InputError(
             "hessian = 'exact' has no second derivatives of materials with memory (prony); "
             "expected 'gauss-newton'"
         )
-    if any(segment.sensors for segment in collocation.segments):
+    if any(len(segment.sensed_dofs) for segment in collocation.segments):
         raise InputError(
-            "hessian = 'exact' has no second derivatives of measured wrenches; expected "
+            "hessian = 'exact' has no second derivatives of measured wrenches, nor of readings of "
+            "grasps; expected "
             "'gauss-newton'"
         )
 

@@ -269,9 +269,8 @@ def _residuals(part: Part) -> Array:
 def _samples(segment: Segment) -> int:
     """How many first samples are compared: a part of all, and one of each kind of reading."""
     t_s, seen = segment.experiment.t_s, [segment.experiment.markers.first_seen]
-    for sensor in segment.sensors:
-        felt_s = sensor.t_s[sensor.present.any(axis=1).argmax()] + sensor.limit_s
-        seen.append(int(np.searchsorted(t_s, felt_s)) + sensor.channel.on.late)
+    for reading in segment.readings[1:]:
+        seen.append(int(np.searchsorted(t_s, reading.begins_s)) + reading.channel.late)
     return min(len(t_s), max(part_of(len(t_s), SHARES[0]), max(seen) + 1))
 
 

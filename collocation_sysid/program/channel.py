@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -111,6 +111,8 @@ class Points:
     rows: Index
     chart: Chart
     places: Index
+
+    late: ClassVar[int] = 0
 
     @property
     def count(self) -> int:

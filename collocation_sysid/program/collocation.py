@@ -150,7 +150,8 @@ class Collocation:
 
     def made_explicit(self) -> Collocation:
         """The same program with `explicit`; itself where nothing is carried or measured so."""
-        if self.explicit or not (self.remembers or any(s.sensors for s in self.segments)):
+        feels = any(len(s.sensed_dofs) for s in self.segments)
+        if self.explicit or not (self.remembers or feels):
             return self
         other = replace(self, explicit=True)
         vars(other)["segments"] = self.segments

@@ -194,6 +194,16 @@ class Reading(ABC):
     has_offsets: ClassVar[bool] = False
     has_fixed_windows: ClassVar[bool] = True
 
+    @property
+    def begins_s(self) -> float:
+        """From when on what is looked at tells something that is compared, however φ is."""
+        return float(self.t_s[self.components.any(axis=(1, 2)).argmax()])
+
+    @property
+    def looked_sigmas(self) -> Array:
+        """(3 e,) how well what is looked at is known by a sample; infinite where it is not."""
+        return np.repeat(self.sigmas, GROUP)
+
     @abstractmethod
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """What a sample reads, of vectors (3, v), its φ and the data of its window."""

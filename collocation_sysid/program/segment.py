@@ -38,8 +38,8 @@ from .reading import Reading
 from .row import Row
 from .sharing import Local
 from .unsymmetric import adding_skew, skew_values
-from .wrench import WrenchReading, sensed_dofs, wrench_readings
-from .wrench_channel import Grid
+from .wrench import WrenchReading, wrench_readings
+from .wrench_channel import Grid, sensed_dofs
 
 T = TypeVar("T", bound=np.generic)
 
@@ -150,7 +150,8 @@ class Segment:
     @cached_property
     def gauges(self) -> tuple[GaugeReading, ...]:
         """Those of one's own."""
-        return gauge_readings(self.experiment, self.dynamics.t_s, self.nuisance, self.huber)
+        grid = Grid.of(self.dynamics)
+        return gauge_readings(self.experiment, grid.t_s, grid, self.nuisance, self.huber)
 
     @cached_property
     def readings(self) -> tuple[Reading, ...]:

@@ -16,14 +16,14 @@ from ..model.parameters import Parameters, theta_of
 from ..model.schemes import MOST_STEPS, Scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import Nuisance
-from .channel import Forced
+from .channel import Forced, Motion
 from .gauge import gauge_readings
 from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
 from .reaction import forces_on, reactions
-from .wrench import sensed_dofs, wrench_readings
-from .wrench_channel import Grid
+from .wrench import wrench_readings
+from .wrench_channel import Grid, sensed_dofs
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,18 +141,19 @@ def simulate(
         markers,
         (at, forced),
         wrenches,
-        _gauged(experiment, positions, ideal),
+        _gauged(experiment, positions, (at, forced), ideal),
     )
 
 
-def _gauged(experiment: Experiment, positions_m: Array, ideal: NuisanceMap) -> tuple[Array, ...]:
-    """What its gauges read of the body's positions at the samples, nothing of them unknown."""
-    none, found = np.zeros(ideal.size), []
-    for reading in gauge_readings(experiment, experiment.t_s, ideal):
-        read = reading.of_samples(positions_m, experiment.t_s, none)
-        shape = len(read), -1
-        found.append(read.reshape(shape)[:, : reading.gauge.measured.shape[1]])
-    return tuple(found)
+def _gauged(
+    experiment: Experiment, positions_m: Array, reactions: tuple[Grid, Forced], ideal: NuisanceMap
+) -> tuple[Array, ...]:
+    """What its gauges read of the body's motion, nothing of them unknown."""
+    readings = gauge_readings(experiment, experiment.t_s, reactions[0], ideal)
+    motion = Motion(positions_m.reshape(len(positions_m), -1), lambda: reactions[1])
+    return tuple(
+        reading.said(reading.of_motion(motion, np.zeros(ideal.size))) for reading in readings
+    )
 
 
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..fem.pattern import dofs_of
 from ..model.nuisance import NuisanceMap
 from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
@@ -79,6 +78,11 @@ class WrenchReading(Reading):
         """Largest shift of the clock."""
         return _limit_s(self.channel)
 
+    @property
+    def begins_s(self) -> float:
+        """The first sample, however late it is."""
+        return super().begins_s + self.limit_s
+
     def covered(self, known: int) -> NDArray[np.bool_]:
         """(S,) samples that the first times suffice for, however the clock is shifted."""
         return _covered(self.channel, self.t_s, known)
@@ -128,7 +132,8 @@ class WrenchReading(Reading):
 
     def told(self, wrench: Wrench) -> WrenchReading:
         """The same of other samples, or in another frame."""
-        return WrenchReading.of(replace(self.channel, wrench=wrench), wrench)
+        seen = replace(self.channel, frame=wrench.frame, point_m=wrench.point_m)
+        return WrenchReading.of(seen, wrench)
 
 
 def _limit_s(channel: GraspWrench) -> float:
@@ -154,25 +159,17 @@ def wrench_readings(
     experiment: Experiment, grid: Grid, nuisance: NuisanceMap, huber: float | None = None
 ) -> tuple[WrenchReading, ...]:
     """Those of an experiment's grasps that have a sensor."""
-    sensed, found = sensed_dofs(experiment), []
-    grasps = [grasp for grasp in experiment.grasps if grasp.wrench is not None]
-    for number, grasp in enumerate(grasps):
-        assert grasp.wrench is not None
-        own = dofs_of(grasp.nodes)
-        held, places = np.isin(own, grasp.dofs).astype(np.float64), np.searchsorted(sensed, own)
-        where = grid, nuisance, 3 * len(experiment.body.nodes_m), sensed, places, held
-        channel = GraspWrench(number, grasp, grasp.wrench, *where)
-        label = "" if len(grasps) == 1 else f" {number + 1}"
-        found.append(WrenchReading.of(channel, grasp.wrench, label, huber))
+    found, sensors = [], [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
+    for number, (grasp, wrench) in enumerate(sensors):
+        how = wrench.frame, wrench.point_m, grid, nuisance, number
+        label = "" if len(sensors) == 1 else f" {number + 1}"
+        channel = GraspWrench.of(experiment, grasp, *how)
+        found.append(WrenchReading.of(channel, wrench, label, huber))
     return tuple(found)
 
 
 def without_sensors(experiment: Experiment) -> Experiment:
-    """The same experiment, its wrenches not measured."""
-    return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
-
-
-def sensed_dofs(experiment: Experiment) -> Index:
-    """(g,) dofs of the nodes of all grasps with a sensor, ascending."""
-    held = [dofs_of(grasp.nodes) for grasp in experiment.grasps if grasp.wrench is not None]
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *held]))
+    """The same experiment, its wrenches not measured, nor what looks at a grasp besides."""
+    grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
+    readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
+    return replace(experiment, grasps=grasps, readings=readings)

@@ -20,12 +20,14 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
+from ..fem.pattern import dofs_of
 from ..model.dynamics import Dynamics
 from ..model.generated import Generated
 from ..model.nuisance import NuisanceMap
+from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.nuisance import SENSOR_LAG, TOOL_CENTRE, TOOL_MASS, NuisanceRow, rotation
-from ..recording.wrench import Wrench
+from ..recording.wrench import Frame
 from .channel import Forced, Motion, Pulled, Slopes
 from .reaction import centred_rows
 
@@ -86,10 +88,10 @@ class GraspWrench:
     Attributes
     ----------
     number : int
-        Of the sensor among those of the experiment.
+        Of the sensor among those of the experiment; −1 of what has no nuisance parameters of one.
     grasp : Grasp
-    wrench : Wrench
-        Its frame and point.
+    frame, point_m
+        See `Wrench`.
     on : Grid
     nuisance : NuisanceMap
     dofs : int
@@ -101,7 +103,8 @@ class GraspWrench:
 
     number: int
     grasp: Grasp
-    wrench: Wrench
+    frame: Frame
+    point_m: Array
     on: Grid
     nuisance: NuisanceMap
     dofs: int
@@ -110,6 +113,11 @@ class GraspWrench:
     held: Array
 
     each = 2
+
+    @property
+    def late(self) -> int:
+        """How many rows after its time a value is known."""
+        return self.on.late
 
     @cached_property
     def grid(self) -> Index:
@@ -145,16 +153,33 @@ class GraspWrench:
         """Positions in φ of what is not known of this sensor."""
         return self.nuisance.places(row, of=self.number)
 
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        grasp: Grasp,
+        frame: Frame,
+        point_m: Array,
+        grid: Grid,
+        nuisance: NuisanceMap,
+        number: int = -1,
+    ) -> GraspWrench:
+        """What one of an experiment's grasps gives."""
+        sensed, own = sensed_dofs(experiment), dofs_of(grasp.nodes)
+        held, places = np.isin(own, grasp.dofs).astype(np.float64), np.searchsorted(sensed, own)
+        where = nuisance, 3 * len(experiment.body.nodes_m), sensed, places, held
+        return cls(number, grasp, frame, point_m, grid, *where)
+
     # Moments ----------------------------------------------------------------------------------
 
     @cached_property
     def frames(self) -> tuple[Array, Array]:
         """Q (n, 3, 3) and o (n, 3)."""
         turns, shifts = self._poses(self.grid)
-        if self.wrench.frame == "grasp":
-            return turns, shifts + turns @ self.wrench.point_m
+        if self.frame == "grasp":
+            return turns, shifts + turns @ self.point_m
         shape = (self.count, 1)
-        return np.tile(np.eye(3), (*shape, 1)), np.tile(self.wrench.point_m, shape)
+        return np.tile(np.eye(3), (*shape, 1)), np.tile(self.point_m, shape)
 
     def _poses(self, rows: Index) -> tuple[Array, Array]:
         return self.grasp.poses.at(self.on.t_s[rows])
@@ -212,8 +237,8 @@ class GraspWrench:
         count = len(self.tool_phi) - len(self.nuisance.of_gravity)
         own, tilts = ca.vertsplit(phi, [0, count, len(self.tool_phi)])
         own *= self.nuisance.scales[self.tool_phi[:count]][:, None]
-        about = self.wrench.frame == "grasp"
-        centre = ca.DM(self.wrench.point_m if about else self.nuisance.grasp_pivot_m)
+        about = self.frame == "grasp"
+        centre = ca.DM(self.point_m if about else self.nuisance.grasp_pivot_m)
         centre = centre + own[1:] if own.numel() > 1 else centre
         gravity = self.nuisance.gravity_expression(tilts)
         pull = own[0] * (turn_rate @ centre + shift_rate - gravity)
@@ -323,11 +348,11 @@ class GraspWrench:
         self, grasp: Grasp, motion: Motion, phi: Array, shifts: Array, turns: Array
     ) -> Array | float:
         """Changes (n, 2, 3, c) of Y where poses are off, by the frame that is carried along."""
-        if grasp is not self.grasp or self.wrench.frame != "grasp":
+        if grasp is not self.grasp or self.frame != "grasp":
             return 0.0
         value = self.without_tool(motion.forced)
         axes = self.frames[0][: len(value)]
-        data = [axes.reshape(-1, 9), value, np.tile(self.wrench.point_m, (len(value), 1))]
+        data = [axes.reshape(-1, 9), value, np.tile(self.point_m, (len(value), 1))]
         slopes = self._off.slopes(np.zeros((6, len(value))), np.concatenate(data, axis=1).T)[1]
         k = self.grid[: len(value)]
         off = np.concatenate([turns[k], shifts[k]], axis=2)
@@ -343,6 +368,12 @@ class GraspWrench:
     def _off(self) -> Generated:
         """W (6,) by a turn and a shift of the frame; data are Q, W and the point in the frame."""
         return Generated(_seen_from, 6, 18)
+
+
+def sensed_dofs(experiment: Experiment) -> Index:
+    """(g,) dofs of the nodes of all grasps that something looks at, ascending."""
+    held = [dofs_of(experiment.grasps[k].nodes) for k in experiment.sensed]
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *held]))
 
 
 def _moment(u: ca.SX, data: ca.SX) -> ca.SX:

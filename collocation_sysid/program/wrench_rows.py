@@ -72,14 +72,18 @@ class WrenchRows(Carried):
     @cached_property
     def _unit(self) -> Array:
         """(6,) in which W and Y are counted [N, N m]: where the mean loss bends by about one."""
-        count = max(1, int(self.reading.components.sum()))
-        return np.sqrt(count) * np.repeat(self.reading.sigmas, 3)
+        count, sigmas = max(1, int(self.reading.components.sum())), self.reading.looked_sigmas
+        return np.where(np.isfinite(sigmas), np.sqrt(count) * sigmas, self._reaction_unit)
 
     @cached_property
     def _row_unit(self) -> Array:
         """(6,) of the equations [N, N m], between this unit and that of R: solvers want both."""
-        of_reactions = self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
-        return of_reactions**0.75 * self._unit**0.25
+        return self._reaction_unit**0.75 * self._unit**0.25
+
+    @property
+    def _reaction_unit(self) -> Array:
+        """(6,) of R [N, N m]."""
+        return self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
 
     # Values -------------------------------------------------------------------------------------
 

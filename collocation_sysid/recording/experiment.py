@@ -281,9 +281,16 @@ class Experiment:
         return total
 
     @property
+    def sensed(self) -> tuple[int, ...]:
+        """The grasps, by their places, whose force or torque is measured."""
+        looked = {gauge.grasp for gauge in self.readings}
+        sensed = (k for k, g in enumerate(self.grasps) if g.wrench is not None or k in looked)
+        return tuple(sensed)
+
+    @property
     def knows_a_force(self) -> bool:
         """Whether a known mass or force, or a measured one, sets the scale of all forces."""
-        if any(grasp.wrench is not None for grasp in self.grasps):
+        if self.sensed:
             return True
         if any(actuator.amplitude(self.t_s).any() for actuator in self.actuators):
             return True
@@ -383,14 +390,20 @@ class Experiment:
             if grasp.wrench is not None:
                 within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
         for gauge in self.readings:
-            within(gauge.times, self.t_s, f"the reading '{gauge.name}'", self.static)
+            what = f"the reading '{gauge.name}'"
+            within(gauge.times, self.t_s, what, self.static)
+            if gauge.grasp is not None and gauge.grasp not in range(len(self.grasps)):
+                raise InputError(
+                    f"{what} looks at the grasp {gauge.grasp}, but there are {len(self.grasps)}; "
+                    "expected its place among them, from 0"
+                )
 
     def _refuse_unmeasured(self) -> None:
-        if self.readings or any(grasp.wrench is not None for grasp in self.grasps):
+        if self.readings or self.sensed:
             return
         if not self.markers.names:
             raise InputError(
-                "nothing is measured: there are no markers and no wrench; expected either"
+                "nothing is measured: there are no markers, no wrench and no reading; expected any"
             )
         raise InputError("no marker sample is present; check the marker file and window_s")
 

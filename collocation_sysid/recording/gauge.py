@@ -1,18 +1,21 @@
-"""A reading of one's own: what an instrument on the body says, as an expression."""
+"""A reading of one's own: what an instrument on the body or at a grasp says, as an expression."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
 from ..errors import InputError
+from ..files import reason
 from .arrays import read_only_floats
 from .clock import first_time_fault
+from .wrench import Frame
 
 
 @dataclass(frozen=True)
@@ -23,17 +26,24 @@ class Look:
     ----------
     t_s : of the sample
     position_m, velocity_m_s, acceleration_m_s2 : (3, P) of its points
+    force_n, torque_nm : (3,) that its grasp gives the body, in its frame and about the origin there
     """
 
     t_s: Any
-    position_m: Any
-    velocity_m_s: Any
-    acceleration_m_s2: Any
+    position_m: Any = None
+    velocity_m_s: Any = None
+    acceleration_m_s2: Any = None
+    force_n: Any = None
+    torque_nm: Any = None
+
+
+OF_POINTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
+OF_GRASP = ("force_n", "torque_nm")
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """An instrument whose reading is an expression of a few points of the body.
+    """An instrument whose reading is an expression of a few points of the body, or of a grasp.
 
     Parameters
     ----------
@@ -47,16 +57,22 @@ class Gauge:
         What it said; NaN where missing.
     sigma : float
         Standard deviation of the noise of each number.
-    points_m : (P, 3) array
+    points_m : (P, 3) array, optional
         Places on the undeformed body.
     unknowns : mapping of name to float
         What is not known of it, about zero, by the standard deviations of its priors.
+    grasp : int, optional
+        In place of points the grasp, by its place among those of the experiment, whose force and
+        torque it looks at.
+    frame : {"grasp", "world"}
+        Axes and origin of these: those of the undeformed body as the grasp carries it, or those of
+        the poses' world.
 
     Raises
     ------
     InputError
-        If shapes disagree, time does not increase, nothing is measured, or a deviation is not
-        above zero.
+        If shapes disagree, time does not increase, nothing is measured, a deviation is not above
+        zero, or the expression cannot be evaluated or is not smooth at rest.
     """
 
     name: str
@@ -64,18 +80,22 @@ class Gauge:
     t_s: ArrayLike
     values: ArrayLike
     sigma: float
-    points_m: ArrayLike
+    points_m: ArrayLike = ()
     unknowns: Mapping[str, float] = field(default_factory=dict)
+    grasp: int | None = None
+    frame: Frame = "grasp"
 
     def __post_init__(self) -> None:
         where = f"the reading '{self.name}'"
         times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
         given = np.array(self.values, dtype=float)
         given = given[:, None] if given.ndim == 1 else given
+        points = np.asarray(self.points_m, dtype=float)
+        points = points if points.size else points.reshape(0, 3)
         vars(self).update(
             t_s=times,
             values=read_only_floats(given, (len(times), None), f"values of {where}", finite=False),
-            points_m=read_only_floats(self.points_m, (None, 3), f"points_m of {where}"),
+            points_m=read_only_floats(points, (None, 3), f"points_m of {where}"),
             unknowns=dict(self.unknowns),
         )
         if fault := first_time_fault(times):
@@ -87,6 +107,13 @@ class Gauge:
         for what, sigma in {"sigma": self.sigma, **self.unknowns}.items():
             if not (sigma > 0 and np.isfinite(sigma)):
                 raise InputError(f"{what} of {where} is {sigma:g}; expected more than 0")
+        if self.frame not in get_args(Frame):
+            expected = ", ".join(get_args(Frame))
+            raise InputError(f"frame of {where} is {self.frame!r}; expected one of {expected}")
+        if (self.grasp is None) == (not len(points)):
+            both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
+            raise InputError(f"{where} has {both}; expected one of them to look at")
+        self._refuse_other_count(self.numbers)
 
     def __repr__(self) -> str:
         return f"Gauge({self.name!r}: {len(self.times)} samples of {self.measured.shape[1]})"
@@ -105,3 +132,58 @@ class Gauge:
     def present(self) -> NDArray[np.bool_]:
         """(S, m) numbers that are there."""
         return np.isfinite(self.measured)
+
+    # The expression ---------------------------------------------------------------------------
+
+    def read(self, t_s: ca.SX, looked: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
+        """Its numbers (m,).
+
+        Parameters
+        ----------
+        looked : position, velocity and acceleration (3, P), or force and torque (3,)
+        unknowns : in their order
+        """
+        names = OF_POINTS if self.grasp is None else OF_GRASP
+        at = Look(t_s, **dict(zip(names, looked, strict=True)))
+        found = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
+        return ca.vec(ca.SX(ca.vertcat(*found) if isinstance(found, (list, tuple)) else found))
+
+    @property
+    def numbers(self) -> int:
+        """How many it reads at a time.
+
+        Raises
+        ------
+        InputError
+            If that cannot be told, or they or their slopes are no numbers at rest.
+        """
+        points = np.asarray(self.points_m).T
+        still = np.zeros_like(points), np.zeros_like(points)
+        rest = [points, *still] if self.grasp is None else [np.ones(3), np.ones(3)]
+        looked = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
+        t_s, own = ca.SX.sym("t_s"), ca.SX.sym("own", len(self.unknowns))
+        names = OF_POINTS if self.grasp is None else OF_GRASP
+        try:
+            read = self.read(t_s, looked, ca.vertsplit(own) if self.unknowns else [])
+        except (Exception, SystemExit) as error:
+            raise InputError(
+                f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
+                f"function of at, which has t_s, {', '.join(names)}, and of its unknowns "
+                f"{', '.join(self.unknowns) or '(none)'}, in CasADi operations"
+            ) from error
+        u = ca.veccat(*looked, own)
+        slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
+        at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
+        if not all(np.isfinite(e.full()).all() for e in slopes(self.times[0], at_rest)):
+            raise InputError(
+                f"the reading '{self.name}' or its slope is not finite where the body is at rest; "
+                "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
+            )
+        return read.numel()
+
+    def _refuse_other_count(self, numbers: int) -> None:
+        if numbers != (count := self.measured.shape[1]):
+            raise InputError(
+                f"the expression of the reading '{self.name}' gives {numbers} numbers; expected "
+                f"{count}, as many as its values have columns"
+            )

@@ -14,8 +14,11 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, wrench_rms
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
+from ..program.channel import Forced, Motion
+from ..program.gauge import gauge_readings
 from ..program.segment import Segment
 from ..program.simulation import Trajectory, simulate
+from ..program.wrench_channel import Grid
 from ..recording import Experiment
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import Derived, LinearisedFit
@@ -163,14 +166,18 @@ def _of_gauges(
     if not segment.gauges:
         return []
     (part,) = (p for p in solution.collocation.parts(solution.z) if p.segment is segment)
-    samples, found = part.x[segment.markers.grid_rows], []
-    for gauge in segment.gauges:
-        fitted, rolled = (
-            gauge.of_samples(x.reshape(len(x), -1, 3), segment.experiment.t_s, part.phi)
-            for x in (samples, trajectory.positions_m)
-        )
-        found.append(share * (rolled - fitted) / gauge.sigmas[:, None])
-    return found
+    fitted = part.x[segment.markers.grid_rows], (Grid.of(segment.dynamics), part.motion.forced)
+    rolled = trajectory.positions_m.reshape(len(fitted[0]), -1), trajectory.reactions
+
+    def read(x: Array, reactions: tuple[Grid, Forced]) -> list[Array]:
+        (grid, forced), nuisance = reactions, segment.nuisance
+        gauges = gauge_readings(segment.experiment, segment.experiment.t_s, grid, nuisance)
+        return [gauge.of_motion(Motion(x, lambda: forced), part.phi) for gauge in gauges]
+
+    return [
+        share * np.nan_to_num(there - here) / gauge.sigmas[:, None]
+        for gauge, here, there in zip(segment.gauges, read(*fitted), read(*rolled), strict=True)
+    ]
 
 
 def _share(problem: Problem, segment: Segment) -> float | None:
