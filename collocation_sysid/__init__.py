@@ -9,114 +9,33 @@
 from . import starting as _starting  # noqa: F401  (before all that takes time to import)
 
 # isort: split
-from importlib.metadata import version
+import ast as _ast
+from importlib import import_module as _import_module
+from importlib.metadata import version as _version
+from pathlib import Path as _Path
+from typing import Any as _Any
 
-from .errors import InputError, SimulationError
-from .fem.body import Body
-from .fem.constants import Constant
-from .fem.materials import Material
-from .fem.mesh import TetMesh
-from .fem.node_force import NodeForce
-from .fem.prony import Prony
-from .fem.regions import Region
-from .fem.selection import Ball, Box, Indices, Named
-from .fem.structured import box_mesh, cylinder_mesh
-from .methods.casadi_nlp import Sleqp, SqpMethod
-from .methods.continuation import Continuation
-from .methods.interior_point import InteriorPoint
-from .methods.penalty import AugmentedLagrangian, Penalty
-from .methods.reduced_space import ReducedSpace
-from .methods.shooting import Shooting
-from .methods.solution import Iteration, Solution, Status
-from .model.parameters import Parameter, Parameters, Tied, Unknown
-from .model.schemes import Scheme, Stencil
-from .pipeline import Run, run, solve
-from .problem import Problem, RolloutOptions, UncertaintyOptions
-from .program.collocation import Collocation
-from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
-from .recording import (
-    Experiment,
-    Force,
-    Gauge,
-    Grasp,
-    Look,
-    Markers,
-    Nuisance,
-    NuisanceRow,
-    Placement,
-    PointMass,
-    PoseSequence,
-    Pressure,
-    Tendon,
-    Wrench,
-    place_markers,
-)
-from .runs.refine import refine
 
-from . import live  # isort: skip  (after `starting`, which is before all)
+def _homes() -> dict[str, str]:
+    """The module of each name, as the stub beside this file imports them."""
+    stub = _ast.parse(_Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    lines = (each for each in stub.body if isinstance(each, _ast.ImportFrom))
+    return {a.name: f".{each.module or a.name}" for each in lines for a in each.names}
 
-__version__ = version("collocation-sysid")
 
-__all__ = [
-    "AugmentedLagrangian",
-    "Ball",
-    "Body",
-    "Box",
-    "Collocation",
-    "Constant",
-    "Continuation",
-    "Experiment",
-    "Force",
-    "Gauge",
-    "Grasp",
-    "Indices",
-    "InputError",
-    "InteriorPoint",
-    "Iteration",
-    "Look",
-    "Markers",
-    "Material",
-    "Named",
-    "NodeForce",
-    "Nuisance",
-    "NuisanceRow",
-    "Parameter",
-    "Parameters",
-    "Penalty",
-    "Placement",
-    "PointMass",
-    "PoseSequence",
-    "Pressure",
-    "Problem",
-    "Prony",
-    "ReducedSpace",
-    "Region",
-    "RolloutOptions",
-    "Run",
-    "Scheme",
-    "Shooting",
-    "SimulationError",
-    "Sleqp",
-    "Solution",
-    "SqpMethod",
-    "Status",
-    "Stencil",
-    "Tendon",
-    "TetMesh",
-    "Tied",
-    "Trajectory",
-    "UncertaintyOptions",
-    "Unknown",
-    "Wrench",
-    "box_mesh",
-    "cylinder_mesh",
-    "live",
-    "place_markers",
-    "refine",
-    "run",
-    "simulate",
-    "solve",
-    "with_markers",
-    "with_readings",
-    "with_wrenches",
-]
+_HOMES = _homes()
+__all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> _Any:
+    if name == "__version__":
+        return _version("collocation-sysid")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = _import_module(_HOMES[name], __name__)
+    found = home if _HOMES[name] == f".{name}" else getattr(home, name)
+    return globals().setdefault(name, found)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__, "__version__"]

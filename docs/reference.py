@@ -133,13 +133,14 @@ def nuisances() -> str:
 
 def command_line() -> str:
     """Every command with its arguments and options, from what `--help` tells."""
-    group = typer.main.get_command(app)
+    group: Any = typer.main.get_command(app)
     parts = [
         "# The command line",
         "Results are printed on stdout, progress and messages on stderr. Exit codes: 0 converged, "
         "1 not converged or, with `solve --strict`, doubtful, 2 bad input, 130 interrupted.",
     ]
-    for name, command in sorted(group.commands.items()):  # type: ignore[attr-defined]
+    for name in sorted(group.list_commands(None)):
+        command = group.get_command(None, name)
         parts += [f"## {name}", _prose(command.help or "")]
         head = "| argument or option | default | what it is |\n|---|---|---|"
         rows = [_parameter(each) for each in command.params if not getattr(each, "hidden", False)]

@@ -461,6 +461,17 @@ def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
     assert file.experiment[0].mass[0].mass_kg == 0.05
 
 
+def test_help_imports_nothing_that_solves():
+    code = (
+        "import sys; from collocation_sysid.cli import main; sys.argv[1:] = ['--help']\n"
+        "try: main()\n"
+        "finally: assert not sys.modules.keys() & {'casadi', 'scipy', 'matplotlib'}"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "report    Write one HTML page" in done.stdout
+
+
 def test_version_and_help():
     assert run_command("--version").out == f"{cs.__version__}\n"
     listed = run_command("--help")

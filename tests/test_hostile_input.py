@@ -165,6 +165,7 @@ for name in [each for each in sys.modules if each.startswith("importlib.metadata
     del sys.modules[name]
 sys.meta_path.insert(0, Interrupting())
 import collocation_sysid
+collocation_sysid.run
 """
 COMMANDED = """
 import os, signal, sys

@@ -6,23 +6,65 @@ Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 
 
 from __future__ import annotations
 
+import ast
 import logging
 import sys
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.text import Text
-from typer.main import get_command
+from typer.core import TyperGroup
+from typer.main import get_command, get_command_from_info
 
 from ..errors import InputError, SimulationError
 from ..starting import heed_interrupts, leave
-from . import designs, problems, runs, streams, studies, texts
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors
+
+FAMILIES = ("problems", "studies", "designs", "runs", "streams", "texts")
+
+
+@cache
+def _written() -> dict[str, tuple[str, str]]:
+    """Module of each command and what it does, as they are written."""
+    told = {}
+    for family in FAMILIES:
+        text = Path(__file__).with_name(f"{family}.py").read_text(encoding="utf-8")
+        for each in ast.parse(text).body:
+            if isinstance(each, ast.FunctionDef) and each.decorator_list:
+                said = (ast.get_docstring(each) or "").partition("\n")[0]
+                told[each.name] = f"{__name__}.{family}", said
+    return told
+
+
+class Commands(TyperGroup):
+    """The commands; only the one that is asked for is imported, all of them take seconds."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Their names."""
+        return [*_written()]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One of them, or None."""
+        if cmd_name not in _written():
+            return None
+        family = import_module(_written()[cmd_name][0]).commands.registered_commands
+        info = next(each for each in family if each.callback.__name__ == cmd_name)
+        how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
+        return get_command_from_info(info, **how)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a line on each."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, said) for name, (_, said) in _written().items()])
+
 
 app = typer.Typer(
     name="collocation-sysid",
+    cls=Commands,
     help="Identify the material parameters of a soft object from motion capture.\n\n"
     "\b\nStart with\n"
     "  collocation-sysid new my_object                    a commented problem file\n"
@@ -34,9 +76,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-for family in (problems, studies, designs, runs, streams, texts):
-    app.registered_commands += family.commands.registered_commands
 
 
 def _version(wanted: bool) -> None:

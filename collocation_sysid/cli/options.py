@@ -14,13 +14,15 @@ from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import OptionInfo, ParameterInfo
 
-from ..problem import Problem
 from ..stated import attributes
+
+if TYPE_CHECKING:
+    from ..problem import Problem  # which takes a second to import
 
 T = TypeVar("T")
 
@@ -130,6 +132,8 @@ class OfProblem:
 
     def read(self, simulation: bool = False) -> Problem:
         """The problem."""
+        from ..problem import Problem
+
         return Problem.read(self.problem, self.set_ or (), self.allow_code, simulation=simulation)
 
 

@@ -1,0 +1,110 @@
+"""What the package exports; each module is imported when one of its names is asked for."""
+
+from . import live
+from .errors import InputError, SimulationError
+from .fem.body import Body
+from .fem.constants import Constant
+from .fem.materials import Material
+from .fem.mesh import TetMesh
+from .fem.node_force import NodeForce
+from .fem.prony import Prony
+from .fem.regions import Region
+from .fem.selection import Ball, Box, Indices, Named
+from .fem.structured import box_mesh, cylinder_mesh
+from .methods.casadi_nlp import Sleqp, SqpMethod
+from .methods.continuation import Continuation
+from .methods.interior_point import InteriorPoint
+from .methods.penalty import AugmentedLagrangian, Penalty
+from .methods.reduced_space import ReducedSpace
+from .methods.shooting import Shooting
+from .methods.solution import Iteration, Solution, Status
+from .model.parameters import Parameter, Parameters, Tied, Unknown
+from .model.schemes import Scheme, Stencil
+from .pipeline import Run, run, solve
+from .problem import Problem, RolloutOptions, UncertaintyOptions
+from .program.collocation import Collocation
+from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
+from .recording import (
+    Experiment,
+    Force,
+    Gauge,
+    Grasp,
+    Look,
+    Markers,
+    Nuisance,
+    NuisanceRow,
+    Placement,
+    PointMass,
+    PoseSequence,
+    Pressure,
+    Tendon,
+    Wrench,
+    place_markers,
+)
+from .runs.refine import refine
+
+__all__ = [
+    "AugmentedLagrangian",
+    "Ball",
+    "Body",
+    "Box",
+    "Collocation",
+    "Constant",
+    "Continuation",
+    "Experiment",
+    "Force",
+    "Gauge",
+    "Grasp",
+    "Indices",
+    "InputError",
+    "InteriorPoint",
+    "Iteration",
+    "Look",
+    "Markers",
+    "Material",
+    "Named",
+    "NodeForce",
+    "Nuisance",
+    "NuisanceRow",
+    "Parameter",
+    "Parameters",
+    "Penalty",
+    "Placement",
+    "PointMass",
+    "PoseSequence",
+    "Pressure",
+    "Problem",
+    "Prony",
+    "ReducedSpace",
+    "Region",
+    "RolloutOptions",
+    "Run",
+    "Scheme",
+    "Shooting",
+    "SimulationError",
+    "Sleqp",
+    "Solution",
+    "SqpMethod",
+    "Status",
+    "Stencil",
+    "Tendon",
+    "TetMesh",
+    "Tied",
+    "Trajectory",
+    "UncertaintyOptions",
+    "Unknown",
+    "Wrench",
+    "box_mesh",
+    "cylinder_mesh",
+    "live",
+    "place_markers",
+    "refine",
+    "run",
+    "simulate",
+    "solve",
+    "with_markers",
+    "with_readings",
+    "with_wrenches",
+]
+
+__version__: str
