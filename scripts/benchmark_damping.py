@@ -77,7 +77,7 @@ def sweep_of(
     experiment = replace(made, body=body, grasps=(grasp,), markers=made.markers.on(body))
     collocation = Collocation([experiment], PARAMETERS)
     (segment,) = collocation.segments
-    x = march(experiment, Dynamics.of(experiment, "midpoint"), body.theta(TRUTH))
+    x = march(experiment, Dynamics.of(experiment, "midpoint").with_theta(body.theta(TRUTH)))
     (part,) = collocation.parts_at(collocation.guess_p, [x])
 
     def sweep() -> tuple[float, ...]:

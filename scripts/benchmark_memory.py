@@ -61,7 +61,7 @@ def sweep(
     collocation = Collocation([replace(experiment, body=body)], Parameters.of(given))
     (segment,) = collocation.segments
     setting = segment.setting(collocation.guess_p, np.zeros(segment.nuisance.size))
-    x = march(experiment=segment.experiment, dynamics=setting.dynamics, theta=setting.theta)
+    x = march(experiment=segment.experiment, dynamics=setting.dynamics)
     solver = Sweep(segment)
     solver.forward(x, setting)
     return lambda: solver.forward(x, setting), 1 + len(segment.moving)

@@ -88,7 +88,6 @@ def measured(size: str, steps: int | None, threads: int, choice: Choice, damping
     x, failure = march_on(
         segment.experiment,
         setting.dynamics,
-        setting.theta,
         options=NewtonOptions(tolerance=1e-6),
         stopwatch=spent,
     )

@@ -143,6 +143,6 @@ def test_tensions_are_applied_in_parts_where_newton_fails_at_once():
     experiment = driven(body, [Grasp(plane(body, 0), STILL)], tendons=[Tendon(points, 0.6)])
     theta = body.theta({"young_pa": YOUNG_PA, "poisson": 0.3} | REST)
     x = rest_state(experiment, theta)
-    forces = Forces.of(experiment, [0.0]).total(x[None], np.zeros((1, x.size)), theta)
+    forces = Forces.of(experiment, [0.0], theta).total(x[None], np.zeros((1, x.size)))
     assert np.abs(forces[0, Solver(experiment).free]).max() < 1e-8
     assert np.linalg.norm(x.reshape(-1, 3)[-1] - body.nodes_m[-1]) > 0.05

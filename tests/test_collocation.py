@@ -85,7 +85,10 @@ def seen_with_gaps(experiment: Experiment) -> Experiment:
 
 def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
     q = collocation.parameters.guess_q if q is None else q
-    motions = [march(s.experiment, s.dynamics, s.constants.theta(q)) for s in collocation.segments]
+    motions = [
+        march(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
+        for s in collocation.segments
+    ]
     return collocation.pack(q, motions)
 
 
@@ -158,7 +161,7 @@ def test_variables_and_rows_are_in_the_documented_order():
     q, positions = collocation.unpack(z)
     expected_z, expected_g = [q], []
     for segment, x in zip(collocation.segments, positions, strict=True):
-        residual = segment.dynamics.residual(x, segment.constants.theta(q))
+        residual = segment.dynamics.with_theta(segment.constants.theta(q)).residual(x)
         expected_z.append(x.ravel() / segment.length_m)
         rows = residual[segment.dynamics.first_row :, segment.free_dofs]
         expected_g.append(rows.ravel() / segment.force_n)

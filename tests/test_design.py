@@ -214,7 +214,10 @@ def at_answer(experiments) -> tuple[Collocation, np.ndarray]:
     """The experiments with exact tracks of the scheme, and their optimum."""
     exact = [with_markers(e, simulate(e, TRUTH, "midpoint").markers_m) for e in experiments]
     found = Collocation(exact, AT)
-    rows = [march(s.experiment, s.dynamics, s.constants.theta(AT.guess_q)) for s in found.segments]
+    rows = [
+        march(s.experiment, s.dynamics.with_theta(s.constants.theta(AT.guess_q)))
+        for s in found.segments
+    ]
     phi = [s.guess_phi for s in found.segments]
     return found, found.pack(np.concatenate([AT.guess_q, *phi]), rows)
 

@@ -88,7 +88,7 @@ def test_on_a_finer_mesh_it_is_the_same_force(element):
     of_both = []
     for each in (body, refined(body)):
         moving = np.tile(wind, len(each.nodes_m))[None]
-        total = Forces.on(each).total(each.nodes_m.reshape(1, -1), moving.reshape(1, -1), theta)
+        total = Forces.on(each, theta).total(each.nodes_m.reshape(1, -1), moving.reshape(1, -1))
         of_both.append(total.reshape(-1, 3).sum(axis=0))
     expected = -5.0 * DRAG * 6 * 0.1**2 * np.linalg.norm(wind) * wind
     np.testing.assert_allclose(of_both, [expected, expected], rtol=1e-6)

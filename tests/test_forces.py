@@ -93,12 +93,11 @@ def some_inputs(segment: Segment, rng: np.random.Generator) -> np.ndarray:
     return u * (1 + 0.1 * rng.normal(size=u.shape[1]))
 
 
-def forces_at(segment: Segment, u: np.ndarray) -> tuple[Forces, np.ndarray]:
-    """The forces at inputs, and θ."""
+def forces_at(segment: Segment, u: np.ndarray) -> Forces:
+    """The forces at inputs."""
     whole = np.broadcast_to(u[0], (segment.grid_rows, u.shape[1])).copy()
     whole[ROWS] = u
-    at = segment.dynamics.at(whole)
-    return at.forces.rows(ROWS), u[0, : len(segment.body.constants)]
+    return segment.dynamics.at(whole).forces.rows(ROWS)
 
 
 def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rng):
@@ -122,20 +121,20 @@ def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
 def test_forces_on_the_way_to_other_times_lie_between_them(segment, rng):
     x, v = states(segment, rng)
     theta = segment.constants.theta(segment.parameters.guess_q)
-    here, there = (Forces.of(segment.experiment, t_s) for t_s in (FROM_S, TO_S))
-    ends = [each.total(x[:2], v[:2], theta) for each in (here, there)]
+    here, there = (Forces.of(segment.experiment, t_s, theta) for t_s in (FROM_S, TO_S))
+    ends = [each.total(x[:2], v[:2]) for each in (here, there)]
     for share in (0.0, SHARE, 1.0):
-        found = here.towards(there, share).total(x[:2], v[:2], theta)
+        found = here.towards(there, share).total(x[:2], v[:2])
         np.testing.assert_allclose(found, (1 - share) * ends[0] + share * ends[1], atol=1e-12)
 
 
 def test_a_share_is_one_of_all_that_acts(segment, rng):
     x, _ = states(segment, rng)
-    whole, still = Forces.of(segment.experiment, FROM_S), np.zeros_like(x[:2])
-    theta = segment.constants.theta(segment.parameters.guess_q)
+    theta, still = segment.constants.theta(segment.parameters.guess_q), np.zeros_like(x[:2])
+    whole = Forces.of(segment.experiment, FROM_S, theta)
     internal = segment.body.force(x[:2], still, theta)
-    outer = whole.total(x[:2], still, theta) - internal
-    found = whole.scaled(SHARE).total(x[:2], still, theta) - internal
+    outer = whole.total(x[:2], still) - internal
+    found = whole.scaled(SHARE).total(x[:2], still) - internal
     np.testing.assert_allclose(found, SHARE * outer, atol=1e-12)
     assert np.abs(outer).max() > 1e-3
 
@@ -148,14 +147,14 @@ def matrix_times(forces: Forces, lower: np.ndarray, skew: np.ndarray, ways: np.n
 
 def test_slopes_of_forces_are_those_of_what_they_are(segment, rng):
     (xi, nu), u = states(segment, rng), some_inputs(segment, rng)
-    forces, theta = forces_at(segment, u)
-    at = forces.linearise(xi, nu, theta)
-    np.testing.assert_allclose(at.force, forces.total(xi, nu, theta), atol=1e-12)
+    forces = forces_at(segment, u)
+    at = forces.linearise(xi, nu)
+    np.testing.assert_allclose(at.force, forces.total(xi, nu), atol=1e-12)
     none = np.zeros((len(xi), 0))
 
     def of_inputs(change: np.ndarray) -> np.ndarray:
-        other, theta = forces_at(segment, u * (1 + change))
-        return other.total(xi, nu, theta)
+        other = forces_at(segment, u * (1 + change))
+        return other.total(xi, nu)
 
     def by_x(way: np.ndarray) -> np.ndarray:
         return matrix_times(forces, at.by_position, at.by_position_skew, way)
@@ -163,8 +162,8 @@ def test_slopes_of_forces_are_those_of_what_they_are(segment, rng):
     def by_v(way: np.ndarray) -> np.ndarray:
         return matrix_times(forces, at.by_velocity, none, way)
 
-    assert_derivative(lambda x: forces.total(x, nu, theta), by_x, xi, rng, 1e-6, scale=1e-3)
-    assert_derivative(lambda v: forces.total(xi, v, theta), by_v, nu, rng, 1e-6)
+    assert_derivative(lambda x: forces.total(x, nu), by_x, xi, rng, 1e-6, scale=1e-3)
+    assert_derivative(lambda v: forces.total(xi, v), by_v, nu, rng, 1e-6)
     by_u = np.einsum("tiu,tu->tiu", at.by_theta, u)
     for one in np.eye(u.shape[1]):
         assert_derivative(of_inputs, lambda d: by_u @ d, np.zeros(len(one)), rng, 1e-6, one)
@@ -173,14 +172,14 @@ def test_slopes_of_forces_are_those_of_what_they_are(segment, rng):
 def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
     (xi, nu), u = states(segment, rng), some_inputs(segment, rng)
     w = rng.normal(size=xi.shape)
-    forces, theta = forces_at(segment, u)
-    at = forces.curvature(xi, nu, w, theta)
+    forces = forces_at(segment, u)
+    at = forces.curvature(xi, nu, w)
     none = np.zeros((len(xi), 0))
 
     def slopes(x: np.ndarray, v: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, ...]:
         """Of wᵀ F by x, v and u."""
-        other, theta = forces_at(segment, u * (1 + change))
-        here = other.linearise(x, v, theta)
+        other = forces_at(segment, u * (1 + change))
+        here = other.linearise(x, v)
         by_x = matrix_times(forces, here.by_position, -here.by_position_skew, w)
         by_v = matrix_times(forces, here.by_velocity, none, w)
         return by_x, by_v, np.einsum("ti,tiu->tu", w, here.by_theta)
@@ -238,6 +237,6 @@ def test_without_any_nothing_is_added():
     body = hung_cube().body
     x = body.nodes_m.ravel()[None]
     theta = np.array([1e3, 1e3, 0.0, 0.0])
-    alone = Forces.on(body)
-    np.testing.assert_array_equal(alone.total(x, 0 * x, theta), body.force(x, 0 * x, theta))
-    assert alone.linearise(x, 0 * x, theta).by_theta.shape[2] == len(theta)
+    alone = Forces.on(body, theta)
+    np.testing.assert_array_equal(alone.total(x, 0 * x), body.force(x, 0 * x, theta))
+    assert alone.linearise(x, 0 * x).by_theta.shape[2] == len(theta)

@@ -105,11 +105,10 @@ def test_the_estimated_time_acts_as_if_it_were_stated():
     moved, really = segment.setting(GUESS.guess_q, phi).dynamics, segment.corrected(phi)
     stated = replace(segment, experiment=replace(really, nuisance=IDEAL)).dynamics
     assert really.masses[0].from_s == pytest.approx(bar.masses[0].from_s + 1.3 * 0.004)
-    theta = segment.constants.theta(GUESS.guess_q)
-    np.testing.assert_allclose(moved.mass.at(theta), stated.mass.at(theta), atol=1e-15)
+    np.testing.assert_allclose(moved.mass.kg, stated.mass.kg, atol=1e-15)
     both = moved.forces, stated.forces
-    np.testing.assert_allclose(*(each.mass.at(theta) for each in both), atol=1e-15)
-    np.testing.assert_allclose(*(each.external_n(theta) for each in both), atol=1e-15)
+    np.testing.assert_allclose(*(each.mass.kg for each in both), atol=1e-15)
+    np.testing.assert_allclose(*(each.weight.external_n for each in both), atol=1e-15)
 
 
 # Finding them

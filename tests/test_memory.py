@@ -46,7 +46,7 @@ def marched(collocation: Collocation, p: np.ndarray) -> Part:
     """The experiment simulated at p."""
     (segment,) = collocation.segments
     (part,) = collocation.parts_at(p, [np.zeros((0, segment.dofs))])
-    x = march(segment.corrected(part.phi), part.setting.dynamics, part.setting.theta)
+    x = march(segment.corrected(part.phi), part.setting.dynamics)
     return Part(segment, part.q, part.phi, x)
 
 
@@ -104,7 +104,7 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     gradient = rng.standard_normal(x.shape)
     y = Sweep(segment).backward(x, setting, gradient)
     step = Sweep(segment).forward(x, setting).step
-    residual = setting.dynamics.residual(x, setting.theta)
+    residual = setting.dynamics.residual(x)
     residual[:, segment.held_dofs] = 0
     residual = setting.dynamics.without_taken(residual)
     expected = float(np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs]))

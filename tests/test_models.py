@@ -132,7 +132,7 @@ def pressed_block(platen: str, name: str, z_m: np.ndarray, load_n: np.ndarray) -
 def load_n(experiment: Experiment) -> np.ndarray:
     """What the upper platen gives, by the truth."""
     collocation = fitted(experiment, Parameters.of(TRUTH))
-    x = march(experiment, collocation.segments[0].dynamics, as_theta(TRUTH))
+    x = march(experiment, collocation.segments[0].dynamics.with_theta(as_theta(TRUTH)))
     (part,) = collocation.parts_at(np.zeros(0), [x])
     return part.sensing.wrenches(x)[0][:, 2]
 

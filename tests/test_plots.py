@@ -85,7 +85,7 @@ def solved(make=hung_cube, scheme="midpoint") -> Solution:
     """A solution found by knowing it."""
     experiment = measured(make(), scheme)
     collocation = Collocation([experiment], GUESS.with_guess(TRUTH), scheme)
-    x = march(experiment, Dynamics.of(experiment, scheme), THETA)
+    x = march(experiment, Dynamics.of(experiment, scheme).with_theta(THETA))
     z = collocation.pack(collocation.parameters.guess_q, [x])
     multipliers = np.zeros(collocation.constraints)
     return Solution(

@@ -74,7 +74,7 @@ def assert_stable_equilibrium(experiment: Experiment, theta: np.ndarray, x: np.n
     """No net force on free nodes, and a positive definite stiffness there."""
     body, solver = experiment.body, Solver(experiment)
     still = np.zeros_like(x)
-    load = Forces.of(experiment, experiment.t_s[:1]).external_n(THETA)[0]
+    load = Forces.of(experiment, experiment.t_s[:1]).weight.external_n[0]
     net = (body.force(x, still, theta)[0] + load)[solver.free]
     assert np.abs(net).max() < 1e-9 * np.abs(load).max()
     stiffness = -body.linearise(x, still, theta).by_position[0]
@@ -267,12 +267,12 @@ def test_newmark_halves_steps_that_are_too_large():
 
 def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
     cube = with_papers_damping(jerked_cube(0.45, timestep_s=0.02))
-    dynamics = Dynamics.of(cube, "midpoint")
-    x = march(cube, dynamics, THETA)
-    residual = dynamics.residual(x, THETA)[:, Solver(cube).free]
-    assert np.abs(residual).max() < 1e-9 * np.abs(dynamics.forces.external_n(THETA)).max()
+    dynamics = Dynamics.of(cube, "midpoint").with_theta(THETA)
+    x = march(cube, dynamics)
+    residual = dynamics.residual(x)[:, Solver(cube).free]
+    assert np.abs(residual).max() < 1e-9 * np.abs(dynamics.forces.weight.external_n).max()
     with pytest.raises(SimulationError, match="the step at row 3 failed: an element is inverted"):
-        march(cube, dynamics, THETA, NewtonOptions(halvings=0))
+        march(cube, dynamics, NewtonOptions(halvings=0))
 
 
 # Failures

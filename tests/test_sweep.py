@@ -42,7 +42,7 @@ def disturbed(
     rng = np.random.default_rng(seed)
     positions = []
     for segment in collocation.segments:
-        x = march(segment.experiment, segment.dynamics, as_theta(TRUTH))
+        x = march(segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH)))
         change = np.zeros_like(x)
         change[:, segment.free_dofs] = rng.standard_normal((len(x), len(segment.free_dofs)))
         change = segment.dynamics.without_taken(change)

@@ -33,7 +33,10 @@ NAMES = tuple(TRUTH)
 
 
 def positions(collocation: Collocation, q):
-    return [march(s.experiment, s.dynamics, s.constants.theta(q)) for s in collocation.segments]
+    return [
+        march(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
+        for s in collocation.segments
+    ]
 
 
 def simulated(experiments, parameters=AT_TRUTH, **options) -> tuple[Collocation, np.ndarray]:

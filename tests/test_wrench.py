@@ -56,7 +56,7 @@ EVERYTHING = Nuisance(
 def at_truth(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Part:
     collocation = Collocation([experiment], Parameters.of(TRUTH), scheme, substeps)
     (segment,) = collocation.segments
-    x = march(experiment, segment.dynamics, as_theta(TRUTH))
+    x = march(experiment, segment.dynamics.with_theta(as_theta(TRUTH)))
     (part,) = collocation.parts_at(np.zeros(collocation.nphi), [x])
     return part
 
@@ -74,12 +74,12 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(experiment: Experi
     part = at_truth(sensing(experiment, point_m=(0, 0, 0)), scheme)
     undragged = TRUTH | {"gamma_m_1_s": 0.0}
     theta = as_theta(undragged)
-    x = march(experiment, part.segment.dynamics, theta)
+    x = march(experiment, part.segment.dynamics.with_theta(theta))
     collocation = Collocation([part.segment.experiment], Parameters.of(undragged), scheme)
     (part,) = collocation.parts_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
     dynamics = part.segment.dynamics
-    mass = dynamics.mass.row(0, theta)[::3]
+    mass = dynamics.mass.kg[0, ::3]
     stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
     acceleration = stencil[grid + part.segment.sensors[0].channel.on.late].reshape(len(grid), -1, 3)
     pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
@@ -91,11 +91,11 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     part = at_truth(sensing(bar_in_two_hands(14), point_m=(0.1, 0.2, -0.1)))
     experiment = part.segment.experiment
     theta = as_theta(TRUTH | {"gamma_m_1_s": 0.0})
-    x = march(experiment, part.segment.dynamics, theta)
+    x = march(experiment, part.segment.dynamics.with_theta(theta))
     collocation = Collocation([experiment], Parameters.of(TRUTH | {"gamma_m_1_s": 0.0}))
     (part,) = collocation.parts_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
-    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass.row(0, theta)[::3]
+    dynamics, mass = part.segment.dynamics, part.segment.dynamics.mass.kg[0, ::3]
     at = x.reshape(len(x), -1, 3)
     second = (at[2:] - 2 * at[1:-1] + at[:-2]) / dynamics.step_s**2
     arm = at[1:-1] - [0.1, 0.2, -0.1]

@@ -54,7 +54,7 @@ def sensed(
     made = measured_with(experiment, truth, scheme)
     collocation = fitted(made, Parameters.of(dict(truth)), scheme)
     (segment,) = collocation.segments
-    x = march(experiment, segment.dynamics, as_theta(truth))
+    x = march(experiment, segment.dynamics.with_theta(as_theta(truth)))
     (part,) = collocation.parts_at(np.zeros(collocation.nphi), [x])
     return with_wrenches(made, part.sensing.wrenches(x))
 

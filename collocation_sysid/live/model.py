@@ -17,7 +17,6 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
-from ..model.forces import Forces
 from ..model.point_forces import generated
 from ..problem import Problem
 from ..program.collocation import Collocation
@@ -201,11 +200,6 @@ class Model:
         for number, pose in zip(self.moved_grasps, moved, strict=True):
             still[number] = pose
         return tuple(still)
-
-    @cached_property
-    def forces(self) -> Forces:
-        """On one row, as the problem has gravity."""
-        return self.segment.dynamics.forces.rows(slice(1))
 
     @cached_property
     def known_rows(self) -> dict[int, Row]:

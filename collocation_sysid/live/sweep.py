@@ -138,10 +138,9 @@ class LiveSweep:
         self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.count = 1 + len(self.moving)
-        self.mass_kg = self.dynamics.mass.row(0, self.setting.theta)
+        self.mass_kg = self.dynamics.mass.kg[0]
         # Loads are always there: what acts on one row acts on every one.
-        still = self.dynamics.forces is segment.dynamics.forces
-        self.forces = model.forces if still else self.dynamics.forces.rows(slice(1))
+        self.forces = self.dynamics.forces.rows(slice(1))
         self._rows = {} if self.setting.mass_moves else model.known_rows
         self.information = known
         state = self._begin() if start is None or at is None else self._moved(start, at)
@@ -274,18 +273,18 @@ class LiveSweep:
         """Rows where they are guessed to be, on from the rows before as they are."""
         for past in (*self.forward.past, *self.forward.past_increments):
             past[:, 0] = 0.0
-        theta, rows, known = self.setting.theta, slice(here.start, here.stop), slice(here.stop)
+        rows, known = slice(here.start, here.stop), slice(here.stop)
         p, q, w, s = (table[rows, known] for table in self.model.stencils)
         x, force, free = self.x[known], self.force[known], self.solver.free
         nu, acceleration = q @ x, s @ x
-        at = self.forces.linearise(p @ x, nu, theta, self.model.out[: len(here)])
+        at = self.forces.linearise(p @ x, nu, self.model.out[: len(here)])
         force[rows] = at.force
         residual = (w @ force - self.mass_kg * acceleration)[:, free]
         return at, self.columns.sides(rows, at, acceleration, residual, free)
 
     def _row(self, t: int) -> Row:
         if t not in self._rows:
-            self._rows[t] = Row.of(self.dynamics, t, self.setting.theta)
+            self._rows[t] = Row.of(self.dynamics, t)
         return self._rows[t]
 
     def _advanced(self, here: range, limit: float) -> tuple[list[Array], float | None]:
@@ -338,7 +337,7 @@ class LiveSweep:
         """x_t, with the grasp's way taken in parts where that is needed."""
         if t == 0:
             return self._start(poses)
-        equations = RowEquations(self.dynamics, self.setting.theta, self.x, self.force, t)
+        equations = RowEquations(self.dynamics, self.x, self.force, t)
         goal = self.x[t, self.grasped]
         try:
             return solve_row(self.model.newton, equations, self.x[t], self.x[t - 1], goal)

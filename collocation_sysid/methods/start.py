@@ -43,7 +43,7 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     for segment in collocation.segments:
         theta = segment.constants.theta(p[: segment.nq])
         try:
-            positions.append(march(segment.experiment, segment.dynamics, theta))
+            positions.append(march(segment.experiment, segment.dynamics.with_theta(theta)))
         except SimulationError as error:
             positions.append(carried_rigidly(segment, theta))
             notes.append(
@@ -100,7 +100,6 @@ def continued(
     return march_on(
         part.segment.corrected(part.phi),
         part.setting.dynamics.first_rows(rows),
-        part.setting.theta,
         part.x if len(part.x) else None,
         options,
         stopwatch=stopwatch,

@@ -166,7 +166,6 @@ def tried(
         settled, failure = march_on(
             segment.corrected(part.phi),
             dynamics.first_rows(len(x)),
-            part.setting.theta,
             options=SETTLED,
             stopwatch=solver.stopwatch,
             near=x,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +44,7 @@ class Tables:
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """c_t(x; θ) for rows t = `first_row` … N − 1 of a uniform grid, all dofs included.
+    """c_t(x; u) for rows t = `first_row` … N − 1 of a uniform grid, all dofs included.
 
     Row 0 exists when the experiment starts in equilibrium and is the static problem; so are all
     rows of a static experiment, whose times need not be evenly spaced.
@@ -117,9 +117,13 @@ class Dynamics:
 
     def at(self, u: Array) -> Dynamics:
         """The same at inputs (N, U), see `inputs`."""
-        forces = self.forces.at(u)
-        if forces is self.forces:
-            return self
+        return self._under(self.forces.at(u))
+
+    def with_theta(self, theta: Sequence[float] | Array) -> Dynamics:
+        """The same with a body of these constants (k,)."""
+        return self._under(self.forces.with_theta(theta))
+
+    def _under(self, forces: Forces) -> Dynamics:
         if forces.mass is self.forces.mass:
             return replace(self, forces=forces)
         return replace(self, forces=forces, mass=_of_rows(self.tables, forces.mass))
@@ -190,17 +194,23 @@ class Dynamics:
         lags = self.tables.p @ np.arange(self.reach + 1.0)
         return self.step_s * np.append(np.diff(np.arange(self.rows) - lags), 1.0)
 
-    def history(self, x: Array, theta: Array) -> History | None:
+    @property
+    def theta(self) -> Array:
+        """(k,) constants of the body."""
+        return self.forces.theta
+
+    def history(self, x: Array) -> History | None:
         """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing."""
         if not self.body.remembers:
             return None
         xi = self.combine(self.state_weights[: len(x)], x)
         intervals = self.until_next_s[: len(x)]
-        return History.of(self.body, xi, theta, intervals, self.loaded_since_s, self.brought)
+        return History.of(self.body, xi, self.theta, intervals, self.loaded_since_s, self.brought)
 
-    def recursions(self, theta: Array) -> list[Recursion]:
+    @property
+    def recursions(self) -> list[Recursion]:
         """How each branch of the memory fades over all evaluations."""
-        return recursions_of(self.body, theta, self.until_next_s, self.loaded_since_s)
+        return recursions_of(self.body, self.theta, self.until_next_s, self.loaded_since_s)
 
     def carried(self, history: History | None, rows: slice | None = None) -> Past | None:
         """What rows `first_row`…, or some, bring from the past."""
@@ -221,25 +231,25 @@ class Dynamics:
                 result[: len(rows) - lag] += column * rows[lag:]
         return result
 
-    def residual(self, x: Array, theta: Array) -> Array:
+    def residual(self, x: Array) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
-        return self.assemble_residual(x, theta, self.force(x, theta))
+        return self.assemble_residual(x, self.force(x))
 
     @property
     def evaluated(self) -> Forces:
         """The forces of rows `first_row`…."""
         return self.forces.rows(slice(self.first_row, self.rows))
 
-    def force(self, x: Array, theta: Array) -> Array:
+    def force(self, x: Array) -> Array:
         """Forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
-        carried = self.carried(self.history(x, theta))
-        return self.evaluated.total(*self.evaluation_states(x), theta, carried)
+        carried = self.carried(self.history(x))
+        return self.evaluated.total(*self.evaluation_states(x), carried)
 
-    def assemble_residual(self, x: Array, theta: Array, force: Array) -> Array:
+    def assemble_residual(self, x: Array, force: Array) -> Array:
         """The same from the forces (N − first_row, 3n) at the evaluation states."""
         total = np.zeros_like(x)
         total[self.first_row :] = force
-        inertia = self.mass.at(theta) * self.acceleration(x)
+        inertia = self.mass.kg * self.acceleration(x)
         return self.combine(self.tables.w, self.without_taken(total)) - inertia
 
     def without_taken(self, rows: Array) -> Array:
@@ -253,10 +263,10 @@ class Dynamics:
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
         return acceleration
 
-    def linearise(self, x: Array, theta: Array, out: Array | None = None) -> Linearisation:
+    def linearise(self, x: Array, out: Array | None = None) -> Linearisation:
         """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
-        carried = self.carried(self.history(x, theta))
-        return self.evaluated.linearise(*self.evaluation_states(x), theta, out, carried)
+        carried = self.carried(self.history(x))
+        return self.evaluated.linearise(*self.evaluation_states(x), out, carried)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
         """The force part of ∂c_t/∂x_{t−lag} as Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.

@@ -8,7 +8,7 @@ inputs u, term by term, see `inputs`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, Index
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Past
-from ..fem.model import Theta
 from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
 from .force_term import ForceTerm, Places, States
@@ -40,14 +39,18 @@ class Forces:
     further : tuple of ForceTerm
     joined : Joined
         The mesh graph, and the couplings of the further terms that have some.
+    theta : (k,) constants of the body; NaN where they are not known yet
     """
 
     weight: Weight
     further: tuple[ForceTerm, ...]
     joined: Joined
+    theta: Array
 
     @classmethod
-    def of(cls, experiment: Experiment, t_s: ArrayLike) -> Forces:
+    def of(
+        cls, experiment: Experiment, t_s: ArrayLike, theta: Sequence[float] | Array | None = None
+    ) -> Forces:
         """Those of an experiment at the times `t_s` (T,)."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
@@ -55,13 +58,21 @@ class Forces:
             for actuator in experiment.actuators
         )
         further = (*potentials, *point_forces(experiment.body, times))
-        return cls(Weight.of(experiment, times), further, experiment.joined)
+        unknown = np.full(len(experiment.body.constants), np.nan)
+        found = cls(Weight.of(experiment, times), further, experiment.joined, unknown)
+        return found if theta is None else found.with_theta(theta)
 
     @classmethod
-    def on(cls, body: Body) -> Forces:
+    def on(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
         """Those on a body that nothing acts on but what is its own, at one time."""
-        own = point_forces(body, np.zeros(1))
-        return cls(Weight.none(body), own, body.joined_with(()))
+        own, known = point_forces(body, np.zeros(1)), np.asarray(theta, dtype=float)
+        weight = Weight.none(body).with_theta(known)
+        return cls(weight, own, body.joined_with(()), known)
+
+    def with_theta(self, theta: Sequence[float] | Array) -> Forces:
+        """The same on a body of these constants (k,)."""
+        known = np.array(theta, dtype=float)
+        return replace(self, theta=known, weight=self.weight.with_theta(known))
 
     @property
     def body(self) -> Body:
@@ -83,10 +94,6 @@ class Forces:
         """Beside what is internal."""
         return (self.weight, *self.further)
 
-    def _rates(self, times: int) -> Array:
-        """Room for the curvature by velocities, where forces may have some."""
-        return np.zeros((times, self.pattern.entries if self.body.forces else 0))
-
     @cached_property
     def _ends(self) -> list[int]:
         """Where the inputs of each term begin in u, and where the last end."""
@@ -100,13 +107,14 @@ class Forces:
 
     def at(self, u: Array) -> Forces:
         """The same at inputs (T, U)."""
-        if len(self.body.constants) == self._ends[-1]:
-            return self
+        found = self.with_theta(u[0, : self._ends[0]])
+        if self._ends[0] == self._ends[-1]:
+            return found
         weight, *further = (
             term.at(u[:, start:stop])
-            for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
+            for term, start, stop in zip(found.terms, self._ends, self._ends[1:], strict=False)
         )
-        return replace(self, weight=weight, further=tuple(further))
+        return replace(found, weight=weight, further=tuple(further))
 
     def rows(self, rows: slice) -> Forces:
         """The same at some of the times."""
@@ -130,29 +138,20 @@ class Forces:
         """Weight and loads alone, without what drives the body or acts by a law of its own."""
         return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
 
-    def external_n(self, theta: Theta) -> Array:
-        """(T, 3n) those that do not depend on the state: weight, and forces on nodes."""
-        return self.weight.force(States(np.zeros(0), np.zeros(0), np.asarray(theta)))
-
-    def total(self, xi: Array, nu: Array, theta: Theta, carried: Past | None = None) -> Array:
+    def total(self, xi: Array, nu: Array, carried: Past | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
-        found = self.body.force(xi, nu, theta, self.mass.tied, carried)
-        states = self._states(xi, nu, theta)
+        found = self.body.force(xi, nu, self.theta, self.mass.tied, carried)
+        states = self._states(xi, nu)
         for term in self.terms:
             found = found + term.force(states)
         return found
 
     def linearise(
-        self,
-        xi: Array,
-        nu: Array,
-        theta: Theta,
-        out: Array | None = None,
-        carried: Past | None = None,
+        self, xi: Array, nu: Array, out: Array | None = None, carried: Past | None = None
     ) -> Linearisation:
         """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
-        at = self.body.linearise(xi, nu, theta, out, self.mass.tied, carried)
-        if self.further or self._ends[-1] > len(theta):
+        at = self.body.linearise(xi, nu, self.theta, out, self.mass.tied, carried)
+        if self.further or self._ends[-1] > self._ends[0]:
             spread = self.joined.spread
             at = Linearisation(
                 at.force,
@@ -161,7 +160,7 @@ class Forces:
                 self._widened(at.by_theta),
                 spread(at.by_position_skew),
             )
-        states = self._states(xi, nu, theta)
+        states = self._states(xi, nu)
         for term, places in self._placed:
             term.add_slopes(at, places, states)
         return at
@@ -176,15 +175,14 @@ class Forces:
         xi: Array,
         nu: Array,
         weights: Array,
-        theta: Theta,
         out: Array | None = None,
         carried: Past | None = None,
         stress_weights: Array | None = None,
     ) -> Curvature:
         """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
-        tied = self.mass.tied
-        at = self.body.curvature(xi, nu, weights, theta, out, tied, carried, stress_weights)
-        if self.further or self._ends[-1] > len(theta):
+        known = self.theta, out, self.mass.tied, carried, stress_weights
+        at = self.body.curvature(xi, nu, weights, *known)
+        if self.further or self._ends[-1] > self._ends[0]:
             spread, widened = self.joined.spread, self._widened
             at = Curvature(
                 spread(at.position_position),
@@ -194,9 +192,10 @@ class Forces:
                 widened(widened(at.theta_theta).swapaxes(1, 2)),
                 widened(at.theta),
                 spread(at.position_velocity_skew),
-                self._rates(len(at.theta)),
+                # Room for the curvature by velocities, where forces may have some.
+                np.zeros((len(at.theta), self.pattern.entries if self.body.forces else 0)),
             )
-        states = self._states(xi, nu, theta)
+        states = self._states(xi, nu)
         for term, places in self._placed:
             term.add_curvature(at, places, states, weights.reshape(states.xi.shape))
         return at
@@ -206,9 +205,9 @@ class Forces:
         """Length of one time's row of `curvature`."""
         return self.body.curvature_width
 
-    def _states(self, xi: Array, nu: Array, theta: Theta) -> States:
+    def _states(self, xi: Array, nu: Array) -> States:
         size = self.body.pattern.size
-        return States(xi.reshape(-1, size), nu.reshape(-1, size), np.asarray(theta))
+        return States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
 
     @cached_property
     def _placed(self) -> list[tuple[ForceTerm, Places]]:
@@ -222,7 +221,7 @@ class Forces:
 
     def _widened(self, by_theta: Array) -> Array:
         """(…, U) slopes by θ with room for those by the inputs of the terms."""
-        further = self._ends[-1] - len(self.body.constants)
+        further = self._ends[-1] - self._ends[0]
         if not further:
             return by_theta
         return np.concatenate([by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1)

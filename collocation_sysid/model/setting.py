@@ -24,8 +24,8 @@ class Setting:
     p : (m,)
     nq : int
         Number of q.
-    u, by_p : (N, U) and (N, U, m), inputs and their derivatives
-    dynamics : Dynamics with these inputs
+    by_p : (N, U, m) derivatives of u
+    dynamics : Dynamics at u
     held : Held
         Where the grasps are.
     """
@@ -33,15 +33,14 @@ class Setting:
     inputs: Inputs
     p: Array
     nq: int
-    u: Array
     by_p: Array
     dynamics: Dynamics
     held: Held
 
-    @cached_property
+    @property
     def theta(self) -> Array:
         """(k,) constants of the body."""
-        return np.array(self.u[0, : len(self.dynamics.body.constants)])
+        return self.dynamics.theta
 
     @cached_property
     def theta_p(self) -> Array:

@@ -30,27 +30,27 @@ from .force_term import ForceTerm, Places, States
 
 @dataclass(frozen=True, eq=False)
 class Mass:
-    """What moves with every dof at T times: M(θ), the body's own and what is tied to it.
+    """What moves with every dof at T times: M, the body's own and what is tied to it.
 
     Attributes
     ----------
-    body : Body
+    own_kg : (3n,)
     tied_kg : (T, 3n)
     """
 
-    body: Body
+    own_kg: Array
     tied_kg: Array
 
     def rows(self, rows: slice) -> Mass:
         """The same at some of the times."""
         return replace(self, tied_kg=self.tied_kg[rows])
 
-    def at(self, theta: Theta) -> Array:
-        """M (T, 3n) [kg]."""
-        own = self.body.mass_of_dofs(theta)
+    @cached_property
+    def kg(self) -> Array:
+        """M (T, 3n)."""
         if len(self.tied_kg) and self.tied_kg.strides[0] == 0:  # in the memory of one row
-            return np.broadcast_to(own + self.tied_kg[0], self.tied_kg.shape)
-        return own + self.tied_kg
+            return np.broadcast_to(self.own_kg + self.tied_kg[0], self.tied_kg.shape)
+        return self.own_kg + self.tied_kg
 
     @cached_property
     def tied(self) -> Array | None:
@@ -59,10 +59,6 @@ class Mass:
             return self.tied_kg
         return self.tied_kg[0] if self.tied_kg[0].any() else None
 
-    def row(self, t: int | slice, theta: Theta) -> Array:
-        """The same (3n,) at one of the times, or (…, 3n) at some."""
-        return self.body.mass_of_dofs(theta) + self.tied_kg[t]
-
 
 @dataclass(frozen=True, eq=False)
 class Weight(ForceTerm):
@@ -70,6 +66,8 @@ class Weight(ForceTerm):
 
     Attributes
     ----------
+    body : Body
+        What it pulls at.
     mass : Mass
         With all that is tied.
     gravity_m_s2 : (3,)
@@ -81,6 +79,7 @@ class Weight(ForceTerm):
     share : (T, L) s
     """
 
+    body: Body
     mass: Mass
     gravity_m_s2: Array
     applied_n: Array
@@ -94,17 +93,24 @@ class Weight(ForceTerm):
     @classmethod
     def of(cls, experiment: Experiment, t_s: ArrayLike) -> Weight:
         """That of an experiment at the times `t_s` (T,)."""
-        applied = experiment.node_forces_n(t_s)
+        applied, body = experiment.node_forces_n(t_s), experiment.body
         tied = np.repeat(experiment.tied_mass_kg(t_s), 3, axis=1)
-        mass = Mass(experiment.body, _compact(tied))
+        mass = Mass(_own_kg(body), _compact(tied))
         applied = _compact(applied.reshape(len(applied), -1))
-        return cls(mass, experiment.gravity_m_s2, applied, False, *_no_loads(applied))
+        return cls(body, mass, experiment.gravity_m_s2, applied, False, *_no_loads(applied))
 
     @classmethod
     def none(cls, body: Body) -> Weight:
         """That of a body that nothing acts on, at one time."""
         nothing = np.zeros((1, body.pattern.size))
-        return cls(Mass(body, nothing), np.zeros(3), nothing, False, *_no_loads(nothing))
+        mass = Mass(_own_kg(body), nothing)
+        return cls(body, mass, np.zeros(3), nothing, False, *_no_loads(nothing))
+
+    def with_theta(self, theta: Theta) -> Self:
+        """The same on a body of these constants."""
+        if not self.body.mass_slopes:
+            return self
+        return replace(self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta)))
 
     def with_inputs(self, turns: bool, loads: Sequence[PointMass | Force], t_s: Array) -> Weight:
         """The same with gravity, and the shares of some loads, as inputs."""
@@ -116,11 +122,6 @@ class Weight(ForceTerm):
             else:
                 newtons[k] = load.at_nodes(t_s, nodes).reshape(len(t_s), -1)
         return replace(self, turns=turns, joining_kg=kg, joining_n=newtons, share=share)
-
-    @property
-    def body(self) -> Body:
-        """What it pulls at."""
-        return self.mass.body
 
     @property
     def size(self) -> int:  # type: ignore[override]
@@ -187,26 +188,22 @@ class Weight(ForceTerm):
 
     def force(self, states: States) -> Array:
         """(T, 3n) [N]; what drags at what is tied is the body's, see `Body.force`."""
-        return self._steady if not self.body.mass_slopes else self._pull(states.theta)
+        return self.external_n
 
     @cached_property
-    def _steady(self) -> Array:
-        """Of densities as stated: once for the iterations of a small body's row."""
-        return self._pull(np.zeros(0))
-
-    def _pull(self, theta: Theta) -> Array:
-        return self.mass.at(theta) * self.gravity + self.applied_n
+    def external_n(self) -> Array:
+        """The same: it does not depend on the state."""
+        return self.mass.kg * self.gravity + self.applied_n
 
     def add_slopes(self, at: Linearisation, places: Places, states: States) -> None:
         """Add F and its slopes."""
-        np.add(at.force, self.force(states), out=at.force)
+        np.add(at.force, self.external_n, out=at.force)
         for density, slope in self.body.mass_slopes.items():
             at.by_theta[:, :, density] += slope * self.gravity
         own = places.inputs.start
         if self.turns:
-            mass = self.mass.at(states.theta)
             for axis in range(3):
-                at.by_theta[:, axis::3, own + axis] += mass[:, axis::3]
+                at.by_theta[:, axis::3, own + axis] += self.mass.kg[:, axis::3]
         for k, (kg, newtons) in enumerate(self._joining, own + 3 * self.turns):
             at.by_theta[:, :, k] += kg * self._falling(states) + newtons
 
@@ -217,7 +214,7 @@ class Weight(ForceTerm):
         own = places.inputs.start
         if self.turns:
             here = slice(own, own + 3)
-            at.theta[:, here] += _of_axes(weights * self.mass.at(states.theta))
+            at.theta[:, here] += _of_axes(weights * self.mass.kg)
             for place, kg in self.mass_by_input(own).items():
                 mixed = _of_axes(weights * kg)
                 at.theta_theta[:, place, here] += mixed
@@ -238,6 +235,11 @@ class Weight(ForceTerm):
     def _falling(self, states: States) -> Array:
         """(T, 3n) acceleration g − γ_m ν of what is tied to the body [m/s²]."""
         return self.gravity - self.body.tied_drag(states.theta) * states.nu
+
+
+def _own_kg(body: Body) -> Array:
+    """(3n,) of a body whose constants are not known yet."""
+    return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 
 
 def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:

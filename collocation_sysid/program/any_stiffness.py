@@ -130,10 +130,9 @@ class Sway:
     def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Sway:
         """Of an experiment; of the constants only ratios count."""
         body, markers = experiment.body, experiment.markers
-        forces = Forces.of(experiment, experiment.t_s[:1]).undriven()
-        theta = body.theta(constants)
-        modes = natural_modes(body, body.nodes_m, experiment.free_dofs, theta, MODES, forces)
-        weighed = modes.shapes * forces.mass.row(0, theta)[::3, None]
+        forces = Forces.of(experiment, experiment.t_s[:1], body.theta(constants)).undriven()
+        modes = natural_modes(forces, body.nodes_m, experiment.free_dofs, MODES)
+        weighed = modes.shapes * forces.mass.kg[0, ::3, None]
         omega = modes.angular_frequencies_rad_s
         return cls(
             markers.observe(body.nodes_m),

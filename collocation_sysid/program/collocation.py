@@ -544,8 +544,8 @@ class Collocation:
         largest = 0.0
         for part in self.parts(z):
             dynamics = part.setting.dynamics
-            total = dynamics.force(part.x, part.setting.theta)
-            external = dynamics.evaluated.external_n(part.setting.theta)
+            total = dynamics.force(part.x)
+            external = dynamics.evaluated.weight.external_n
             for force in (total - external, external):
                 # What a grasp bears counts too: where nothing else acts, all other forces vanish.
                 largest = max(largest, float(np.abs(force).max()))

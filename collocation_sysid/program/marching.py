@@ -31,7 +31,6 @@ Progress = Callable[[float], None]
 def march(
     experiment: Experiment,
     dynamics: Dynamics,
-    theta: Array,
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
 ) -> Array:
@@ -42,7 +41,7 @@ def march(
     SimulationError
         Naming time and element of the step that failed.
     """
-    x, failure = march_on(experiment, dynamics, theta, None, options, progress)
+    x, failure = march_on(experiment, dynamics, None, options, progress)
     if failure is not None:
         raise failure
     return x
@@ -52,7 +51,6 @@ def march(
 def march_on(
     experiment: Experiment,
     dynamics: Dynamics,
-    theta: Array,
     known: Array | None = None,
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
@@ -82,7 +80,7 @@ def march_on(
     if known is None:
         try:
             first_near = None if near is None else near[0]
-            x[0], v0 = start_state(experiment, theta, solvers.holding(held[0]), first_near)
+            x[0], v0 = start_state(experiment, dynamics.theta, solvers.holding(held[0]), first_near)
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
@@ -91,16 +89,16 @@ def march_on(
     forces = np.zeros_like(x)  # total force at every evaluation so far
     xi, nu = dynamics.evaluation_states(x)
     first, seen = dynamics.first_row, done - dynamics.first_row
-    history = dynamics.history(x[:done], theta)
+    history = dynamics.history(x[:done])
     if seen > 0:
         here = slice(first, done)
         carried = dynamics.carried(history, here)
-        forces[here] = dynamics.forces.rows(here).total(xi[:seen], nu[:seen], theta, carried)
+        forces[here] = dynamics.forces.rows(here).total(xi[:seen], nu[:seen], carried)
     dynamics.without_taken(forces)
     memory, intervals = history.last if history else None, dynamics.until_next_s
     for t in range(done, dynamics.rows):
         carried = memory.ahead(intervals[t - 1]) if memory else None
-        row = RowEquations(dynamics, theta, x, forces, t, carried)
+        row = RowEquations(dynamics, x, forces, t, carried)
         solver = solvers.holding(held[t])
         goal = held_positions[t].ravel()[solver.held]
         if not dynamics.static:
@@ -145,13 +143,12 @@ class RowEquations:
     def __init__(
         self,
         dynamics: Dynamics,
-        theta: Array,
         x: Array,
         forces: Array,
         t: int,
         carried: Past | None = None,
     ) -> None:
-        self.dynamics, self.theta, self.row = dynamics, theta, Row.of(dynamics, t, theta)
+        self.dynamics, self.row = dynamics, Row.of(dynamics, t)
         self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
         self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
         row = self.row
@@ -172,7 +169,7 @@ class RowEquations:
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        return self.forces.total(*self.states(x), self.theta, self.carried)[0]
+        return self.forces.total(*self.states(x), self.carried)[0]
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """ξ_t and ν_t, (1, 3n) each."""
@@ -189,7 +186,7 @@ class RowEquations:
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
-        at = self.forces.linearise(*self.states(x), self.theta, carried=self.carried)
+        at = self.forces.linearise(*self.states(x), carried=self.carried)
         matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
         skew = self.row.skew_block(at.by_position_skew[0])
         return self.balanced(at.force[0], x), matrix, skew

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from ..arrays import Array, Index
-from ..fem.body import Body
 from ..model.forces import Forces
 from .factorisation import Factor, Factoriser
 
@@ -55,36 +54,26 @@ class Modes:
         return 2 * np.pi * self.frequencies_hz
 
 
-def natural_modes(
-    body: Body,
-    x: ArrayLike,
-    free_dofs: Index,
-    theta: Array,
-    count: int = 6,
-    forces: Forces | None = None,
-) -> Modes:
+def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6) -> Modes:
     """The lowest modes of a body about a state.
 
     Parameters
     ----------
-    body : Body
+    forces : Forces
+        On the body at one time, see `Forces.on`.
     x : (n, 3) or (3n,) array
         The state; it should be an equilibrium.
     free_dofs : (k,) sorted dofs that are not held
-    theta : (k,) constants of the body
     count : int
         Modes wanted; there may be fewer.
-    forces : Forces, optional
-        On the body at one time; nothing acts on it by default.
 
     Returns
     -------
     Modes
     """
-    forces = forces or Forces.on(body)
-    mass, pattern = forces.mass.row(0, theta)[free_dofs], forces.pattern
+    mass, pattern = forces.mass.kg[0, free_dofs], forces.pattern
     state = np.asarray(x, dtype=float).reshape(1, -1)
-    at = forces.linearise(state, np.zeros_like(state), theta)
+    at = forces.linearise(state, np.zeros_like(state))
     lower, damping = -at.by_position[0], -at.by_velocity[0]
     stiffness = sp.csc_array(pattern.matrix(lower)[:, free_dofs][free_dofs])
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
@@ -103,7 +92,7 @@ def natural_modes(
     return Modes(
         omega / (2 * np.pi),
         drag / (2 * omega),
-        shapes.reshape(-1, len(body.nodes_m), 3),
+        shapes.reshape(-1, pattern.size // 3, 3),
         int((~oscillating).sum()),
     )
 

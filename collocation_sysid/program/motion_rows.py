@@ -103,9 +103,9 @@ class MotionRows:
         grasps = self.band.positions(rows, 0, np.searchsorted(self.row_dofs, held), held)
         return np.concatenate(positions), grasps.ravel()
 
-    def _inertia(self, dynamics: Dynamics, theta: Array) -> Array:
+    def _inertia(self, dynamics: Dynamics) -> Array:
         """∂c/∂x of the inertia, in the order of its positions."""
-        mass = dynamics.mass.at(theta)[:, self.moving_dofs] * self.length_m / self.force_n
+        mass = dynamics.mass.kg[:, self.moving_dofs] * self.length_m / self.force_n
         values = [np.zeros(0)]
         for lag in range(self.dynamics.reach + 1):
             rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
@@ -115,7 +115,7 @@ class MotionRows:
     @cached_property
     def _known_inertia(self) -> Array:
         """The same where it does not depend on (q, φ)."""
-        return self._inertia(self.dynamics, np.zeros(0))
+        return self._inertia(self.dynamics)
 
     @cached_property
     def _passing(self) -> ReleasedGrasps:
@@ -125,24 +125,19 @@ class MotionRows:
         )
 
     def fill(
-        self,
-        values: Array,
-        forces: Linearisation,
-        dynamics: Dynamics,
-        theta: Array,
-        mass_moves: bool,
+        self, values: Array, forces: Linearisation, dynamics: Dynamics, mass_moves: bool
     ) -> None:
         """Write the values (band.nnz,), from the slopes of the forces at the evaluations.
 
         Parameters
         ----------
-        dynamics, theta : at the parameters
+        dynamics : at the parameters
         mass_moves : whether the mass depends on them
         """
         threads = dynamics.body.threads
         self.band.fill(values, forces.by_position, forces.by_velocity, threads)
         positions, grasps = self._constants
-        values[positions] += self._inertia(dynamics, theta) if mass_moves else self._known_inertia
+        values[positions] += self._inertia(dynamics) if mass_moves else self._known_inertia
         skew = skew_values(self.pattern, forces.by_position_skew)
         if skew.size:
             self._skew.fill(values, skew, skew, threads)

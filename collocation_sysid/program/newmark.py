@@ -114,13 +114,16 @@ class _Stepper:
     def _force(self, state: _State, load_s: float) -> Array:
         """All forces (3n,) in a state, under the loads of a time."""
         now = state.memory.now if state.memory else None
-        return Forces.of(self.experiment, load_s).total(state.x, state.v, self.theta, now)[0]
+        return self._forces(load_s).total(state.x, state.v, now)[0]
+
+    def _forces(self, load_s: float) -> Forces:
+        return Forces.of(self.experiment, load_s, self.theta)
 
     def _solver(self, time_s: float) -> Solver:
         return self.solvers.holding(self.experiment.held(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
-        return Weight.of(self.experiment, time_s).mass.row(0, self.theta)
+        return Weight.of(self.experiment, time_s).with_theta(self.theta).mass.kg[0]
 
     def _after_a_change(self, state: _State, goal_s: float) -> _State:
         """The state with the accelerations after nodes are let go."""
@@ -137,9 +140,8 @@ class _Stepper:
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
-        theta, h = self.theta, end_s - state.t_s
-        forces = Forces.of(self.experiment, load_s)
-        mass = forces.mass.row(0, theta)
+        h, forces = end_s - state.t_s, self._forces(load_s)
+        mass = forces.mass.kg[0]
         carried = state.memory.ahead(h) if state.memory else None
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
@@ -154,11 +156,11 @@ class _Stepper:
 
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            return forces.total(x, v, theta, carried)[0] - mass * a
+            return forces.total(x, v, carried)[0] - mass * a
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
-            at = forces.linearise(x, v, theta, carried=carried)
+            at = forces.linearise(x, v, carried=carried)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
             matrix[forces.pattern.diagonal] += slope**2 * mass
             return at.force[0] - mass * a, matrix, -at.by_position_skew[0]

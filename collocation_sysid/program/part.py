@@ -102,7 +102,7 @@ class Part:
     def forces(self) -> Linearisation:
         """Those of the evaluations with their slopes, valid until others are formed."""
         rows = self.segment.linearisation_rows
-        return self.setting.dynamics.linearise(self.x, self.setting.theta, rows)
+        return self.setting.dynamics.linearise(self.x, rows)
 
     @property
     def residual_n(self) -> Array:

@@ -65,10 +65,10 @@ class HeldForces:
         self.force[:done], self.slopes[:done] = known.force, known.slopes
 
 
-def forces_on(dynamics: Dynamics, x: Array, theta: Array, dofs: Index) -> Array:
+def forces_on(dynamics: Dynamics, x: Array, dofs: Index) -> Array:
     """F (N, g) on some dofs at the evaluations of x (N, 3n), also those that grasps take."""
     force = np.zeros((len(x), len(dofs)))
-    force[dynamics.first_row :] = dynamics.force(x, theta)[:, dofs]
+    force[dynamics.first_row :] = dynamics.force(x)[:, dofs]
     return force
 
 

@@ -90,7 +90,7 @@ class Reactions(Carried):
         setting, motion = part.setting, self._motion
         dynamics, first = setting.dynamics, setting.dynamics.first_row
         by_x = np.empty(motion.band.nnz)
-        motion.fill(by_x, part.forces, dynamics, setting.theta, setting.mass_moves)
+        motion.fill(by_x, part.forces, dynamics, setting.mass_moves)
         by_p = np.zeros((len(part.x), self.shape[1], len(self.segment.moving)))
         slopes = setting.force_slopes(slice(first, None), part.forces.by_theta)
         by_p[first:] = slopes[:, self.dofs]
@@ -99,6 +99,6 @@ class Reactions(Carried):
         by_p -= setting.inertia_slopes(slice(None), acceleration, self.dofs)
         force = np.zeros(acceleration.shape)
         force[first:] = part.forces.force[:, self.dofs]
-        mass_kg = dynamics.mass.at(setting.theta)[:, self.dofs]
+        mass_kg = dynamics.mass.kg[:, self.dofs]
         rows = z[self.variables] - self._scaled(reactions(dynamics, mass_kg, force, acceleration))
         return rows, np.concatenate([by_x, np.ones(self.count), self._scaled(by_p)])

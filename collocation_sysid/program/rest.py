@@ -36,7 +36,7 @@ def rest_state(
     solver = solver or Solver(experiment)
     at_s = float(experiment.t_s[0] if time_s is None else time_s)
     body = experiment.body
-    forces = Forces.of(experiment, at_s)
+    forces = Forces.of(experiment, at_s, theta)
     still = np.zeros((1, body.pattern.size))
     shape = experiment.rigid_positions([at_s])[0]
     carried = start_carried(body, theta, experiment.loaded_since_s)
@@ -45,11 +45,11 @@ def rest_state(
         loaded = forces.scaled(share)
 
         def residual(state: Array) -> Array:
-            return loaded.total(state, still, theta, carried)[0]
+            return loaded.total(state, still, carried)[0]
 
         def linearise(state: Array) -> tuple[Array, Array, Array]:
             # Nothing moves: there is no skew part.
-            at = loaded.linearise(state, still, theta, carried=carried)
+            at = loaded.linearise(state, still, carried=carried)
             return at.force[0], -at.by_position[0], NONE
 
         goal = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]

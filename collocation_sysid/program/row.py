@@ -40,8 +40,8 @@ class Row:
     mass_kg: Array
 
     @classmethod
-    def of(cls, dynamics: Dynamics, t: int, theta: Array) -> Row:
-        """Row t of the tables, with the mass at θ."""
+    def of(cls, dynamics: Dynamics, t: int) -> Row:
+        """Row t of the tables, with its mass."""
         tables, step_s = dynamics.tables, dynamics.step_s
         return cls(
             tuple(tables.p[t].tolist()),
@@ -49,7 +49,7 @@ class Row:
             tuple(tables.w[t].tolist()),
             tuple((tables.s[t] / step_s**2).tolist()),
             float(tables.r[t]) / step_s,
-            dynamics.mass.row(t, theta),
+            dynamics.mass.own_kg + dynamics.mass.tied_kg[t],
         )
 
     @cached_property

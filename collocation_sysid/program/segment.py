@@ -324,11 +324,11 @@ class Segment:
     @cached_property
     def force_n(self) -> float:
         """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
-        dynamics, at_rest = self.dynamics, self.body.nodes_m.reshape(1, -1)
-        theta, last = self.constants.theta(self.parameters.guess_q), dynamics.rows - 1
-        at_last = dynamics.forces.rows(slice(last, None))
-        forces = at_last.linearise(at_rest, np.zeros_like(at_rest), theta)
-        last, pattern = Row.of(dynamics, last, theta), self.pattern
+        theta, at_rest = self.constants.theta(self.parameters.guess_q), self.body.nodes_m
+        dynamics, pattern = self.dynamics.with_theta(theta), self.pattern
+        at_last = dynamics.forces.rows(slice(dynamics.rows - 1, None))
+        forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
+        last = Row.of(dynamics, dynamics.rows - 1)
         block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
@@ -366,7 +366,7 @@ class Segment:
         p = np.concatenate([q, phi[self.nuisance.moving]])
         u, by_p = self.inputs.at(p)
         dynamics, held = self.dynamics.at(u), self.grasping.at(phi)
-        return Setting(self.inputs, p, self.nq, u, by_p, dynamics, held)
+        return Setting(self.inputs, p, self.nq, by_p, dynamics, held)
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -407,7 +407,7 @@ class Segment:
 
     def constraint_values(self, x: Array, setting: Setting) -> Array:
         """(constraints,) scaled rows at x (N, 3n) in metres."""
-        return self._rows(x, setting.dynamics.residual(x, setting.theta), setting)
+        return self._rows(x, setting.dynamics.residual(x), setting)
 
     def _rows(self, x: Array, residual: Array, setting: Setting) -> Array:
         rows = residual / self.force_n
@@ -429,7 +429,7 @@ class Segment:
 
     def residual_n(self, x: Array, setting: Setting) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
-        residual = setting.dynamics.residual(x, setting.theta)
+        residual = setting.dynamics.residual(x)
         return self.dynamics.without_taken(residual)[:, self.free_dofs]
 
     @cached_property
@@ -460,7 +460,7 @@ class Segment:
         by_p : (constraints, len(moving)) ∂c/∂(q, φ), where it is not zero
         """
         dynamics = setting.dynamics
-        self.motion_rows.fill(values, forces, dynamics, setting.theta, setting.mass_moves)
+        self.motion_rows.fill(values, forces, dynamics, setting.mass_moves)
         by_p = np.zeros((self.grid_rows, self.dofs, len(self.moving)))
         rows = slice(dynamics.first_row, None)
         by_p[rows] = setting.force_slopes(rows, forces.by_theta)
@@ -474,7 +474,7 @@ class Segment:
         if setting.held.moves:
             by_p[:, setting.held.dofs, self.nq :] -= setting.held.by_phi / self.length_m
         by_p = by_p[dynamics.first_row :, self.row_dofs]
-        rows = self._rows(x, dynamics.assemble_residual(x, setting.theta, forces.force), setting)
+        rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
     def weights(self, multipliers: Array, of_reactions: Array | float = 0.0) -> Weights:
@@ -501,7 +501,7 @@ class Segment:
     ) -> tuple[Array, Array]:
         """Slopes of Σ weights · F through the memory, by x and by q, at weights (N, 3n)."""
         dynamics = setting.dynamics
-        history = dynamics.history(x, setting.theta)
+        history = dynamics.history(x)
         if history is None:
             return np.zeros_like(x), np.zeros(self.nq)
         by_xi, by_q = history.pulled(weights, setting.theta_q)
@@ -644,11 +644,11 @@ class Segment:
         dynamics = setting.dynamics
         xi = dynamics.combine(dynamics.state_weights, x)
         nu = dynamics.combine(dynamics.tables.q, x) / dynamics.step_s
-        history = dynamics.history(x, setting.theta) if memory_weights else None
+        history = dynamics.history(x) if memory_weights else None
         past = history and history.carried(slice(None))
         sigma = history and history.stress_weights(memory_weights)
-        rows, theta = self._curvature_rows, setting.theta
-        curvature = dynamics.forces.curvature(xi, nu, weights, theta, rows, past, sigma)
+        rows = self._curvature_rows
+        curvature = dynamics.forces.curvature(xi, nu, weights, rows, past, sigma)
         if history:
             history.add_curvature(curvature, memory_weights)
         return curvature

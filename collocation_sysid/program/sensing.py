@@ -54,15 +54,14 @@ class Sensing:
 
     def _forced(self, x: Array) -> Forced:
         dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
-        force, mass_kg = forces_on(dynamics, x, self.setting.theta, dofs), self._mass_kg[: len(x)]
+        force, mass_kg = forces_on(dynamics, x, dofs), self._mass_kg[: len(x)]
         reaction = reactions(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
         return Forced(reaction, x[:, dofs])
 
     @property
     def _mass_kg(self) -> Array:
         """(N, g) of the sensed dofs."""
-        dynamics = self.setting.dynamics
-        return dynamics.mass.at(self.setting.theta)[:, self.segment.sensed_dofs]
+        return self.setting.dynamics.mass.kg[:, self.segment.sensed_dofs]
 
     # Along the equations of motion ------------------------------------------------------------
 
@@ -159,7 +158,7 @@ class Sensing:
         dynamics, t = setting.dynamics, setting.dynamics.tables
         first, whole = dynamics.first_row, np.zeros_like(x)
         whole[:, dofs] = -dynamics.combine_transposed(t.w, weights)
-        at = dynamics.linearise(x, setting.theta, segment.linearisation_rows)
+        at = dynamics.linearise(x, segment.linearisation_rows)
         slopes = setting.force_slopes(slice(first, None), at.by_theta)
         by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
         if setting.mass_moves:

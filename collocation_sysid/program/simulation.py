@@ -117,13 +117,13 @@ def simulate(
         at = Grid.at(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:
         taken = 1 if experiment.static else substeps
-        dynamics = Dynamics.of(experiment, integrator, taken)
-        grid = march(experiment, dynamics, theta, options, progress)
+        dynamics = Dynamics.of(experiment, integrator, taken).with_theta(theta)
+        grid = march(experiment, dynamics, options, progress)
         x = grid[::taken]
         still = np.zeros_like(grid)
         v = still if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::taken]
-        at, force = Grid.of(dynamics), forces_on(dynamics, grid, theta, sensed)
-        mass_kg, acceleration = dynamics.mass.at(theta)[:, sensed], dynamics.acceleration(grid)
+        at, force = Grid.of(dynamics), forces_on(dynamics, grid, sensed)
+        mass_kg, acceleration = dynamics.mass.kg[:, sensed], dynamics.acceleration(grid)
         reaction = reactions(dynamics, mass_kg, force, acceleration[:, sensed])
         forced = Forced(reaction, grid[:, sensed])
     shape = (len(x), -1, 3)

@@ -75,7 +75,7 @@ def _instability(part: Part) -> Instability | None:
     held, theta = experiment.held(t_s).reshape(len(t_s), -1), part.setting.theta
     growths = np.array(
         [
-            growth_rate_1_s(Forces.of(experiment, time), x, np.flatnonzero(~there), theta)
+            growth_rate_1_s(Forces.of(experiment, time, theta), x, np.flatnonzero(~there))
             for time, x, there in zip(t_s, part.x[rows], held, strict=True)
         ]
     )
@@ -86,7 +86,7 @@ def _instability(part: Part) -> Instability | None:
     return Instability(experiment.name, float(t_s[worst]), float(growths[worst]), e_foldings)
 
 
-def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, theta: Array) -> float:
+def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     """The largest Re(s) of M s² + D s + K at a state; 0 where none is positive.
 
     Parameters
@@ -94,13 +94,12 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, theta: Array) ->
     forces : Forces at one time
     x : (3n,) the state
     free_dofs : (k,) sorted dofs that are not held
-    theta : (k,) constants of the body
     """
     if not len(free_dofs):
         return 0.0
     state = x.reshape(1, -1)
-    at = forces.linearise(state, np.zeros_like(state), theta)
-    mass, pattern = forces.mass.row(0, theta)[free_dofs], forces.pattern
+    at = forces.linearise(state, np.zeros_like(state))
+    mass, pattern = forces.mass.kg[0, free_dofs], forces.pattern
     lowers = -at.by_position[0], -at.by_velocity[0]
     if all(_definite(lower, pattern, free_dofs, mass) for lower in lowers):
         return 0.0

@@ -328,7 +328,7 @@ class Sweep:
         """
         reach, free, y = self.dynamics.reach, self.free, np.zeros_like(x)
         pulled = -gradient[:, free]  # what is left for the rows that are still to come
-        history = self.dynamics.history(x, setting.theta)
+        history = self.dynamics_at(setting).history(x)
         weights, later = Weights(history) if history else None, deque[Row](maxlen=reach)
         for chunk in self.chunks(x, setting, backward=True, history=history):
             for step in reversed(chunk.steps):
@@ -397,7 +397,7 @@ class Sweep:
         history: History | None = None,
     ) -> Iterator[Chunk]:
         """Blocks and factors of every row from `first` on, computed side by side."""
-        dynamics, theta = self.dynamics_at(setting), setting.theta
+        dynamics = self.dynamics_at(setting)
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
@@ -407,9 +407,9 @@ class Sweep:
             with self.stopwatch.evaluating():
                 forces = setting.dynamics.forces.rows(here)
                 carried = dynamics.carried(history, here)
-                at = forces.linearise(xi[seen], nu[seen], theta, carried=carried)
+                at = forces.linearise(xi[seen], nu[seen], carried=carried)
             with self.stopwatch.solving():
-                rows = [Row.of(dynamics, t, theta) for t in range(start, here.stop)]
+                rows = [Row.of(dynamics, t) for t in range(start, here.stop)]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
             numbers = range(start, here.stop)
             parts = numbers, rows, at.force, at.by_position, at.by_velocity, factors
@@ -489,8 +489,8 @@ class Forward:
     def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
         """Y_t (3n, c) at x (N, 3n) after rows that are done, also into `out` (N, 3n, c)."""
         solver, columns, setting = self.solver, self.columns, self.columns.setting
-        dynamics, first = solver.dynamics, solver.dynamics.first_row
-        history, acceleration = dynamics.history(x, setting.theta), dynamics.acceleration(x)
+        dynamics, first = solver.dynamics_at(setting), solver.dynamics.first_row
+        history, acceleration = dynamics.history(x), dynamics.acceleration(x)
         if history is not None:
             self.slopes = Slopes(history, columns.theta, done, self._overstress)
         for t in range(done, first):  # the start is given

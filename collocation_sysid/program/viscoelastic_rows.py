@@ -127,7 +127,7 @@ class Overstress(Carried):
         return [mu[:, branch.own] for branch in self.branches]
 
     def _history(self, part: Part) -> History:
-        history = part.setting.dynamics.history(part.x, part.setting.theta)
+        history = part.setting.dynamics.history(part.x)
         assert history is not None
         return history
 
@@ -304,7 +304,7 @@ class Overstress(Carried):
         segment, setting = self.segment, part.setting
         theta_q = setting.theta_q
         by_q = np.zeros((segment.nq, *self.shape))
-        recursions = setting.dynamics.recursions(setting.theta)
+        recursions = setting.dynamics.recursions
         for r, mu in zip(recursions, self.memory_weights(multipliers), strict=True):
             fading = theta_q[[r.branch.share, r.branch.tau]].T @ r.by[1][:, 1:]
             by_q[:, :, r.branch.own] = np.einsum("qt,tp->qtp", fading, mu[1:])

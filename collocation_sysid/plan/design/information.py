@@ -209,8 +209,7 @@ class Recording:
         known = self._starts.get(q.tobytes())  # every motion starts from the same rest
         x, failure = march_on(
             experiment,
-            segment.dynamics,
-            segment.constants.theta(q),
+            segment.dynamics.with_theta(segment.constants.theta(q)),
             known,
             NewtonOptions(tolerance=TOLERANCE),
         )

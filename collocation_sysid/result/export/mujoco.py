@@ -254,8 +254,8 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
     oscillating = squares[squares > 1e-9 * squares[-1]]
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
-    forces = Forces.of(body.experiment, body.start_s)
-    ours = natural_modes(body.body, body.nodes_m, dofs, body.theta, 1, forces).frequencies_hz
+    forces = Forces.of(body.experiment, body.start_s, body.theta)
+    ours = natural_modes(forces, body.nodes_m, dofs, 1).frequencies_hz
     return Comparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
 
 

@@ -99,8 +99,7 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
     time_s = float(experiment.t_s[least])
     x, about = _state(experiment, held[least], time_s, theta)
     free = np.flatnonzero(~held[least])
-    forces = Forces.of(experiment, time_s)
-    modes = natural_modes(experiment.body, x, free, theta, COUNT, forces)
+    modes = natural_modes(Forces.of(experiment, time_s, theta), x, free, COUNT)
     findings = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
     if findings:
