@@ -4,10 +4,9 @@ from . import live
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
-from .fem.materials import Material
+from .fem.materials import Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
-from .fem.prony import Prony
 from .fem.regions import Region
 from .fem.selection import Ball, Box, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh

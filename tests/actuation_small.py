@@ -9,8 +9,8 @@ from scipy.sparse.linalg import spsolve
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.mesh_checks import orient
+from collocation_sysid.fem.shape import Volume
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.fem.volume import Volume
 
 
 def box_with_cavity() -> TetMesh:

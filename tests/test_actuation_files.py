@@ -14,7 +14,7 @@ from problems_small import smooth_poses, times
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.volume import Volume
+from collocation_sysid.fem.shape import Volume
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data

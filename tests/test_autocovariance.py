@@ -9,10 +9,8 @@ import pytest
 from fits_small import Problem, autoregressive, problem
 from scipy.linalg import block_diag, toeplitz
 
-from collocation_sysid.statistics.autocorrelation import error_processes
-from collocation_sysid.statistics.autocovariance import lagged_products
-from collocation_sysid.statistics.information import information
-from collocation_sysid.statistics.linearised import LinearisedFit
+from collocation_sysid.statistics.autocorrelation import error_processes, lagged_products
+from collocation_sysid.statistics.linearised import LinearisedFit, information
 
 LAG = 2
 PROBLEMS = {

@@ -12,8 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
 from collocation_sysid.statistics.autocorrelation import dependence, error_processes
-from collocation_sysid.statistics.information import information
-from collocation_sysid.statistics.linearised import LinearisedFit
+from collocation_sysid.statistics.linearised import LinearisedFit, information
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
 DRAWS = 60

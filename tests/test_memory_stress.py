@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.materials import Prony
 from collocation_sysid.fem.memory import Branch, fading
-from collocation_sysid.fem.prony import Prony
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.viscoelasticity import History, Recursion, Remembered

@@ -15,8 +15,8 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.elements import EDGES
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.quadratic import EDGES
 from collocation_sysid.fem.selection import Named
 from collocation_sysid.fem.structured import box_mesh
 

@@ -12,7 +12,7 @@ import pytest
 from fits_small import PARAMETERS, Problem, problem
 from scipy.stats import binom, kstest
 
-from collocation_sysid.statistics.information import information
+from collocation_sysid.statistics.linearised import information
 from collocation_sysid.statistics.noise import noise_level
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 

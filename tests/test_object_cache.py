@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from collocation_sysid.fem.kernels import object_cache
+from collocation_sysid.fem.kernels import jit
 
 CODE = b"\x7fELF and so on"
 
@@ -14,20 +14,20 @@ CODE = b"\x7fELF and so on"
 def folder(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "deep" / "kernels"
     monkeypatch.setenv("COLLOCATION_SYSID_CACHE", str(folder))
-    object_cache._warn.cache_clear()
+    jit._warn.cache_clear()
     return folder
 
 
 def entry(folder: Path) -> Path:
-    object_cache.store("key", CODE)
+    jit.store("key", CODE)
     (found,) = folder.iterdir()
     return found
 
 
 def test_what_is_stored_is_loaded_by_its_key_alone():
-    object_cache.store("key", CODE)
-    assert object_cache.load("key") == CODE
-    assert object_cache.load("other") is None
+    jit.store("key", CODE)
+    assert jit.load("key") == CODE
+    assert jit.load("other") is None
 
 
 def test_folders_and_files_that_it_makes_are_the_users_alone(folder):
@@ -41,39 +41,39 @@ def test_folders_and_files_that_it_makes_are_the_users_alone(folder):
 
 
 def test_object_of_another_key_in_its_place_is_refused(folder):
-    object_cache.store("foreign", b"does something else")
+    jit.store("foreign", b"does something else")
     (foreign,) = folder.iterdir()
-    foreign.rename(folder / object_cache._file_name("key"))
-    assert object_cache.load("key") is None
+    foreign.rename(folder / jit._file_name("key"))
+    assert jit.load("key") is None
 
 
 @pytest.mark.parametrize("content", [b"", CODE, b"\0" * 32 + CODE])
 def test_object_without_its_digest_is_refused(folder, content):
     entry(folder).write_bytes(content)
-    assert object_cache.load("key") is None
+    assert jit.load("key") is None
 
 
 def test_file_that_others_can_write_is_refused(folder):
     entry(folder).chmod(0o666)
-    assert object_cache.load("key") is None
+    assert jit.load("key") is None
 
 
 def test_link_and_pipe_are_refused_at_once(folder):
     file = entry(folder)
     moved = file.rename(folder.parent / "elsewhere.o")
     file.symlink_to(moved)
-    assert object_cache.load("key") is None
+    assert jit.load("key") is None
     file.unlink()
     os.mkfifo(file)
-    assert object_cache.load("key") is None
+    assert jit.load("key") is None
 
 
 def test_folder_that_others_can_write_is_neither_read_nor_written(folder):
     entry(folder)
     folder.chmod(0o777)
     with pytest.warns(RuntimeWarning, match=r"kernels can be written by others; set COLLOC"):
-        assert object_cache.load("key") is None
-    object_cache.store("another", CODE)
+        assert jit.load("key") is None
+    jit.store("another", CODE)
     assert len(list(folder.iterdir())) == 1
 
 
@@ -81,13 +81,13 @@ def test_parent_that_others_can_write_is_refused_unless_sticky(folder):
     entry(folder)
     folder.parent.chmod(0o777)
     with pytest.warns(RuntimeWarning, match=r"deep, which .*kernels is in, can be written"):
-        assert object_cache.load("key") is None
+        assert jit.load("key") is None
     folder.parent.chmod(0o1777)
-    assert object_cache.load("key") == CODE
+    assert jit.load("key") == CODE
 
 
 def test_folder_of_another_user_is_refused(folder, monkeypatch):
     entry(folder)
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     with pytest.warns(RuntimeWarning, match="belongs to another user"):
-        assert object_cache.load("key") is None
+        assert jit.load("key") is None

@@ -14,8 +14,7 @@ import collocation_sysid as cs
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Wrench
-from collocation_sysid.statistics.diagnostics import diagnose
-from collocation_sysid.statistics.outliers import set_apart
+from collocation_sysid.statistics.diagnostics import diagnose, set_apart
 from collocation_sysid.statistics.trust import Trust, fit_concerns
 from collocation_sysid.statistics.uncertainty import uncertainty_of
 

@@ -17,8 +17,7 @@ from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.result.pictures.mesh import mesh_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.warm_start import Earlier
-from collocation_sysid.statistics.places import Place, places_of
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import Place, covariance, places_of
 
 PLACES_M = {"low": [0.0, 0.0, 0.0], "mid": [0.03, 0.02, 0.03], "side": [0.06, 0.06, 0.03]}
 # One as it is, one 4 mm off, one not given.

@@ -34,7 +34,7 @@ from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.sensitivity import sensitivities
+from collocation_sysid.statistics.linearised import sensitivities
 
 GRADIENTS = ("forward", "adjoint")
 

@@ -10,8 +10,8 @@ from scipy.sparse.linalg import ArpackNoConvergence
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import GAMMA_R
-from collocation_sysid.fem.damping import Damping
 from collocation_sysid.fem.kernel import mirrored
+from collocation_sysid.fem.materials import Damping
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameter, Parameters

@@ -50,7 +50,7 @@ from collocation_sysid.result.terminal import check_table, summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import Rollout
-from collocation_sysid.statistics.stillness import stillness_notes
+from collocation_sysid.statistics.scale import stillness_notes
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])

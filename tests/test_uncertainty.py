@@ -25,7 +25,7 @@ from collocation_sysid.program.marching import march
 from collocation_sysid.program.segment import Segment
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.statistics.sensitivity import marker_sensitivities, sensitivities
+from collocation_sysid.statistics.linearised import marker_sensitivities, sensitivities
 from collocation_sysid.statistics.uncertainty import covariance
 
 AT_TRUTH = GUESS.with_guess(TRUTH)

@@ -27,15 +27,13 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from .damping import Damping
 from .discretisation import Discretisation
-from .materials import Energy, Material
+from .materials import Damping, Energy, Material, Prony
 from .memory import Past
 from .mesh import TetMesh
 from .model import Model, Theta
 from .node_force import NodeForce, PlacedForce
 from .pattern import Joined, SymmetricPattern
-from .prony import Prony
 from .regions import Part, Region, parts_of
 from .selection import Selection
 from .stress import Stresses

@@ -15,10 +15,9 @@ from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
 from .kernels import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .memory import Past, PointLayout
-from .mesh import TetMesh
+from .mesh import Nodes, TetMesh
 from .model import Model, Theta
 from .node_force import NodeForce
-from .nodes import Nodes
 from .pattern import SymmetricPattern, element_destinations, in_ascending_order
 from .regions import Part
 from .selection import Selection

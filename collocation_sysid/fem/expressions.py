@@ -30,12 +30,10 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from .damping import Damping
 from .elements import Element
-from .kernel import PointKernel
-from .materials import Material
+from .kernel import Outputs, Pieces, Point, PointKernel, Term
+from .materials import Damping, Material
 from .mean_dilatation import averaging_kernel
-from .point import Outputs, Pieces, Point, Term
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Hyperelastic materials: a strain-energy density and its constants, in CasADi SX.
+"""Laws of materials in CasADi SX, each with its constants: energy, damping, branches of memory.
 
 A `Material` is a function ``energy(F, **constants) -> ψ`` [J/m³] of the 3 × 3 deformation gradient
 with ψ(I) = 0 and no stress at F = I. Its constants are the function's arguments. Any such function
@@ -8,22 +8,33 @@ Those written in (λ, μ) have the small-strain stiffness of linear elasticity w
 written in isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂ have the volumetric term
 ½ κ (J − 1)². Ogden's is left out: its derivatives by principal stretches are not exact where
 stretches coincide.
+
+A `Damping` law is a potential or a stress of the rate of deformation. Kelvin and Voigt's is
+objective and dissipates at any strain, with viscosities by the small-strain Lamé constants.
+Rayleigh's is the same at small strain, but it also resists that a stretched body turns, and feeds
+energy in where the stiffness is not positive.
+
+Beside it the mass of a region is damped by γ_m, see `body`. What branches of memory do is told in
+`memory`.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 
 from ..errors import InputError, hint_at
 from ..files import reason
-from .constants import Constant, constant_named
+from .constants import GAMMA_R, SHARE, TAU, Constant, constant_named
+from .kernel import mirrored
 
+T = TypeVar("T")
 Energy = Callable[..., ca.SX]
 
 # Share of the stiffness that energy and stress of an undeformed material may be off by.
@@ -237,9 +248,126 @@ def as_material(given: str | Energy | Material) -> Material:
     """
     if isinstance(given, Material):
         return given
-    if not isinstance(given, str):
-        return Material.of(given)
-    if given not in MATERIALS:
-        known = ", ".join(MATERIALS)
-        raise InputError(f"no material {given!r}; available: {known}{hint_at(given, MATERIALS)}")
-    return MATERIALS[given]
+    return _named("material", given, MATERIALS) if isinstance(given, str) else Material.of(given)
+
+
+def _named(kind: str, name: str, table: Mapping[str, T]) -> T:
+    if name not in table:
+        raise InputError(f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}")
+    return table[name]
+
+
+Potential = Callable[..., ca.SX]
+Stress = Callable[..., tuple[ca.SX, ca.SX]]
+# Where the entries of Aᵀ stand in A, both stacked column after column.
+TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
+
+
+@dataclass(frozen=True, eq=False)
+class Damping:
+    """A damping law.
+
+    Attributes
+    ----------
+    name : str
+    constants : tuple of Constant
+    potential : callable, optional
+        ``potential(psi, F, rate, **constants)`` → a density ψ_d linear in the rate Ḟ, from the
+        energy's as an expression in F. The first Piola–Kirchhoff stress of the damping is
+        ∂ψ_d/∂F, and ∂²ψ_d/∂F∂Ḟ must be symmetric. F and Ḟ are stacked (9,); where an element
+        averages the dilatation, its volume and the rate of that follow them.
+    stress : callable, optional
+        In its place, ``stress(psi, F, rate, **constants)`` → that stress P_v (9,), and ∂P_v/∂F
+        (9, 9), which need not be symmetric. P_v must be linear in Ḟ, and ∂P_v/∂Ḟ symmetric.
+    """
+
+    name: str
+    constants: tuple[Constant, ...]
+    potential: Potential | None = field(default=None, repr=False)
+    stress: Stress | None = field(default=None, repr=False)
+
+
+def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """P_v = F S_v, S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹ with η = γ_r μ, ζ = γ_r λ.
+
+    That is the Kirchhoff stress 2η d + ζ (tr d) 1 of the rate of deformation d, the symmetric part
+    of L = Ḟ F⁻¹: what it dissipates, 2η d:d + ζ (tr d)², is positive whatever F.
+    """
+    stiffness, _ = ca.hessian(psi, F)
+    # A linear material knows no difference between the shapes.
+    if not ca.depends_on(stiffness, F):
+        return gamma_r_s * mirrored(stiffness) @ rate, ca.SX(9, 9)
+    lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
+    one, inverse = ca.SX.eye(3), ca.inv_minor(ca.reshape(F, 3, 3))
+    L = ca.reshape(rate, 3, 3) @ inverse
+    P = (shear * (L + L.T) + lame * ca.trace(L) * one) @ inverse.T
+    stress = ca.vec(P)
+    # dF changes L as a rate −L dF would, and F⁻ᵀ by −F⁻ᵀ dFᵀ F⁻ᵀ.
+    slope = -ca.jacobian(stress, rate) @ ca.kron(one, L) - ca.kron(inverse, P)[:, TRANSPOSED]
+    return stress, slope
+
+
+def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
+    """γ_r ∂ψ/∂F:Ḟ, which makes the damping force −γ_r K(x) v."""
+    return gamma_r_s * ca.jtimes(psi, F, rate)
+
+
+DAMPINGS: dict[str, Damping] = {
+    "kelvin-voigt": Damping("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
+    "rayleigh": Damping("rayleigh", (GAMMA_R,), rayleigh),
+}
+
+
+def as_damping(given: str | Damping) -> Damping:
+    """A damping law from a name in `DAMPINGS`, or itself.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    return given if isinstance(given, Damping) else _named("damping", given, DAMPINGS)
+
+
+@dataclass(frozen=True)
+class Prony:
+    """A branch of the memory: a spring of `share` times the stiffness, behind a dashpot.
+
+    Attributes
+    ----------
+    name : str
+        Stands before the names of its constants: ``prony_1.share``, ``prony_1.tau_s``.
+    """
+
+    name: str
+
+    def __post_init__(self) -> None:
+        if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
+            raise InputError(
+                f"the branch's name is {self.name!r}; expected letters, digits, - and _, which "
+                "stand before the names of its parameters"
+            )
+
+    @property
+    def constants(self) -> tuple[Constant, Constant]:
+        """Its share g and its relaxation time τ."""
+        share, tau = (replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU))
+        return share, tau
+
+
+def as_branches(given: Sequence[str | Prony]) -> tuple[Prony, ...]:
+    """Branches from their names, or themselves.
+
+    Raises
+    ------
+    InputError
+        For a name that cannot be one, or is there twice.
+    """
+    if isinstance(given, str):
+        raise InputError(f"prony is {given!r}; expected a sequence of names")
+    branches = tuple(b if isinstance(b, Prony) else Prony(b) for b in given)
+    names = [branch.name for branch in branches]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two branches of a part are named {name!r}; names must differ")
+    return branches

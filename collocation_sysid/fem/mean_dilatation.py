@@ -33,8 +33,7 @@ from functools import cached_property
 
 import casadi as ca
 
-from .kernel import PointKernel, mirrored
-from .point import By, Outputs, Pieces, Point, Term
+from .kernel import By, Outputs, Pieces, Point, PointKernel, Term, mirrored
 
 
 def averaging_kernel(name: str, point: Point, outputs: Outputs) -> PointKernel:

@@ -1,4 +1,7 @@
-"""The tetrahedral mesh: made or read, cleaned and checked once, then never changed."""
+"""The tetrahedral mesh: made or read, cleaned and checked once, then never changed.
+
+A body's `Nodes` are those of the mesh, then one halfway along each edge if the element asks.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array, Index
 from ..errors import InputError
+from .elements import Element
 from .mesh_checks import (
     MeshQuality,
     checked_arrays,
@@ -25,9 +30,16 @@ from .mesh_checks import (
     unique_edges,
 )
 from .mesh_files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
-from .nodes import Nodes
-from .selection import Selection
 from .surface import tetrahedralize_surface
+
+
+class NodeSelection(Protocol):
+    """What chooses nodes, see `selection`."""
+
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes, sorted."""
+        ...
+
 
 _OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
@@ -185,7 +197,7 @@ class TetMesh:
         """Write the mesh, in metres, to any format meshio knows by the file's ending."""
         write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays, self.cell_arrays)
 
-    def select(self, selection: Selection) -> np.ndarray:
+    def select(self, selection: NodeSelection) -> np.ndarray:
         """Return the nodes of a `selection.Selection`, as sorted int64 indices.
 
         Where a body's element has nodes between these, see `Body.select`.
@@ -237,6 +249,15 @@ class TetMesh:
         """Pairs of nodes that share an element, (m, 2) int64, each once, sorted."""
         return _read_only(unique_edges(self.tetrahedra))
 
+    def middles(self, pairs: np.ndarray) -> np.ndarray:
+        """Numbers (…) that nodes halfway between pairs (…, 2) of corners have behind the corners.
+
+        They are in the order of `edges`.
+        """
+        count = len(self.points_m)
+        codes = np.sort(pairs, axis=-1) @ [count, 1]
+        return count + np.searchsorted(self.edges @ [count, 1], codes)
+
     @cached_property
     def sha256(self) -> str:
         """Hash of the points and tetrahedra, as 64 hexadecimal digits."""
@@ -257,3 +278,47 @@ def _read_only(array: np.ndarray) -> np.ndarray:
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Where nodes are, and which of them make up each element.
+
+    Attributes
+    ----------
+    mesh : TetMesh
+        Its nodes are the corners and come first, with their numbers.
+    points_m : (n, 3)
+    cells : (E, nodes per element)
+    ends : (k, 2) the corners at the ends of each mid node's edge: rows of `mesh.edges`, or none
+    """
+
+    mesh: TetMesh
+    points_m: Array
+    cells: Index
+    ends: Index
+
+    @classmethod
+    def corners(cls, mesh: TetMesh) -> Nodes:
+        """Only the mesh's own."""
+        return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
+
+    @classmethod
+    def of_element(cls, mesh: TetMesh, element: Element) -> Nodes:
+        """All that the element has."""
+        if not element.edges:
+            return cls.corners(mesh)
+        points = _read_only(np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)]))
+        middles = mesh.middles(mesh.tetrahedra[:, element.edges])
+        return cls(mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges)
+
+    def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Extend a choice of mesh nodes to mid nodes: chosen when both ends of the edge are."""
+        return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
+
+    def on_faces(self, triangles: Index) -> Index:
+        """Nodes (F, 3) or (F, 6) of triangles of corners: then those on the edges ab, bc, ca."""
+        if not len(self.ends):
+            return triangles
+        pairs = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
+        return np.hstack([triangles, self.mesh.middles(pairs)])

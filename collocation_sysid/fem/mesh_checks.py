@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
+from .elements import EDGES
 
 # Volume over mean edge length cubed; 0.118 for the regular tetrahedron. Below this a
 # single-precision file cannot tell the element from a flat one.
@@ -19,7 +20,10 @@ DEGENERATE_RATIO = 1e-6
 # Beyond all bodies, but volumes are still numbers.
 LARGEST_M = 1e50
 
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+# How far a mid node may lie off the middle, in edge lengths: round-off of a file in single
+# precision, and what may be straightened without asking.
+ROUND_OFF = 1e-5
+SLIGHTLY_CURVED = 0.05
 
 
 def checked_points(points_m: ArrayLike) -> np.ndarray:
@@ -144,7 +148,7 @@ def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
     """Pairs of nodes that share an element, (m, 2), each once, sorted."""
-    return np.unique(np.sort(tetrahedra[:, _EDGES].reshape(-1, 2), axis=1), axis=0)
+    return np.unique(np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0)
 
 
 @dataclass(frozen=True)
@@ -166,7 +170,7 @@ def mean_ratios(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """(E, 6) lengths of the elements' edges."""
-    ends = points[tetrahedra[:, _EDGES]]
+    ends = points[tetrahedra[:, EDGES]]
     return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
 
 
@@ -214,3 +218,48 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
     twins = n - len(np.unique(points, axis=0))
     hint = f"; {twins} of {n} nodes lie exactly on others: merge them" if twins else ""
     return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)
+
+
+def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
+    """Notes on what is lost when quadratic tetrahedra are taken by their corners alone.
+
+    Parameters
+    ----------
+    points_m : (n, 3)
+    cells : (E, 10)
+
+    Returns
+    -------
+    tuple of str
+        Empty where all sides are straight.
+
+    Raises
+    ------
+    InputError
+        If a node does not exist, or a mid node lies further off the middle than those of
+        slightly curved sides.
+    """
+    refuse_unknown_nodes(cells, len(points_m))
+    start_of, end_of = np.array(EDGES).T
+    start, stop = points_m[cells[:, start_of]], points_m[cells[:, end_of]]
+    length = np.linalg.norm(stop - start, axis=2)
+    off = np.linalg.norm(points_m[cells[:, 4:]] - (start + stop) / 2, axis=2)
+    bad = np.argwhere(~(off <= SLIGHTLY_CURVED * length))
+    if len(bad):
+        e, k = bad[0]
+        a, b, mid = cells[e, start_of[k]], cells[e, end_of[k]], cells[e, 4 + k]
+        raise InputError(
+            f"quadratic element {e}: mid node {mid} lies {off[e, k]:.3g} m off the middle of the "
+            f"edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at most "
+            f"{SLIGHTLY_CURVED:.0%} of that ({len(bad)} such in all), since sides are taken as "
+            "straight: refine the mesh, or save it with linear tetrahedra"
+        )
+    curved = off > ROUND_OFF * length
+    if not curved.any():
+        return ()
+    largest = (off[curved] / length[curved]).max()
+    count = len(np.unique(cells[:, 4:][curved]))
+    return (
+        f"Curved sides were straightened: {count} mid nodes lie off the middle of their edges, "
+        f"by up to {largest:.2g} of the edge's length.",
+    )

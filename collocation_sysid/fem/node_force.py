@@ -21,7 +21,7 @@ from ..arrays import Array, Index
 from ..errors import InputError, hint_at
 from ..files import reason
 from .constants import Constant, constant_named
-from .nodes import Nodes
+from .mesh import Nodes
 from .pattern import SymmetricPattern, dofs_of
 from .selection import Indices, Selection
 

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Index
-from .mesh import TetMesh
+from .elements import ELEMENTS
+from .mesh import Nodes, TetMesh
 from .mesh_checks import orient
 from .node_force import NodeForce, PlacedForce
-from .quadratic import EDGES
 from .regions import Region
 from .selection import Ball, Box, Selection
 
 if TYPE_CHECKING:
     from .body import Body
 
-# Each corner keeps a tetrahedron of its own: its mid nodes, in the order of `quadratic.EDGES`.
+# Each corner keeps a tetrahedron of its own: its mid nodes, in the order of `elements.EDGES`.
 _AT_CORNERS = ((0, 4, 6, 7), (1, 4, 5, 8), (2, 5, 6, 9), (3, 7, 8, 9))
 # The octahedron that is left: each of its diagonals, and the other mid nodes around it.
 _DIAGONALS = np.array([(4, 9), (5, 7), (6, 8)])
@@ -33,11 +33,8 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
     `TetMesh.edges`; the eight elements of one follow each other. Masks of nodes hold in the middle
     of an edge where they hold at both ends; other arrays of nodes are left out.
     """
-    count, ends = len(mesh.points_m), mesh.edges
-    points = np.vstack([mesh.points_m, mesh.points_m[ends].mean(axis=1)])
-    pairs = np.sort(mesh.tetrahedra[:, EDGES], axis=2)
-    edge = np.searchsorted(ends @ [count, 1], pairs @ [count, 1])
-    nodes = np.hstack([mesh.tetrahedra, count + edge])
+    finer, ends = Nodes.of_element(mesh, ELEMENTS["tet10"]), mesh.edges
+    points, nodes = finer.points_m, finer.cells
     across = points[nodes[:, _DIAGONALS]]  # (E, 3, 2, 3)
     shortest = np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=2).round(12).argmin(axis=1)
     ring, axis = _AROUND[shortest], _DIAGONALS[shortest]  # (E, 4), (E, 2)
@@ -56,9 +53,7 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
 
 def faces_in_four(faces: Index, mesh: TetMesh) -> Index:
     """Faces (k, 3) of a mesh cut in four, with the nodes of `split_in_eight`."""
-    count, ends = len(mesh.points_m), mesh.edges
-    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
-    nodes = np.hstack([faces, count + np.searchsorted(ends @ [count, 1], pairs @ [count, 1])])
+    nodes = Nodes.of_element(mesh, ELEMENTS["tet10"]).on_faces(faces)
     return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
 
 

@@ -12,10 +12,8 @@ from numpy.typing import ArrayLike
 from ..arrays import Index
 from ..errors import InputError
 from .constants import DENSITY, GAMMA_M, Constant
-from .damping import Damping, as_damping
-from .materials import Energy, Material, as_material
+from .materials import Damping, Energy, Material, Prony, as_branches, as_damping, as_material
 from .mesh import TetMesh
-from .prony import Prony, as_branches
 from .selection import Selection
 
 

@@ -8,15 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import InputError, hint_at
-from .nodes import Nodes
-
-if TYPE_CHECKING:
-    from .nodes import Mesh
+from .mesh import Nodes, TetMesh
 
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
 ROUND_OFF = 1e-9
@@ -50,11 +46,11 @@ class Box:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         return _chosen(self._holds(nodes.points_m), nodes, str(self))
 
-    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
 
-    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted."""
         return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
 
@@ -88,11 +84,11 @@ class Ball:
         )
         return _chosen(self._holds(nodes.points_m), nodes, str(self), nearest)
 
-    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
 
-    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted."""
         return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
 
@@ -142,7 +138,7 @@ class Indices:
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, wanted))
         return _chosen(chosen, nodes, "an empty list of indices")
 
-    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         count = len(mesh.tetrahedra)
         outside = [index for index in self.indices if not 0 <= index < count]
@@ -154,7 +150,7 @@ class Indices:
         chosen = np.isin(np.arange(count), self.indices)
         return _chosen_cells(chosen, mesh, "an empty list of indices")
 
-    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` whose corners are all among the nodes."""
         nodes = self.resolve(Nodes.corners(mesh))
         chosen = np.isin(np.arange(len(mesh.points_m)), nodes)
@@ -178,12 +174,12 @@ class Named:
         mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
         return _chosen(nodes.with_mid_nodes(mask), nodes, what)
 
-    def resolve_cells(self, mesh: Mesh) -> np.ndarray:
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         what = f'cell array "{self.name}"'
         return _chosen_cells(self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what), mesh, what)
 
-    def resolve_faces(self, mesh: Mesh) -> np.ndarray:
+    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted.
 
         They are the triangles of a face set, or those whose corners are all in a point array.
@@ -230,7 +226,7 @@ class Named:
 Selection = Box | Ball | Indices | Named
 
 
-def _chosen_cells(mask: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:
+def _chosen_cells(mask: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
     if not mask.any():
         raise InputError(
             f"{what} selects none of the {len(mask)} cells, by their centres; the body spans "
@@ -246,7 +242,7 @@ def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
     return np.array([there.get(tuple(face), -1) for face in wanted], dtype=np.int64)
 
 
-def _chosen_faces(chosen_nodes: np.ndarray, mesh: Mesh, what: str) -> np.ndarray:
+def _chosen_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
     mask = chosen_nodes[mesh.surface].all(axis=1)
     if not mask.any():
         raise InputError(

@@ -21,10 +21,9 @@ from ..arrays import Array, Index
 from .discretisation import Discretisation
 from .elements import Element
 from .expressions import Law, carried_energy, first_piola, second_piola, six_of
-from .kernel import PointKernel
+from .kernel import Pieces, Point, PointKernel
 from .kernels import COMPILING, Batch, Evaluator
 from .pattern import dofs_of
-from .point import Pieces, Point
 
 
 def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:

@@ -20,8 +20,7 @@ from ..program.simulation import require_steps
 from ..recording import Experiment
 from ..stated import key, stated
 from ..statistics.plausible import oddities
-from ..statistics.scale import scale_notes
-from ..statistics.stillness import stillness_notes
+from ..statistics.scale import scale_notes, stillness_notes
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..checked import Finite, Flag, Positive, Text, Whole
-from ..fem.damping import DAMPINGS
 from ..fem.elements import ELEMENTS
-from ..fem.materials import MATERIALS
+from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.selected import Nodes
 from ..section import Section, Unit, given_keys, require_one, section_of

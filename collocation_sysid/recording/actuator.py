@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
-from ..fem.length import Length
-from ..fem.volume import Volume
+from ..fem.shape import Length, Volume
 from .course import Course
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from ..checked import Finite, Text
 from ..errors import InputError
 from ..fem.refinement import faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
-from ..fem.volume import Volume
+from ..fem.shape import Volume
 from ..stated import Key, key, stated
 from .actuator import Actuator, Placed
 from .course import Course

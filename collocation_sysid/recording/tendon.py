@@ -11,7 +11,7 @@ from pydantic import Field
 from ..arrays import Array
 from ..checked import NotNegative, Text
 from ..errors import InputError
-from ..fem.length import Length
+from ..fem.shape import Length
 from ..section import Vector
 from ..stated import Key, key, stated
 from .actuator import Actuator, Placed

@@ -22,10 +22,9 @@ from ..arrays import Array
 from ..fem.body import Body
 from ..fem.elements import Element
 from ..fem.expressions import kernel_of
-from ..fem.kernel import PointKernel
+from ..fem.kernel import Point, PointKernel, Term
 from ..fem.kernels import Batch, Evaluator
 from ..fem.materials import Material
-from ..fem.point import Point, Term
 
 NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 

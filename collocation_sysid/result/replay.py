@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.constants import bare, symbol_of
-from ..fem.quadratic import EDGES
+from ..fem.elements import EDGES
 from ..files import RESULT_FILE, damage_refused, require_own
 from ..recording.experiment import Experiment
 from ..runs.result import Result

@@ -27,8 +27,8 @@ from ..runs.forward_simulation import Rollout
 from ..statistics.concern import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import Refinement
-from ..statistics.places import Place
 from ..statistics.scale import relative_sentence
+from ..statistics.uncertainty import Place
 from .export.target import Comparison
 from .heartbeat import Heartbeat
 from .remedies import remedies_for

@@ -22,10 +22,9 @@ from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
 from ..statistics.numerical import Refinement
-from ..statistics.places import Place, places_of
 from ..statistics.profile import Profile
 from ..statistics.trust import Trust, cause_concerns, numerical_concerns
-from ..statistics.uncertainty import Uncertainty
+from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
 from .verdict import concerns, expected_rms_m, motions_of

@@ -13,8 +13,8 @@ from ..methods.solution import Timing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import NumericalError
-from ..statistics.places import Place
 from ..statistics.trust import Trust
+from ..statistics.uncertainty import Place
 from ..tree import optional, read
 
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .autocorrelation import ErrorProcess, error_processes
-from .information import information
-from .linearised import FitBlock, LinearisedFit
+from .linearised import FitBlock, LinearisedFit, information
 from .noise import ROUNDING
 
 

@@ -1,10 +1,10 @@
 """What may be described wrongly: the description without a mistake, how it is tried, what is said.
 
 A hypothesis is tried by what is left of the misfit if it holds: by the modes of bodies of many
-stiffnesses (`modal`), by another fit (`causes`), or by the wrench that a fit to the markers alone
-has (`wrench_causes`). What jumps or contradicts itself needs no trial (`sudden`, `plausible`). All
-are ranked by the factor by which the misfit falls. The sentence is looked up by the code, of which
-the first part is the cause.
+stiffnesses (`modal`), by another fit, or by the wrench that a fit to the markers alone has
+(`causes`). What jumps or contradicts itself needs no trial (`plausible`). All are ranked by the
+factor by which the misfit falls. The sentence is looked up by the code, of which the first part is
+the cause.
 """
 
 from __future__ import annotations

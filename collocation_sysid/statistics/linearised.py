@@ -2,6 +2,15 @@
 
 Everything the statistics need to know of a fit. Estimated are the shared parameters, q, and
 possibly nuisance parameters of single experiments, such as the offset of a marker on the body.
+
+How the trajectory follows the parameters, Z = dx/dp with the equations of motion kept, is found
+from the linearised constraints c_x Z + c_p = 0, solved forward in time by `program.sweep`; p are
+the shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
+
+The information is factored, in coordinates where the statistics are simple. With S the slopes of
+all residuals and P the priors' slopes, the information is A = SᵀS + PᵀP. The root L with A⁻¹ = L Lᵀ
+turns S into D = S L, for which DᵀD + LᵀPᵀP L = I: a covariance B of the score Sᵀe becomes L (LᵀB L)
+Lᵀ for the parameters, without any further inverse.
 """
 
 from __future__ import annotations
@@ -14,10 +23,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..fem.kernels import side_by_side
 from ..model.parameters import ThetaMap
-from ..program.collocation import Collocation
+from ..program.collocation import Collocation, Part
+from ..program.lapack import one_blas_thread
+from ..program.least_squares import LeastSquares
+from ..program.reaction import HeldForces
 from ..program.reading import as_weights
-from .sensitivity import responses
+from ..program.sensing import Response
+from ..program.sweep import Sweep
+
+
+def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
+    """dx/dp of each experiment, (N, 3n, m) in metres per unit of p.
+
+    Held dofs have zeros, and so has x_0 unless it is found in equilibrium.
+
+    Raises
+    ------
+    SimulationError
+        Where the equations of a step are singular.
+    """
+    return [
+        np.stack(list(Sweep(part.segment).sensitivities(part.x, part.setting)))
+        for part in collocation.parts(z)
+    ]
+
+
+@one_blas_thread()
+def responses(collocation: Collocation, z: Array) -> list[Response]:
+    """The response of each experiment; needs no more memory than the result.
+
+    Raises
+    ------
+    SimulationError
+        Where the equations of a step are singular.
+    """
+
+    def of(part: Part) -> Response:
+        segment = part.segment
+        held = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), len(segment.moving))
+        rows = Sweep(segment).sensitivities(part.x, part.setting, held)
+        return part.sensing.read_along(rows, held)
+
+    return side_by_side(of, collocation.parts(z), collocation.threads)
+
+
+def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
+    """d(markers)/dp of each experiment at its samples, (T, 3M, m), see `Response`."""
+    return [response.looked[0] for response in responses(collocation, z)]
+
 
 Mask = NDArray[np.bool_]
 
@@ -208,3 +263,51 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
         derived=Derived.of((s.constants for s in collocation.segments), p[: collocation.nq]),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What residuals and priors say of all parameters, by the r directions that are determined.
+
+    Those that ended at a bound are free here like the others: had the noise been another, they
+    would not have, and what they can take from the others belongs to these others' error.
+
+    Attributes
+    ----------
+    fit : LeastSquares
+        Its root is L.
+    slopes : of each experiment (T, 3M, r), D = S L; zero where missing
+    prior : (r, r) Lᵀ PᵀP L
+    """
+
+    fit: LeastSquares
+    slopes: tuple[Array, ...]
+    prior: Array
+
+    @property
+    def fitted(self) -> float:
+        """Number of parameters the data determine; one that a prior determines counts in part."""
+        return float(sum(np.sum(slope**2) for slope in self.slopes))
+
+
+def information(fit: LinearisedFit) -> Information:
+    """Factor the information of a fit."""
+    all_rows = least_squares(fit)
+    slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
+    prior = all_rows.root * fit.prior_slope[:, None]
+    return Information(all_rows, slopes, prior.T @ prior)
+
+
+def least_squares(fit: LinearisedFit) -> LeastSquares:
+    """Residuals and priors by a step of all parameters."""
+    found = LeastSquares.none(len(fit.names)).add(fit.prior_residual, np.diag(fit.prior_slope))
+    for block in fit.blocks:
+        residual, slope, _ = block.channels
+        found = found.add(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
+    return found
+
+
+def best_step(fit: LinearisedFit) -> Array:
+    """(p,) step of all parameters to the least squares of what is linearised."""
+    free = np.full(len(fit.names), np.inf)
+    return least_squares(fit).best(-free, free)

@@ -1,6 +1,6 @@
 """How large the errors are against the σ given, marker by marker; forces and torques count as such.
 
-The residuals are r = M e + D Lᵀ Pᵀ e_P with M = I − D Dᵀ (see `information`) and e_P the errors of
+The residuals are r = M e + D Lᵀ Pᵀ e_P with M = I − D Dᵀ (see `linearised`) and e_P the errors of
 the priors. If the errors of marker m have s_m² times the variance given, its residuals have
 
     E Σ r_m² = Σ_n s_n² tr(M_mn M_nm) + tr(G_m LᵀPᵀP L) + what is expected besides,
@@ -21,8 +21,7 @@ import numpy as np
 
 from ..arrays import Array
 from .distributions import chi2_cdf, chi2_sf
-from .information import Information
-from .linearised import FitBlock, LinearisedFit
+from .linearised import FitBlock, Information, LinearisedFit
 
 Noise = Literal["given", "estimated", "by-marker"]
 # (K, T, M, 3) of each block: samples of what adds to the residuals, in units of σ; or None.

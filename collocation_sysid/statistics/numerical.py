@@ -18,7 +18,7 @@ they should: then the largest of them is taken. The ends of the interval of 95 %
 n being the half width for the noise and u what each Δ may be wrong by on that side.
 
 Cheaper is a Gauss–Newton step towards a finer simulation with the answer's parameters, d being what
-half the step changes of the residuals: −A⁻¹ Sᵀ d, see `information`, to first order. That takes the
+half the step changes of the residuals: −A⁻¹ Sᵀ d, see `linearised`, to first order. That takes the
 place of the change with half the step.
 
 From what one step a sample leaves follows how many leave little enough: an error of order p falls
@@ -36,8 +36,7 @@ import numpy as np
 from ..arrays import Array
 from ..fem.constants import bare
 from .estimates import Estimate
-from .information import best_step
-from .linearised import FitBlock, LinearisedFit
+from .linearised import FitBlock, LinearisedFit, best_step
 
 # Roache's factor of safety for an observed order.
 OBSERVED = 1.25

@@ -1,13 +1,29 @@
-"""Sizes and densities that soft objects can have: a unit mistaken shows here first."""
+"""What contradicts itself or what is known of soft bodies: told by the description and data alone.
+
+- Sizes and densities that soft objects can have: a unit mistaken shows here first.
+- A body that is deformed takes work: loads that fall as their grasp goes on have a wrong sign.
+- Sudden lasting steps, of a pose that the markers do not follow, or of one marker alone. A step of
+  h between two samples shows in the second differences as h followed by −h; a motion that starts or
+  stops suddenly shows one of them only.
+- Markers that take each other's names at some sample, as trackers do after an occlusion. Seen from
+  the grasp a marker is, from one sample to the next, nearly where it was: where the names suit far
+  better in another order, they have been exchanged. The first order is taken for right, unless
+  another lasts more than twice as long.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterator
 
-from ..arrays import Array
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.moduli import engineering
+from ..program.any_stiffness import carrying
+from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
 DENSITIES_KG_M3 = (10.0, 25_000.0)
@@ -73,3 +89,183 @@ def odd_material(body: Body, theta: Array) -> str | None:
 
 def _outside(value: float, limits: tuple[float, float]) -> float:
     return max(limits[0] / value, value / limits[1])
+
+
+# Of load and displacement; noise and hysteresis leave it above zero.
+AGAINST = -0.8
+FEWEST_SAMPLES = 3
+
+
+def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Displacements of a static experiment whose own load goes the other way.
+
+    What moves may be pushed against its displacement, by its inertia.
+    """
+    for k, grasp in enumerate(experiment.grasps if experiment.static else (), start=1):
+        if grasp.wrench is None:
+            continue
+        shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
+        for axis in grasp.zero:
+            along = "xyz".index(axis)
+            moved_m, load_n = shifts_m[:, along], grasp.wrench.values[:, along]
+            there = np.isfinite(load_n)
+            if there.sum() < FEWEST_SAMPLES or not (
+                np.ptp(moved_m[there]) and np.ptp(load_n[there])
+            ):
+                continue
+            together = float(np.corrcoef(moved_m[there], load_n[there])[0, 1])
+            if together < AGAINST:
+                data = {"axis": axis, "grasp": k, "correlation": together}
+                strength = 1 / (1 + together + 1e-3)
+                yield Hypothesis("sign", f"'{experiment.name}'", data, strength=strength)
+
+
+# A step is so many times what else happens between samples.
+SUDDEN = 4.0
+# Of all samples, the liveliest tenth tells what else happens.
+LIVELY = 0.9
+FEWEST = 8
+
+
+def steps(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Poses that jump and markers that slip."""
+    if len(experiment.markers.positions_m) < FEWEST:
+        return
+    if (grasp := carrying(experiment)) is not None:
+        yield from _jump(experiment, grasp.poses.carry(_corners(experiment), experiment.t_s))
+    yield from _slips(experiment)
+
+
+def _corners(experiment: Experiment) -> Array:
+    """Corners of the markers' places on the undeformed body, which poses carry."""
+    places = experiment.markers.observe(experiment.body.nodes_m)
+    return np.vstack([places.min(axis=0), places.max(axis=0)])
+
+
+def step_sizes(x: Array) -> Array:
+    """(T − 3, M) size of a step between samples k + 1 and k + 2 of x (T, M, 3); NaN in gaps."""
+    second = x[2:] - 2 * x[1:-1] + x[:-2]
+    opposite = -np.sum(second[:-1] * second[1:], axis=2)
+    return np.sqrt(np.maximum(opposite, 0.0))
+
+
+def _jump(experiment: Experiment, carried: Array) -> Iterator[Hypothesis]:
+    sizes = step_sizes(carried).max(axis=1)
+    k = int(sizes.argmax())
+    markers = step_sizes(experiment.markers.positions_m)[k]
+    moved = np.linalg.norm(np.diff(carried, 2, axis=0), axis=2).max(axis=1)
+    sigma_m = float(np.median(experiment.markers.sigma_m))
+    if np.isfinite(markers).any():
+        usual_m = max(_lively(moved), float(np.nanmedian(markers)), 2 * sigma_m)
+        yield from _sudden("pose-jump", experiment, k, float(sizes[k]), usual_m)
+
+
+def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
+    markers = experiment.markers
+    sizes = step_sizes(markers.positions_m)
+    for m, name in enumerate(markers.names):
+        if not np.isfinite(sizes[:, m]).any():
+            continue
+        k = int(np.nanargmax(sizes[:, m]))
+        others, size_m = np.delete(sizes[k], m), float(sizes[k, m])
+        most_m = float(others[np.isfinite(others)].max(initial=0.0))
+        usual_m = max(_lively(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
+        if _lasts(markers.positions_m, m, k + 2, size_m):
+            yield from _sudden("marker-slip/alone", experiment, k, size_m, usual_m, name)
+
+
+def _sudden(
+    code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
+) -> Iterator[Hypothesis]:
+    """A step between samples k + 1 and k + 2, if it is far larger than what is usual."""
+    data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
+    if size_m >= SUDDEN * usual_m:
+        yield Hypothesis(code, f"'{experiment.name}'", data, strength=size_m / usual_m)
+
+
+def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
+    """Whether the marker's distances from the others stay changed."""
+    to_others = np.linalg.norm(tracks - tracks[:, marker : marker + 1], axis=2)
+    others = np.delete(to_others, marker, axis=1)
+    if not others.shape[1]:
+        return True
+    change = np.nanmedian(others[sample:], axis=0) - np.nanmedian(others[:sample], axis=0)
+    return bool(np.nanmax(np.abs(change)) > 0.3 * step_m)
+
+
+def _lively(sizes: Array) -> float:
+    """What else happens: the liveliest tenth of all samples but the largest three."""
+    rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
+    return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
+
+
+# Another order of the names suits so many times better before it is believed.
+CLEARLY = 2.5
+# With Huber's loss fewer of a marker's samples than this share are no matter: they count as wild.
+TAMED = 0.2
+
+
+def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypothesis, ...]:
+    """Markers whose names are exchanged for a part of the recording.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    huber : float, optional
+        Of the loss, where it is Huber's.
+    """
+    order, strength = _orders(experiment)
+    kinds, counts = np.unique(order, axis=0, return_counts=True)
+    right = kinds[int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))]
+    wrong = order != right
+    share = float(wrong.mean(axis=0).max(initial=0.0))
+    if not share or (huber is not None and share < TAMED):
+        return ()
+    at = np.flatnonzero(wrong.any(axis=1))
+    first, t_s, names = int(at[0]), experiment.t_s, experiment.markers.names
+    same = (order[first:] == order[first]).all(axis=1)
+    end = first + (len(same) if same.all() else int(same.argmin()))
+    when = f"from t = {t_s[first]:.4g} s " + (
+        "on" if end == len(t_s) else f"to {t_s[end - 1]:.4g} s"
+    )
+    real = np.argsort(right)[order[first]]
+    listed = ", ".join(f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first]))
+    also = ", and at other times" if at[-1] >= end else ""
+    data = {"when": f"{when}{also}", "names": listed}
+    return (Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data, strength=strength),)
+
+
+def _orders(experiment: Experiment) -> tuple[Index, float]:
+    """(T, M) which marker of the first samples each one is, and how clearly it changes."""
+    markers, grasp = experiment.markers, carrying(experiment)
+    seen_m = np.array(markers.positions_m)
+    if grasp is not None:
+        rotations, translations_m = grasp.poses.at(experiment.t_s)
+        seen_m = np.einsum("tji,tmj->tmi", rotations, seen_m - translations_m[:, None])
+    order, strength = np.tile(np.arange(len(markers.names)), (len(seen_m), 1)), 0.0
+    last_m = np.full(seen_m.shape[1:], np.nan)
+    for k, now_m in enumerate(seen_m):
+        there = np.isfinite(now_m[:, 0])
+        known = np.flatnonzero(there & np.isfinite(last_m[:, 0]))
+        chosen, clearly = _chosen(last_m[known], now_m[known], markers.sigma_m[known])
+        if clearly > CLEARLY:
+            order[k:, known] = order[k, known[chosen]]
+            strength = max(strength, clearly)
+        last_m[there] = now_m[there]
+    return order, strength
+
+
+def _chosen(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
+    """Which of the markers before each one is now, and how many times nearer it is so."""
+    same = np.arange(len(now_m))
+    if len(now_m) < 2:
+        return same, 1.0
+    apart_m = (now_m - now_m.mean(axis=0))[:, None] - (before_m - before_m.mean(axis=0))
+    cost = np.sum(apart_m**2, axis=2)
+    if (cost.argmin(axis=1) == same).all():
+        return same, 1.0
+    _, chosen = linear_sum_assignment(cost)
+    moved = np.flatnonzero(chosen != same)
+    noise = 6 * float(np.sum(sigma_m[moved] ** 2))
+    left = max(float(cost[moved, chosen[moved]].sum()), noise, 1e-300)
+    return chosen, float(np.sqrt(cost[moved, moved].sum() / left))

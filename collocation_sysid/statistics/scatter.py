@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from .distributions import chi2_sf
-from .information import best_step
-from .linearised import LinearisedFit
+from .linearised import LinearisedFit, best_step
 
 # Probability that recordings without such an error are said to disagree, for all parameters.
 SIGNIFICANT = 0.01

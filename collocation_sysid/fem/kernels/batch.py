@@ -1,4 +1,4 @@
-"""What is evaluated over all timesteps and elements, independent of how."""
+"""What is evaluated over all timesteps and elements, and by CasADi's own machine, the reference."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import InputError
 from ..kernel import PointKernel
+from ..pattern import dofs_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,3 +64,45 @@ class Evaluator(Protocol):
 
 class VectorCodeError(InputError):
     """A kernel that cannot be compiled to vector code."""
+
+
+class CasadiEvaluator:
+    """Evaluate a `Batch` by CasADi's own virtual machine; slower, available everywhere."""
+
+    def __init__(self, batch: Batch) -> None:
+        count, points, size = batch.geometry.shape
+        kernel = batch.kernel
+        self._mapped = kernel.element_function(points).map(
+            "element_map", "serial", count, [len(kernel.fields) + 1], []
+        )
+        self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
+        self._dofs = dofs_of(batch.cells).T
+        self._carried = None
+        if batch.carried is not None:
+            self._carried = batch.carried.reshape(count * points, -1).T
+        destinations = batch.destinations.ravel()
+        self._sum = sp.csr_array(
+            (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
+            shape=(batch.width, len(destinations)),
+        )
+
+    def __call__(
+        self,
+        fields: Sequence[Array],
+        theta: Array,
+        out: Array,
+        threads: int,
+        add: bool = False,
+        carried: Array | None = None,
+    ) -> None:
+        """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
+        for t in range(len(out)):
+            inputs = [field[t][self._dofs] for field in fields]
+            if self._carried is not None and carried is not None:
+                own = [carried[t][self._carried]]
+            else:
+                own = []
+            outputs = self._mapped.call([*inputs, self._geometry, theta, *own])
+            stacked = np.concatenate([value.full() for value in outputs])
+            total = self._sum @ stacked.ravel(order="F")
+            out[t] = out[t] + total if add else total

@@ -84,7 +84,7 @@ def combine_natively(plan: Plan) -> Combiner:
 def _emit() -> Any:
     from llvmlite import ir
 
-    from .loops import DOUBLES, I32S, I64, counting
+    from .jit import DOUBLES, I32S, I64, counting
 
     module = ir.Module()
     i64s = I64.as_pointer()

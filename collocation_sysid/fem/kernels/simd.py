@@ -22,8 +22,19 @@ from numpy.typing import NDArray
 from ..kernel import Contraction, Phase, PointKernel
 from .batch import Array, Batch
 from .instructions import FUSE, function_values
-from .jit import CompiledFunction, address, vector_lanes
-from .loops import DOUBLE, DOUBLES, I32, I32S, I64, Builder, Value, counting
+from .jit import (
+    DOUBLE,
+    DOUBLES,
+    I32,
+    I32S,
+    I64,
+    Builder,
+    CompiledFunction,
+    Value,
+    address,
+    counting,
+    vector_lanes,
+)
 from .threads import in_slices
 
 

@@ -20,8 +20,18 @@ from numpy.typing import NDArray
 
 from ...arrays import Array, Index
 from .instructions import FUSE
-from .jit import CompiledFunction, address, vector_lanes
-from .loops import DOUBLE, DOUBLES, I32, I64, Builder, Value, counting
+from .jit import (
+    DOUBLE,
+    DOUBLES,
+    I32,
+    I64,
+    Builder,
+    CompiledFunction,
+    Value,
+    address,
+    counting,
+    vector_lanes,
+)
 
 # Pivots that act on a row at a time: it is then read and written once for all of them.
 PIVOTS = 4

@@ -21,8 +21,7 @@ from ...program.marching import march_on
 from ...program.newton import NewtonOptions
 from ...recording import Experiment, PoseSequence
 from ...recording.wrench import Wrench
-from ...statistics.information import least_squares
-from ...statistics.linearised import LinearisedFit, linearised_fit
+from ...statistics.linearised import LinearisedFit, least_squares, linearised_fit
 from .limits import Bounds, Limits
 from .motion import Motion
 

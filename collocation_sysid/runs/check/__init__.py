@@ -25,8 +25,7 @@ from ...recording.turning import turning_warnings
 from ...statistics.concern import Concern, as_said
 from ...statistics.hypothesis import Hypothesis
 from ...statistics.numerical import MOST_SUBSTEPS
-from ...statistics.scale import scale_notes
-from ...statistics.stillness import stillness_notes
+from ...statistics.scale import scale_notes, stillness_notes
 from ...statistics.trust import stability_concerns
 from .cost import Cost, cost_notes, cost_warnings, costs
 from .derivatives import derivative_errors, shortened
