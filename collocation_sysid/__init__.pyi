@@ -10,12 +10,12 @@ from .fem.node_force import NodeForce
 from .fem.regions import Region
 from .fem.selection import Ball, Box, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh
-from .methods.casadi_nlp import Sleqp, SqpMethod
+from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
+from .methods.comparison.penalty import AugmentedLagrangian, Penalty
+from .methods.comparison.shooting import Shooting
 from .methods.continuation import Continuation
 from .methods.interior_point import InteriorPoint
-from .methods.penalty import AugmentedLagrangian, Penalty
 from .methods.reduced_space import ReducedSpace
-from .methods.shooting import Shooting
 from .methods.solution import Iteration, Solution, Status
 from .model.parameters import Parameter, Parameters, Tied, Unknown
 from .model.schemes import Scheme, Stencil

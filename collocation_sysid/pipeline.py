@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .errors import InputError, SimulationError
-from .methods.method import Method, Watch
-from .methods.solution import Solution, Status
+from .methods.solution import Method, Solution, Status, Watch
 from .methods.start import marched
 from .methods.workers import workers_of
 from .model.schemes import as_scheme

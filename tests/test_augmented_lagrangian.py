@@ -8,7 +8,7 @@ from problems_small import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, noisy
 from test_penalty import collocation_of
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
+from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.program.collocation import Collocation

@@ -16,10 +16,9 @@ from collocation_sysid import solve as solve_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.callbacks import NlpFunctions
-from collocation_sysid.methods.casadi_nlp import PLUGINS, REFUSED, SqpMethod, why_not
-from collocation_sysid.methods.method import Watch
+from collocation_sysid.methods.comparison.casadi_nlp import PLUGINS, REFUSED, SqpMethod, why_not
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.methods.solution import Iteration, Solution, Status, Watch
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 

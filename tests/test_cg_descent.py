@@ -10,7 +10,12 @@ import pytest
 from scipy.optimize import check_grad, rosen, rosen_der
 from scipy.optimize import minimize as scipy_minimise
 
-from collocation_sysid.methods.cg_descent import CgDescentOptions, CgResult, CgState, minimise
+from collocation_sysid.methods.comparison.cg_descent import (
+    CgDescentOptions,
+    CgResult,
+    CgState,
+    minimise,
+)
 
 OPTIONS = CgDescentOptions(tolerance=1e-6, max_iterations=20_000)
 

@@ -22,8 +22,8 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import is_density
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
 from collocation_sysid.methods.horizon import Horizon
-from collocation_sysid.methods.shooting import adjoint_gradient, simulated
 from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers

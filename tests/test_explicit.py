@@ -13,9 +13,9 @@ from problems_small import GUESS, box, hung_cube, measured_with, with_markers
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.methods.casadi_nlp import SqpMethod
+from collocation_sysid.methods.comparison.casadi_nlp import SqpMethod
+from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.interior_point import InteriorPoint
-from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, carried_over

@@ -14,10 +14,10 @@ from test_explicit import explicit, of_branches
 from test_static import ELASTIC_ONLY, HANGING, block
 from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
 
-from collocation_sysid.methods.casadi_nlp import SqpMethod
+from collocation_sysid.methods.comparison.casadi_nlp import SqpMethod
+from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.interior_point import InteriorPoint
-from collocation_sysid.methods.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.parameters import Parameters, Unknown

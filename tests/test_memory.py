@@ -8,9 +8,9 @@ from checks import assert_derivative, directional_derivative, relative_error
 from memories_small import ONE, TWO, guesses, recorded, remembering, truth
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.methods.comparison.shooting import Shooting, adjoint_gradient, simulated
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
 from collocation_sysid.program.collocation import Collocation, Part
 from collocation_sysid.program.marching import march
 from collocation_sysid.program.simulation import simulate

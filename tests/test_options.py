@@ -10,9 +10,9 @@ from pydantic import TypeAdapter
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
+from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.options import built
-from collocation_sysid.methods.penalty import Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.stated import documented

@@ -20,9 +20,9 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.inner import FIRST_ORDER, minimise
-from collocation_sysid.methods.merit import Merit, Unconstrained
-from collocation_sysid.methods.penalty import Penalty
+from collocation_sysid.methods.comparison.inner import FIRST_ORDER, minimise
+from collocation_sysid.methods.comparison.merit import Merit, Unconstrained
+from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.program.collocation import Collocation

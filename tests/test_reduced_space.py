@@ -26,10 +26,10 @@ from problems_small import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.moduli import engineering
+from collocation_sysid.methods.curvature import updated, with_curvature
 from collocation_sysid.methods.horizon import Horizon, Point
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
-from collocation_sysid.methods.secant import updated, with_curvature
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
 from collocation_sysid.model.parameters import Parameter, Parameters

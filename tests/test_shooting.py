@@ -26,10 +26,10 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.methods import shooting
+from collocation_sysid.methods.comparison import shooting
+from collocation_sysid.methods.comparison.shooting import Shooting, adjoint_gradient, simulated
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.shooting import Shooting, adjoint_gradient, simulated
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation

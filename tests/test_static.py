@@ -27,9 +27,9 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.shooting import Shooting
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.parameters import Parameters

@@ -11,7 +11,7 @@ from problems_small import TRUTH, hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.live.model import Model
-from collocation_sysid.methods.method import Method
+from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
 from collocation_sysid.result.record import result

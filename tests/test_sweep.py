@@ -18,7 +18,7 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.methods.multipliers import constraint_multipliers
+from collocation_sysid.methods.solution import constraint_multipliers
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.model.setting import Setting
 from collocation_sysid.program import sweep

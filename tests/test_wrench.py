@@ -26,8 +26,8 @@ from problems_small import (
 from scipy.spatial.transform import Rotation
 from wrenches_small import fitted, sensing, with_wrenches, wristed_cube
 
+from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
 from collocation_sysid.methods.horizon import Horizon
-from collocation_sysid.methods.shooting import adjoint_gradient, simulated
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.channel import Forced, Motion

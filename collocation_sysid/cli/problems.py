@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 
 from ..folders import require_possible, run_name
-from ..methods.described import require_method
+from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import run
 from ..result.record import result

@@ -47,8 +47,7 @@ class Methods:
 @command(commands, "methods", "methods interior-point")
 def methods(options: Methods) -> None:
     """List the methods, or the options of one: defaults, values, and what they do."""
-    from ..methods import METHODS
-    from ..methods.described import options_schema, require_method, summary
+    from ..methods import METHODS, options_schema, require_method, summary
 
     name = options.name
     if name is not None:
@@ -107,15 +106,14 @@ def new(options: New) -> None:
 
 def _methods_table() -> Table:
     """The methods by name, with a line on each."""
-    from ..methods import METHODS
-    from ..methods.described import summary
+    from ..methods import METHODS, summary
 
     return Table("", ("method", ""), tuple((name, summary(name)) for name in METHODS), texts=1)
 
 
 def _options_table(method: str) -> list[Shown]:
     """A method's options: defaults, what they can be, and what they do."""
-    from ..methods.described import options_schema, summary
+    from ..methods import options_schema, summary
     from ..problem.solver_schema import heading
 
     rows = []

@@ -17,16 +17,14 @@ from ..arrays import Array
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
-from .casadi_nlp import Sleqp, SqpMethod
+from .comparison.casadi_nlp import Sleqp, SqpMethod
+from .comparison.penalty import AugmentedLagrangian, Penalty
+from .comparison.shooting import Shooting
 from .interior_point import InteriorPoint
-from .ladder import SHARES, Shares, part_of
-from .method import Method, Watch
-from .options import Options, built
-from .penalty import AugmentedLagrangian, Penalty
+from .options import SHARES, Options, Shares, built, part_of
 from .recorder import Recorder
 from .reduced_space import ReducedSpace
-from .shooting import Shooting
-from .solution import Iteration, Solution, Status
+from .solution import Iteration, Method, Solution, Status, Watch
 from .start import completed, marched
 
 _ONE_HORIZON = (

@@ -15,10 +15,9 @@ from ..program.collocation import Collocation
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .condensed import condensed
-from .method import Watch
 from .options import Options
 from .recorder import Recorder
-from .solution import Solution, Status
+from .solution import Solution, Status, Watch
 
 
 def _ipopt_value(value: Any) -> Any:

@@ -1,4 +1,7 @@
-"""A method is a dataclass of its options, checked against the types of its fields."""
+"""A method is a dataclass of its options, checked against the types of its fields.
+
+Many take growing first parts of every recording, solved one after another.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, ClassVar, TypeVar, get_type_hints
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AfterValidator, TypeAdapter, ValidationError
 
-from ..checked import expected
+from ..checked import Positive, expected
 from ..errors import InputError, hint_at
 
 T = TypeVar("T", bound="Options")
@@ -75,3 +79,23 @@ def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
     choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
     hint = hint_at(str(found), choices)
     return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)
+
+
+# Fewest samples, or rows of a grid, of a first part.
+FEWEST = 8
+
+
+def part_of(count: int, share: float) -> int:
+    """How many of `count` a share is."""
+    return min(count, max(FEWEST, round(share * count)))
+
+
+def _ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
+    ascending = all(a < b for a, b in pairwise(shares))
+    if not ascending or shares[-1:] != (1.0,):
+        raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
+    return shares
+
+
+Shares = Annotated[tuple[Positive, ...], AfterValidator(_ascending)]
+SHARES = (0.25, 0.5, 1.0)

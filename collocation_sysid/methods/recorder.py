@@ -11,8 +11,7 @@ from ..arrays import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
-from .method import Watch
-from .solution import Iteration, Solution, Status, Timing
+from .solution import Iteration, Solution, Status, Timing, Watch
 from .start import initial_variables
 
 

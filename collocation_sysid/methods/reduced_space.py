@@ -32,10 +32,9 @@ from ..program.collocation import Collocation
 from ..program.lapack import one_blas_thread
 from ..program.sweep import Sweep
 from .curvature import require_second_derivatives
-from .method import Watch
 from .recorder import Recorder
 from .search import Search, SearchOptions
-from .solution import Solution, Status
+from .solution import Solution, Status, Watch
 from .start import completed
 from .trajectory import positions
 from .workers import Here, Workers

@@ -27,7 +27,7 @@ from ..model.parameters import Parameter, Parameters
 from ..program.collocation import Collocation, Part
 from ..program.newton import NewtonOptions
 from ..program.segment import Segment
-from .ladder import SHARES, part_of
+from .options import SHARES, part_of
 from .start import marched
 
 # Young's moduli that are tried, those beyond where the best is at an end, and the most of these.

@@ -11,12 +11,10 @@ from ..arrays import Array
 from ..checked import Count, Positive
 from ..errors import SimulationError
 from ..program.factorisation import Choice
-from .curvature import exact_curvature
+from .curvature import exact_curvature, updated, with_curvature
 from .horizon import Horizon, Point
-from .ladder import FEWEST, SHARES, Shares, part_of
-from .options import Options
+from .options import FEWEST, SHARES, Options, Shares, part_of
 from .recorder import Recorder
-from .secant import updated, with_curvature
 from .solution import Iteration, Status
 from .trajectory import Seen
 

@@ -1,21 +1,23 @@
-"""What every method returns."""
+"""What a method is, anything that solves a `Collocation`, and what it returns."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from enum import Enum
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from ..arrays import Array, root_mean
 from ..errors import SimulationError
-from ..program.collocation import Collocation, Violation
+from ..fem.kernels import side_by_side
+from ..program.collocation import Collocation, Part, Violation
 from ..program.stopwatch import Stopwatch
+from ..program.sweep import Sweep
 from ..recording.experiment import Experiment
-from .multipliers import constraint_multipliers
 from .scan import Scan
 
 
@@ -290,3 +292,65 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
         for square, count in zip(squares, counts, strict=True)
     )
     return force, torque
+
+
+Watch = Callable[[Iteration], None]
+
+
+class Method(Protocol):
+    """A callable that solves a `Collocation`, as those of `METHODS` are with their options."""
+
+    def __call__(
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+    ) -> Solution:
+        """Solve the NLP.
+
+        Parameters
+        ----------
+        collocation : Collocation
+        watch : callable, optional
+            Called with every line of the history, an `Iteration`.
+        start : (variables,) ndarray, optional
+            Initial variables; the method's own choice at the guess by default.
+
+        Returns
+        -------
+        Solution
+            Also when it did not converge or was interrupted (Ctrl-C): then the best iterate.
+        """
+        ...
+
+
+def constraint_multipliers(
+    collocation: Collocation, z: Array, stopwatch: Stopwatch | None = None
+) -> Array:
+    """Multipliers (constraints,) that make the Lagrangian stationary in the positions.
+
+    From c_xᵀ y = −∂L/∂x, in the scaling of the NLP.
+
+    Raises
+    ------
+    SimulationError
+        Where a timestep's equations are singular.
+    """
+
+    def of(part: Part) -> Array:
+        segment = part.segment
+        gradient = collocation.loss_scale * part.gradient()[0]
+        solver = Sweep(segment, stopwatch=stopwatch)
+        y = segment.force_n * solver.backward(part.x, part.setting, gradient)
+        return segment.of_rows(y)
+
+    found = side_by_side(of, collocation.parts(z), collocation.threads)
+    multipliers = np.concatenate(found)
+    if any(segment.grasp_rows.any() for segment in collocation.segments):
+        _add_grasps(collocation, z, multipliers)
+    return multipliers
+
+
+def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
+    """Give the grasp rows, which are unit rows, what is left of the gradient."""
+    slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
+    for part in collocation.parts(slope):
+        segment, grasped = part.segment, part.segment.grasp_rows
+        multipliers[segment.rows][grasped] = -segment.of_rows(part.x)[grasped] / segment.length_m

@@ -11,8 +11,7 @@ import numpy as np
 
 from ..errors import InputError, hint_at
 from ..files import require_regular
-from ..methods import METHODS
-from ..methods.described import require_method
+from ..methods import METHODS, require_method
 from ..problem.explaining import short
 from ..problem.reading import parse_toml
 

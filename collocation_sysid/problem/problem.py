@@ -9,9 +9,8 @@ from typing import Literal
 
 from ..errors import InputError
 from ..fem.body import Body
-from ..methods import METHODS
-from ..methods.described import require_method
-from ..methods.method import Method
+from ..methods import METHODS, require_method
+from ..methods.solution import Method
 from ..model.parameters import Parameters, Tied, Unknown
 from ..model.schemes import Scheme, as_scheme
 from ..program.collocation import Collocation

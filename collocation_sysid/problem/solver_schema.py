@@ -18,11 +18,10 @@ from pydantic import (
 
 from ..checked import Positive
 from ..errors import InputError
-from ..methods import METHODS
-from ..methods.casadi_nlp import why_not
-from ..methods.described import options_schema
-from ..methods.method import Method
+from ..methods import METHODS, options_schema
+from ..methods.comparison.casadi_nlp import why_not
 from ..methods.options import built
+from ..methods.solution import Method
 from ..section import Section
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}

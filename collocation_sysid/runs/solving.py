@@ -8,10 +8,9 @@ from pathlib import Path
 
 from ..arrays import Array
 from ..errors import InputError
-from ..methods.method import Method, Watch
 from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import Scan, rescue, started
-from ..methods.solution import Solution, Status
+from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.start import placed_at_guess
 from ..methods.workers import Workers, workers_of
 from ..problem import Problem

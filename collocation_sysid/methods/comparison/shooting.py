@@ -22,18 +22,16 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from ..arrays import Array
-from ..checked import Count, Positive
-from ..errors import SimulationError
-from ..program.collocation import Collocation
-from ..program.stopwatch import Stopwatch
-from .horizon import Horizon
-from .method import Watch
-from .multipliers import constraint_multipliers
-from .options import Options
-from .recorder import Ended, Recorder
-from .solution import Solution, Status
-from .start import completed, marched
+from ...arrays import Array
+from ...checked import Count, Positive
+from ...errors import SimulationError
+from ...program.collocation import Collocation
+from ...program.stopwatch import Stopwatch
+from ..horizon import Horizon
+from ..options import Options
+from ..recorder import Ended, Recorder
+from ..solution import Solution, Status, Watch, constraint_multipliers
+from ..start import completed, marched
 
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14

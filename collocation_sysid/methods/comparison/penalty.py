@@ -24,16 +24,15 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ..arrays import Array
-from ..checked import AboveOne, AtLeastOne, Count, Positive
-from ..errors import InputError
-from ..program.collocation import Collocation
+from ...arrays import Array
+from ...checked import AboveOne, AtLeastOne, Count, Positive
+from ...errors import InputError
+from ...program.collocation import Collocation
+from ..options import Options
+from ..recorder import Ended, Recorder
+from ..solution import Solution, Status, Watch
 from .inner import FIRST_ORDER, Inner, minimise
 from .merit import Merit, Unconstrained
-from .method import Watch
-from .options import Options
-from .recorder import Ended, Recorder
-from .solution import Solution, Status
 
 # ρ rises where a stage leaves more than this share of the slack, and the augmented Lagrangian ends
 # where not even the largest ρ leaves less than the second.

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import Bounds, OptimizeResult
 from scipy.optimize import minimize as scipy_minimise
 
-from ..arrays import Array
+from ...arrays import Array
 from .cg_descent import CgDescentOptions
 from .cg_descent import minimise as cg_descent
 from .levenberg_marquardt import minimise as levenberg_marquardt

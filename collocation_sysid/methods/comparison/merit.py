@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import Array, Index
-from ..program.collocation import Collocation, carried_over
-from ..program.stopwatch import Stopwatch
+from ...arrays import Array, Index
+from ...program.collocation import Collocation, carried_over
+from ...program.stopwatch import Stopwatch
 
 
 class Unconstrained:
