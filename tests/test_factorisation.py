@@ -7,9 +7,9 @@ from problems_small import TRUTH, box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
+from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.factorisation import Factoriser
 from collocation_sysid.program.supernodal import library
-from collocation_sysid.program.unsymmetric import whole
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
 BAR = box((0.04, 0.04, 0.4), (1, 1, 10))

@@ -16,9 +16,9 @@ from collocation_sysid.fem.node_force import NodeForce
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameters, Unknown
+from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.segment import Segment
-from collocation_sysid.program.unsymmetric import whole
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 
 # Of a tendon whose tension grows and a pressure that stays.

@@ -19,8 +19,8 @@ from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.unsymmetric import whole
 from collocation_sysid.recording import Experiment
 
 OBJECTIVE = [name for name in MATERIALS if name != "linear"]

@@ -19,8 +19,8 @@ from collocation_sysid.fem.memory import Branch, fading
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.viscoelasticity import History, Recursion, Remembered
+from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.unsymmetric import whole
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 
 SHARE, TAU_S = 0.5, 0.2

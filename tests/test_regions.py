@@ -16,7 +16,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Ball, Box, Indices, Named
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.program.unsymmetric import whole
+from collocation_sysid.program.block_band import whole
 
 EVALUATORS = ["simd", "casadi"]
 LENGTH_M = 0.03  # a large change of a position

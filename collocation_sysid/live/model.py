@@ -17,13 +17,13 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
+from ..model.dynamics import Row
 from ..model.point_forces import generated
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.least_squares import LeastSquares
 from ..program.markers import NEIGHBOURS, MarkerReading
 from ..program.newton import NewtonOptions, Solver
-from ..program.row import Row
 from ..program.segment import Segment
 from ..program.sweep import Sweep
 from ..recording.experiment import Experiment

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.body import Linearisation
+from ..model.dynamics import Row
 from ..program.least_squares import LeastSquares
 from ..program.marching import RowEquations, extrapolated, solve_row
 from ..program.newton import NewtonFailure, simulation_error
 from ..program.reading import as_squares
 from ..program.rest import start_state
-from ..program.row import Row
 from ..program.sweep import Columns, Forward, GraspMotion, LastRows, Step
 from .model import TOGETHER, Model, Poses
 

@@ -21,9 +21,8 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Past
 from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
-from .force_term import ForceTerm, Places, States
+from .force_term import ForceTerm, Places, Potential, States
 from .point_forces import point_forces
-from .potential import Potential
 from .weight import Mass, Weight
 
 

@@ -4,7 +4,7 @@ Reverse Cuthill–McKee makes the mesh graph a narrow band; a factorisation with
 within its skyline or, if it is wide, Cholesky's, then also tells whether the matrix is positive
 definite. Wide bands are those of LAPACK, or of a supernodal method where that is installed.
 Indefinite matrices go to SuperLU, and so do all where its fill-in is estimated to cost less than
-the band. What has a skew part besides, see `unsymmetric`, needs no exchanges either where the
+the band. What has a skew part besides, see `block_band`, needs no exchanges either where the
 symmetric part is positive definite and the skew one does not outweigh it: within a skyline it is
 factorised whole, else by its symmetric part and refined. What remains SuperLU takes.
 """

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.memory import Past
-from ..model.dynamics import Dynamics
+from ..model.dynamics import Dynamics, Row, weighted
 from ..recording.experiment import Experiment
 from .lapack import one_blas_thread
 from .newton import (
@@ -22,7 +22,6 @@ from .newton import (
     simulation_error,
 )
 from .rest import start_state
-from .row import Row, weighted
 from .stopwatch import Stopwatch
 
 Progress = Callable[[float], None]

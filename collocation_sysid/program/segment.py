@@ -17,17 +17,16 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.pattern import SymmetricPattern
-from ..model.dynamics import Dynamics
+from ..model.dynamics import Dynamics, Row
 from ..model.grasp_constraint import Grasping, Held
-from ..model.inputs import Inputs
+from ..model.inputs import Inputs, inputs_of, with_inputs
 from ..model.nuisance import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..model.setting import Setting
-from ..model.terms import inputs_of, with_inputs
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
-from .block_band import Block, BlockBand, Term
+from .block_band import Block, BlockBand, Term, adding_skew, skew_values
 from .channel import Points
 from .charts import Chart
 from .gauge import GaugeReading, gauge_readings
@@ -35,9 +34,7 @@ from .local_loss import LocalLoss
 from .markers import MarkerReading
 from .motion_rows import MotionRows, ahead
 from .reading import Reading
-from .row import Row
 from .sharing import Local
-from .unsymmetric import adding_skew, skew_values
 from .wrench import WrenchReading, wrench_readings
 from .wrench_channel import Grid, sensed_dofs
 

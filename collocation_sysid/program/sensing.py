@@ -12,10 +12,10 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.setting import Setting
+from .block_band import Submatrix
 from .channel import Forced, Motion
 from .reaction import HeldForces, forces_on, reaction_slopes, reactions
 from .segment import Segment
-from .unsymmetric import Submatrix
 
 
 @dataclass(frozen=True, eq=False)

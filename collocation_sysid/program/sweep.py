@@ -27,16 +27,15 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from ..model.dynamics import Dynamics
+from ..model.dynamics import Dynamics, Row, weighted
 from ..model.setting import Setting
 from ..model.viscoelasticity import History, Slopes, Weights
+from .block_band import Submatrix
 from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .reaction import HeldForces
-from .row import Row, weighted
 from .segment import Segment
 from .stopwatch import Stopwatch
-from .unsymmetric import Submatrix
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import Room
