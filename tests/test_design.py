@@ -18,11 +18,10 @@ from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.plan.design import Criterion, DesignOptions, Limits, Motion, designing
 from collocation_sysid.plan.design.criterion import Errors, both_sides, draws_about
 from collocation_sysid.plan.design.designing import Judge, design
-from collocation_sysid.plan.design.display import DesignProgress
 from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
-from collocation_sysid.plan.design.information import Recording, shared_information
-from collocation_sysid.plan.design.linear import LinearRecording
+from collocation_sysid.plan.design.information import LinearRecording, Recording, shared_information
 from collocation_sysid.plan.design.motion import angular_motion
+from collocation_sysid.plan.progress import DesignProgress
 from collocation_sysid.plan.design.search import search
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation

@@ -22,8 +22,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.plan import PlannedRun, plan_models
-from collocation_sysid.plan.choice import advice, model_rows
-from collocation_sysid.plan.prediction import model_record, without
+from collocation_sysid.plan.choice import advice, evidence_of, model_record, model_rows, without
 from collocation_sysid.plan.variants import (
     file_variants,
     models,
@@ -36,7 +35,6 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.marching import march
 from collocation_sysid.recording import Experiment, Markers, Wrench, write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
-from collocation_sysid.statistics.evidence import evidence_of
 
 BOTH = ("neo-hookean", "yeoh")
 DAMPING = "gamma_r_s = 0.009, gamma_m_1_s = 1.0, lambda_pa = 120.0"

@@ -68,8 +68,9 @@ def design(options: Design) -> None:
     of the parameters. The folder gets poses.csv, error bars before and after, pictures, a film and
     a problem that simulates it. Ctrl-C keeps the best motion so far.
     """
-    from ..plan.design.display import DesignProgress, design_summary
     from ..plan.design.folder import DESIGN_FILE, as_dict, write_design
+    from ..plan.design.page import design_summary
+    from ..plan.progress import DesignProgress
 
     folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
     names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))

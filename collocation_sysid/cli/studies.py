@@ -168,8 +168,14 @@ def _study(
     kind: str, options: Many, planned: Sequence[PlannedRun], yardstick: Yardstick | None = None
 ) -> None:
     """Do the runs that are left, write the tables and plots, and print them."""
-    from ..plan.progress import StudyProgress, plan_table, study_tables
-    from ..plan.study_page import load_report, report_json, write_report
+    from ..plan.progress import StudyProgress
+    from ..plan.study_page import (
+        load_report,
+        plan_table,
+        report_json,
+        study_tables,
+        write_report,
+    )
 
     name = run_name(options.problem)
     folder = options.out or Path("runs") / f"{name}-{kind}"

@@ -5,20 +5,42 @@ block by block in time; how much the difference scatters between blocks, and the
 ratio between recordings, tells how sure it is (Diebold & Mariano 1995, with means of batches). The
 model with the fewest parameters that predicts as well as the best, within one standard error, is
 taken.
+
+Of a single recording the last third is held out: its samples are taken away, and the simulation
+with what the rest tells goes on into it. Otherwise each recording is left out in turn, and
+simulated with what the others tell, its own nuisance parameters fitted. What is compared are the
+markers, and the forces where there are none.
+
+Akaike's criterion is −2 ln L + 2k. Of n independent normal errors of unknown variance −2 ln L is
+n ln(RSS/n), up to what all models of the same data share. Residuals of a model that misses
+something are not independent: ten samples that err alike are worth one. n is then the number of
+independent ones that are worth as much: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and
+channels by (tr Σ)²/tr Σ² across, with the ρ and Σ of `autocorrelation`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from math import exp, log, sqrt
 from typing import Any
 
 import numpy as np
 
+from ..errors import SimulationError
 from ..fem.constants import bare, symbol_of
-from ..statistics.evidence import Evidence
-from .store import Record
-from .study import PlannedRun
+from ..methods.solution import Solution, pooled_wrench_rms
+from ..problem import Problem, RolloutOptions
+from ..program.simulation import with_markers
+from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp
+from ..runs.forward_simulation import Rollout, roll_out
+from ..runs.solving import solve
+from ..statistics.autocorrelation import ErrorProcess, error_processes
+from ..statistics.linearised import Derived, FitBlock, LinearisedFit, information, linearised_fit
+from ..statistics.noise import ROUNDING
+from .process import Record
+from .study import PlannedRun, recordings
 from .table import Row
 
 # Predictions nearer than this, as a logarithm, are alike whatever the scatter.
@@ -257,3 +279,156 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
             for name, why in row["failures"].items()
         ),
     ]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the criterion needs to know of a fit.
+
+    Attributes
+    ----------
+    misfit : float
+        Σ residual² of the markers, in units of σ²; rounding at least.
+    prior : float
+        Σ residual² of the priors.
+    fitted : float
+        Number of parameters that the data determine, nuisance parameters included.
+    measurements : int
+    independent : float
+        The number of independent measurements that these are worth.
+    """
+
+    misfit: float
+    prior: float
+    fitted: float
+    measurements: int
+    independent: float
+
+    def criterion(self, independent: float) -> float:
+        """Akaike's, if the measurements are worth so many; models are compared at the same."""
+        return independent * float(np.log(self.misfit)) + self.prior + 2 * self.fitted
+
+
+def evidence_of(fit: LinearisedFit) -> Evidence:
+    """The evidence for a model from its fit near the answer."""
+    factored, rounding = information(fit), ROUNDING**2 * fit.measurements
+    independent = float(fit.measurements)
+    if fit.chi_squared > rounding:
+        processes = error_processes(fit, factored)
+        pairs = zip(fit.blocks, processes, strict=True)
+        independent = sum(_independent(b, p) for b, p in pairs if b.measurements)
+    return Evidence(
+        max(fit.chi_squared, rounding),
+        float(np.sum(fit.prior_residual**2)),
+        factored.fitted,
+        fit.measurements,
+        independent,
+    )
+
+
+def _independent(block: FitBlock, process: ErrorProcess) -> float:
+    lags = np.arange(1, len(process.along_time))
+    in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.along_time[1:])
+    seen = block.channels[2].any(axis=0)
+    among = process.among_channels[np.ix_(seen, seen)]
+    total = float(np.trace(among)) ** 2
+    # Few samples make channels look alike that are not: that much is taken off tr Σ².
+    alike = float(np.sum(among**2)) - total / max(process.samples, 1.0)
+    channels = float(np.clip(total / max(alike, 1e-300), 1.0, len(among)))
+    return block.measurements * channels / len(among) / max(1.0, in_time)
+
+
+# Share of a single recording that is fitted.
+FITTED = 2 / 3
+# Parts in time of what is held out: longer than most errors persist, and enough to see a scatter.
+BLOCKS = 8
+
+
+def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
+    """Fit a model, to all recordings or to all but what is held out, and tell how well it does.
+
+    Parameters
+    ----------
+    problem : Problem
+    method : str
+    held_out : str
+        A recording; "" to fit all.
+    """
+    known, start_s = without(problem, held_out) if held_out else (problem, np.inf)
+    solution = solve(known, method)
+    record: dict[str, Any] = {
+        "status": solution.status.value,
+        "converged": solution.status.converged,
+        "rms": {"m": solution.rms_m, "N": pooled_wrench_rms(solution)[0]},
+        "parameters": solution.parameters | _derived(solution),
+        "free": [item.name for item in problem.parameters.free],
+        "time_s": solution.timing.total,
+    }
+    if not solution.status.converged:
+        return record
+    if not held_out:
+        try:
+            fit = linearised_fit(solution.collocation, solution.z)
+        except SimulationError as error:
+            return record | {"converged": False, "status": str(error)}
+        return record | {"evidence": asdict(evidence_of(fit))}
+    experiment = next(e for e in known.experiments if e.name == held_out)
+    # With the scheme that was fitted: what is compared are models, not integrators.
+    rollout = roll_out(replace(known, rollout=RolloutOptions("scheme")), experiment, solution)
+    if not isinstance(rollout, Rollout):
+        return record | {"prediction": None, "failure": rollout}
+    whole = next(e for e in problem.experiments if e.name == held_out)
+    return record | {"prediction": _missed(whole, rollout, start_s)}
+
+
+def without(problem: Problem, name: str) -> tuple[Problem, float]:
+    """The problem without a recording, or its end, and the time from which it is held out."""
+    chosen = next(e for e in problem.experiments if e.name == name)
+    if len(recordings(problem)) > 1:
+        left, start_s = replace(chosen, validation=True), -np.inf
+    else:
+        start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
+        tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
+        grasps = tuple(_until(grasp, start_s) for grasp in chosen.grasps)
+        left = replace(with_markers(chosen, tracks), grasps=grasps)
+    experiments = [left if e is chosen else e for e in problem.experiments]
+    return replace(problem, experiments=experiments), start_s
+
+
+def _until(grasp: Grasp, end_s: float) -> Grasp:
+    """The grasp without what its sensor measured later."""
+    wrench = grasp.wrench
+    if wrench is None:
+        return grasp
+    values = np.where((wrench.t_s > end_s)[:, None], np.nan, wrench.values)
+    return replace(grasp, wrench=replace(wrench, values=values))
+
+
+def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[str, Any]:
+    """How far held-out samples are from the simulation: RMS, number, and Σ of squares by block.
+
+    Of the markers [m], or of the forces [N] where there are none; `unit` says which.
+    """
+    markers, unit = experiment.markers, "m"
+    t_s, apart = experiment.t_s, rollout.trajectory.markers_m - markers.positions_m
+    counted = markers.present
+    if not markers.samples:
+        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+        t_s = np.concatenate([sensor.t_s for sensor in sensors])
+        pairs = zip(rollout.wrenches, sensors, strict=True)
+        apart = np.concatenate([(read - sensor.values)[:, :3] for read, sensor in pairs])
+        order, unit = np.argsort(t_s, kind="stable"), "N"
+        t_s, apart = t_s[order], apart[order, None]
+        counted = np.asarray(np.isfinite(apart).any(axis=2))
+    later = t_s > start_s
+    squares = np.where(counted, np.nansum(apart**2, axis=2), 0.0)[later]
+    samples = int(counted[later].sum())
+    blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
+    rms = float(np.sqrt(squares.sum() / samples)) if samples else None
+    return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}
+
+
+def _derived(solution: Solution) -> dict[str, float]:
+    """Moduli that follow from the parameters."""
+    constants = (segment.constants for segment in solution.collocation.segments)
+    return dict(Derived.of(constants, solution.q).values)

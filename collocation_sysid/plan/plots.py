@@ -29,9 +29,17 @@ from ..result.style import (
 )
 from ..runs.result import Result
 from ..tree import read
-from .store import Record
+from .process import Record
 from .study import short_keys
-from .table import Row, Yardstick, best_run, distance, reference, wilson_interval
+from .table import (
+    Row,
+    Yardstick,
+    best_run,
+    distance,
+    parameters_in,
+    reference,
+    wilson_interval,
+)
 
 Array = NDArray[Any]
 
@@ -229,7 +237,7 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
 
     Answers that did not converge are crosses. Values of the first other key have colours.
     """
-    names = [column.removeprefix("guess_") for column in rows[0] if column.startswith("guess_")]
+    names = parameters_in(rows)
     width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(swept)))
     figure = new_figure(width, 14 + PANEL_MM * len(names))
     panels = figure.subplots(len(names), len(swept), sharex="col", sharey="row", squeeze=False)

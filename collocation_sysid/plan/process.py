@@ -1,4 +1,8 @@
-"""A run's process, seen from outside: started, watched, killed when it is late, tried again."""
+"""A run's process, seen from outside, and what became of it.
+
+It is started, watched, killed when it is late, and tried again. Finished runs are on disk, one JSON
+file each, there whole or not at all.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from ..apart import killed_by
-from .store import CRASHED, ERROR, STOPPED, TIMEOUT, Record
+from ..files import write_whole
+from ..tree import as_json
 
 COMMAND = (sys.executable, "-m", "collocation_sysid.plan.worker")
 # Runs side by side must not fight for cores, and compared times must mean the same.
@@ -134,3 +140,44 @@ def _last_words(code: int, said: IO[bytes]) -> str:
     lines = said.read()[-2000:].decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f"{how}: {last}" if last else how
+
+
+# What became of a run.
+FINISHED, ERROR, TIMEOUT, CRASHED, STOPPED = "finished", "error", "timeout", "crashed", "stopped"
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RunStore:
+    """The folder ``runs/`` of a study."""
+
+    folder: Path
+
+    def save(self, record: Record) -> None:
+        """Write a run's record."""
+        write_whole(self._file(record["key"]), as_json(record) + "\n")
+
+    def load(self, key: str) -> Record | None:
+        """A run's record; None if there is none that can be read."""
+        try:
+            record = json.loads(self._file(key).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return record if isinstance(record, dict) and record.get("key") == key else None
+
+    def finished(self, key: str, time_limit_s: float | None) -> Record | None:
+        """A run's record unless it is worth another try.
+
+        A run that crashed is, and one that ran out of less time than it has now.
+        """
+        record = self.load(key)
+        if record is None or record["outcome"] == CRASHED:
+            return None
+        if record["outcome"] == TIMEOUT:
+            had = record.get("time_limit_s") or 0.0
+            return record if time_limit_s is not None and time_limit_s <= had else None
+        return record
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.json"

@@ -1,18 +1,20 @@
-"""A study in the terminal: progress with the time left, the tables, the list of what would run."""
+"""Progress in the terminal, of a study with the time left and of a design."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from ..console import Watched
-from ..display import Line, Shown, Table
-from .store import Record
+from .design.designing import FORBIDDEN
+from .process import Record
 from .study import PlannedRun
-from .study_page import SHOWN_FAILURES, Report
+
+# How often a search tells where no line is live.
+EVERY = 20
 
 
 class StudyProgress(Watched):
@@ -61,6 +63,25 @@ class StudyProgress(Watched):
         return "" if left_s is None else f"; about {duration(left_s)} left"
 
 
+class DesignProgress(Watched):
+    """The search, live on a terminal; a line now and then elsewhere."""
+
+    def __init__(self, console: Console, evaluations: int, quiet: bool = False) -> None:
+        super().__init__(console, quiet)
+        self.evaluations = evaluations
+
+    def tried(self, number: int, log_size: float) -> None:
+        """Show the smallest error bar so far."""
+        best = "none possible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
+        line = f"{number} of {self.evaluations} motions tried, smallest error bar: {best}"
+        seldom = number % EVERY == 0 or number == self.evaluations
+        self.update(Text(f"{line} (Ctrl-C keeps it)", style="dim"), line if seldom else "")
+
+    def say(self, what: str) -> None:
+        """Show what is being done now."""
+        self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
+
+
 def label_of(record: Record) -> str:
     """A record's run in a few words."""
     names = PlannedRun.__dataclass_fields__
@@ -86,31 +107,3 @@ def duration(time_s: float) -> str:
         if time_s >= 2 * seconds:
             return f"{time_s / seconds:.2g} {unit}"
     return f"{time_s:.0f} s"
-
-
-def study_tables(report: Report, folder: Path) -> list[Shown]:
-    """The tables of a study within 80 columns, and what went wrong."""
-    # What no line of the tables says.
-    parts: list[Shown] = [*report.headline, ""] if report.kind == "models" else []
-    for table in report.views:
-        parts += [table, ""]
-    failures = report.failures
-    parts += [*report.notes, *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
-    if len(failures) > SHOWN_FAILURES:
-        more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
-        parts.append(Line(more, "doubtful"))
-    return [*parts, f"written to {folder}"]
-
-
-def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
-    """The runs of a study, and which of them are done."""
-    rows = tuple(
-        (
-            str(number),
-            run.label,
-            " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
-            "finished" if run.key in finished else "to do",
-        )
-        for number, run in enumerate(planned, start=1)
-    )
-    return Table("", ("", "run", "guess", ""), rows, names=4)

@@ -17,8 +17,7 @@ from typing import Any
 from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.kernels import available_threads
-from .process import execute
-from .store import CRASHED, STOPPED, Record, RunStore
+from .process import CRASHED, STOPPED, Record, RunStore, execute
 from .study import PlannedRun
 
 

@@ -22,7 +22,6 @@ from ..problem import Problem
 from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile
 from .arguments import require_few
-from .prediction import recordings
 from .variants import Variant
 
 KEY_LENGTH = 20
@@ -228,6 +227,11 @@ def plan_models(
             more |= {"allow_code": allow_code}
             planned.append(_planned(variant.path, file, method, variant.overrides, **more))
     return planned
+
+
+def recordings(problem: Problem) -> list[str]:
+    """Names of the recordings that are fitted."""
+    return [e.name for e in problem.experiments if not e.validation]
 
 
 def _planned(

@@ -10,34 +10,24 @@ from math import exp
 from pathlib import Path
 from typing import Any
 
-from ..display import Items, Section, Table, as_markdown
+from ..display import Items, Line, Section, Shown, Table, as_markdown
 from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import SCHEMA, whole_file, write_whole
 from ..tree import as_json
 from .choice import advice, model_notes, model_rows, shown_in
 from .plots import comparison_plots, sweep_plots
-from .store import Record, RunStore
+from .process import Record, RunStore
 from .study import PlannedRun, short_keys
-from .table import Row, Yardstick, method_rows, run_row
+from .table import COLUMNS, Column, Row, Yardstick, method_rows, parameters_in, run_row
 
 RESOLUTION_DPI = 150
 SHOWN_FAILURES = 8
 # Heads of the tables where there is room, on pages.
 WORDS = {
+    **{column.head: column.words for column in COLUMNS.values()},
     "": "to use",
     "success": "successes",
     "95 %": "95 % interval of the rate",
-    "violation N": "dynamics violated by [N]",
-    "relative": "of the largest force",
-    "markers mm": "markers, RMS [mm]",
-    "roll-out mm": "roll-out, RMS [mm]",
-    "tip mm": "tip, at most [mm]",
-    "iter.": "iterations",
-    "evals": "evaluations",
-    "build s": "set-up [s]",
-    "evaluate s": "evaluations [s]",
-    "solve s": "linear algebra [s]",
-    "total s": "in all [s]",
     "free": "parameters estimated",
     "fit mm": "markers, RMS [mm]",
     "fit N": "forces, RMS [N]",
@@ -132,6 +122,37 @@ def load_report(
     return Report(title, kind, tuple(planned), records, yardstick or Yardstick())
 
 
+# In the terminal ---------------------------------------------------------------------------------
+
+
+def study_tables(report: Report, folder: Path) -> list[Shown]:
+    """The tables of a study within 80 columns, and what went wrong."""
+    # What no line of the tables says.
+    parts: list[Shown] = [*report.headline, ""] if report.kind == "models" else []
+    for table in report.views:
+        parts += [table, ""]
+    failures = report.failures
+    parts += [*report.notes, *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
+    if len(failures) > SHOWN_FAILURES:
+        more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
+        parts.append(Line(more, "doubtful"))
+    return [*parts, f"written to {folder}"]
+
+
+def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
+    """The runs of a study, and which of them are done."""
+    rows = tuple(
+        (
+            str(number),
+            run.label,
+            " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
+            "finished" if run.key in finished else "to do",
+        )
+        for number, run in enumerate(planned, start=1)
+    )
+    return Table("", ("", "run", "guess", ""), rows, names=4)
+
+
 # Files --------------------------------------------------------------------------------------------
 
 
@@ -214,36 +235,20 @@ Cell = Callable[[Row], str]
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
     """Success, quality and cost of every method."""
-    errors = [name for name in summaries[0] if name.startswith("error_")]
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
         "success": lambda row: f"{row['successes']}/{row['runs']}",
         "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
     }
-    for name in errors:
-        symbol = symbol_of(name.removeprefix("error_"))
-        success[f"Δ{symbol} %"] = _number(name, 100)
-    quality = {
-        "violation N": _number("violation_n", 1, ".1e"),
-        "relative": _number("violation_relative", 1, ".1e"),
-        "markers mm": _number("rms_m", 1e3),
-        "roll-out mm": _number("rollout_rms_m", 1e3),
-        "tip mm": _number("tip_max_m", 1e3),
-    }
-    cost = {
-        "iter.": _number("iterations", 1, ".4g"),
-        "evals": _number("evaluations", 1, ".4g"),
-        "build s": _number("build_s"),
-        "evaluate s": _number("evaluations_s"),
-        "solve s": _number("linear_algebra_s"),
-        "total s": _number("total_s"),
-    }
+    success |= _errors(summaries)
+    quality = "violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m"
+    cost = ["iterations", "evaluations", "build_s", "evaluations_s", "linear_algebra_s", "total_s"]
     if all(row["evaluations"] is None for row in summaries):
-        del cost["evals"]
+        cost.remove("evaluations")
     return [
         _view("Success", {"method": _text("method")}, success, summaries),
-        _view("Quality", {"method": _text("method")}, quality, summaries),
-        _view("Cost", {"method": _text("method")}, cost, summaries),
+        _view("Quality", {"method": _text("method")}, _numbers(*quality), summaries),
+        _view("Cost", {"method": _text("method")}, _numbers(*cost), summaries),
     ]
 
 
@@ -254,14 +259,7 @@ def run_view(rows: Sequence[Row]) -> Table:
         "ended": _text("status"),
         "succeeded": lambda row: "yes" if row["success"] else "no",
     }
-    for name in (column for column in rows[0] if column.startswith("error_")):
-        cells[f"Δ{symbol_of(name.removeprefix('error_'))} %"] = _number(name, 100)
-    cells |= {
-        "markers mm": _number("rms_m", 1e3),
-        "roll-out mm": _number("rollout_rms_m", 1e3),
-        "iterations": _number("iterations", 1, ".4g"),
-        "total s": _number("total_s"),
-    }
+    cells |= _errors(rows) | _numbers("rms_m", "rollout_rms_m", "iterations", "total_s")
     ordered = sorted(rows, key=lambda row: row["start"])
     view = _view("Runs", names, cells, ordered)
     return replace(view, heads=tuple(map(_in_words, view.heads)))
@@ -282,7 +280,7 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
     """How many runs converged, and how far each estimate moves over them."""
     found = [row for row in rows if row["converged"]]
     said = [f"{len(found)} of {len(rows)} runs converged."]
-    for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
+    for name in parameters_in(rows):
         values = [row[f"value_{name}"] for row in found]
         errors = [e for row in found if (e := row[f"std_error_{name}"]) is not None]
         if len(values) > 1:
@@ -296,15 +294,10 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
     """Estimates and quality against the swept values."""
     places = {short: _swept(key) for key, short in short_keys(swept)}
     estimates: dict[str, Cell] = {}
-    for name in (column.removeprefix("guess_") for column in rows[0] if column[:6] == "guess_"):
+    for name in parameters_in(rows):
         estimates[with_unit(name)] = _estimate(name)
-    quality = {
-        "status": _text("status"),
-        "markers mm": _number("rms_m", 1e3),
-        "roll-out mm": _number("rollout_rms_m", 1e3),
-        "iterations": _number("iterations", 1, ".4g"),
-        "total s": _number("total_s"),
-    }
+    numbers = _numbers("rms_m", "rollout_rms_m", "iterations", "total_s")
+    quality = {"status": _text("status"), **numbers}
     return [
         _view("Estimates ± standard error", places, estimates, rows),
         _view("Quality and cost", places, quality, rows),
@@ -325,11 +318,11 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     moduli: dict[str, Cell] = {}
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
-        moduli[with_unit(name)] = lambda row, name=name: _value(row["parameters"].get(name))
+        moduli[with_unit(name)] = _number(name, 1, ".4g", "parameters")
     model = {"": lambda row: "→" if row["chosen"] else "", "model": _text("model")}
     views = [_view("Models", model, numbers, rows)]
     held = {
-        f"'{n}' {unit}": _held_out(n, factor)
+        f"'{n}' {unit}": _number(n, factor, ".3g", "predictions")
         for n in dict.fromkeys(n for r in rows for n in r["predictions"])
     }
     if len(held) > 1:
@@ -346,18 +339,10 @@ def _turned(
     return Table(title, ("", *(name(row) for row in rows)), lines)
 
 
-def _held_out(name: str, factor: float) -> Cell:
-    return lambda row: _value(row["predictions"].get(name), factor, ".3g")
-
-
 def _times(row: Row) -> str:
     if row["log_ratio"] is None:
         return "–"
     return f"{exp(row['log_ratio']):.2f} ± {exp(row['log_ratio']) * row['log_ratio_error']:.2f}"
-
-
-def _value(value: float | None, factor: float = 1.0, form: str = ".4g") -> str:
-    return "–" if value is None else format(factor * value, form)
 
 
 def _view(
@@ -384,16 +369,20 @@ def _swept(key: str) -> Cell:
     return cell
 
 
-def _number(name: str, factor: float = 1.0, form: str = ".2g") -> Cell:
-    def cell(row: Row) -> str:
-        if row[name] is None:
-            return "–"
-        value = factor * row[name]
-        if form == ".2g" and abs(value) >= 100:
-            return f"{value:.0f}"
-        return format(value, form)
+def _number(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
+    shown = Column(factor=factor, form=form)
+    return lambda row: shown(row[among].get(name) if among else row[name])
 
-    return cell
+
+def _errors(rows: Sequence[Row]) -> dict[str, Cell]:
+    """Of each parameter whose true value is known."""
+    names = parameters_in(rows, "error_")
+    return {f"Δ{symbol_of(name)} %": _number(f"error_{name}", 100) for name in names}
+
+
+def _numbers(*names: str) -> dict[str, Cell]:
+    """Columns of quality and cost."""
+    return {COLUMNS[name].head: lambda row, name=name: COLUMNS[name](row[name]) for name in names}
 
 
 def _estimate(name: str) -> Cell:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, nan, sqrt
 from typing import Any
@@ -12,40 +12,65 @@ import numpy as np
 from ..errors import InputError
 from ..runs.result import Result
 from ..tree import read
-from .store import TIMEOUT, Record
+from .process import TIMEOUT, Record
 from .study import PlannedRun
 
 Row = dict[str, Any]
 
-# Medians over a method's runs that have an answer, under the names of the runs' columns.
-MEDIANS = (
-    "rms_m",
-    "violation_n",
-    "violation_relative",
-    "rollout_rms_m",
-    "tip_max_m",
-    "iterations",
-    "evaluations",
-    "build_s",
-    "evaluations_s",
-    "linear_algebra_s",
-    "total_s",
-)
-# What a run's result says of its quality and cost.
-NUMBERS = (
-    "loss",
-    "rms_m",
-    "violation_n",
-    "violation_relative",
-    "rollout_rms_m",
-    "rollout_max_m",
-    "iterations",
-    "evaluations",
-    "build_s",
-    "evaluations_s",
-    "linear_algebra_s",
-    "total_s",
-)
+
+@dataclass(frozen=True)
+class Column:
+    """A number of each run, and how it is shown.
+
+    Attributes
+    ----------
+    head, words : str
+        Over the column where there is little room, and on pages; empty where it is not shown.
+    factor, form
+        What it is multiplied by, and its format.
+    of : callable, optional
+        The number in a run's result.
+    summed_up : bool
+        Whether a method has the median over its runs that have an answer.
+    """
+
+    head: str = ""
+    words: str = ""
+    factor: float = 1.0
+    form: str = ".2g"
+    of: Callable[[Result], float | None] | None = None
+    summed_up: bool = True
+
+    def __call__(self, value: float | None) -> str:
+        """The number as it is shown."""
+        if value is None:
+            return "–"
+        value *= self.factor
+        return format(value, ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form)
+
+
+# Quality and cost of a run.
+COLUMNS = {
+    "loss": Column(of=lambda r: r.history[-1].loss if r.history else None, summed_up=False),
+    "rms_m": Column("markers mm", "markers, RMS [mm]", 1e3, of=lambda r: r.fit.rms_m),
+    "violation_n": Column(
+        "violation N", "dynamics violated by [N]", 1, ".1e", lambda r: r.dynamics.max_violation_n
+    ),
+    "violation_relative": Column(
+        "relative", "of the largest force", 1, ".1e", lambda r: r.dynamics.max_violation_relative
+    ),
+    "rollout_rms_m": Column("roll-out mm", "roll-out, RMS [mm]", 1e3, of=lambda r: r.rollout.rms_m),
+    "rollout_max_m": Column(of=lambda r: r.rollout.max_m, summed_up=False),
+    "tip_max_m": Column("tip mm", "tip, at most [mm]", 1e3),
+    "iterations": Column("iter.", "iterations", 1, ".4g", lambda r: r.iterations),
+    "evaluations": Column("evals", "evaluations", 1, ".4g", lambda r: r.evaluations),
+    "build_s": Column("build s", "set-up [s]", of=lambda r: r.timing_s.build),
+    "evaluations_s": Column("evaluate s", "evaluations [s]", of=lambda r: r.timing_s.evaluations),
+    "linear_algebra_s": Column(
+        "solve s", "linear algebra [s]", of=lambda r: r.timing_s.linear_algebra
+    ),
+    "total_s": Column("total s", "in all [s]", of=lambda r: r.timing_s.total),
+}
 NORMAL_975 = 1.959963984540054
 
 
@@ -108,7 +133,11 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
     parameters = _parameters(run, result, yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
     near = all(error is not None and error <= yardstick.within for error in errors)
-    numbers: Row = dict.fromkeys(NUMBERS) if result is None else _numbers(result)
+    numbers = {
+        name: None if result is None else column.of(result)
+        for name, column in COLUMNS.items()
+        if column.of is not None
+    }
     row = {
         "key": run.key,
         "method": run.method,
@@ -125,17 +154,6 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
         "message": record.get("message", ""),
     }
     return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
-
-
-def _numbers(result: Result) -> Row:
-    """Quality and cost, by `NUMBERS`."""
-    dynamics, rollout, timing = result.dynamics, result.rollout, result.timing_s
-    loss = result.history[-1].loss if result.history else None
-    violated = (dynamics.max_violation_n, dynamics.max_violation_relative)
-    misfits = (result.fit.rms_m, *violated, rollout.rms_m, rollout.max_m)
-    cost = (timing.build, timing.evaluations, timing.linear_algebra, timing.total)
-    values = (loss, *misfits, result.iterations, result.evaluations, *cost)
-    return dict(zip(NUMBERS, values, strict=True))
 
 
 def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
@@ -156,6 +174,11 @@ def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, floa
     return row
 
 
+def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
+    """Names of the parameters that rows have a column of this kind for."""
+    return [name.removeprefix(kind) for name in rows[0] if name.startswith(kind)]
+
+
 # Methods ------------------------------------------------------------------------------------------
 
 
@@ -171,7 +194,8 @@ def _summary(method: str, rows: Sequence[Row]) -> Row:
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))
-    errors = [name for name in rows[0] if name.startswith("error_")]
+    errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
+    medians = [name for name, column in COLUMNS.items() if column.summed_up]
     return {
         "method": method,
         "runs": len(done),
@@ -180,7 +204,7 @@ def _summary(method: str, rows: Sequence[Row]) -> Row:
         "success_rate": successes / len(done) if done else None,
         "success_low": low,
         "success_high": high,
-        **{name: _median(done, name) for name in (*errors, *MEDIANS)},
+        **{name: _median(done, name) for name in (*errors, *medians)},
     }
 
 
@@ -202,7 +226,7 @@ def best_run(rows: Sequence[Row]) -> Row | None:
 
 def reference(rows: Sequence[Row], yardstick: Yardstick) -> dict[str, float]:
     """Where guesses are measured from: the truth, or the best answer's parameters."""
-    names = [name.removeprefix("guess_") for name in rows[0] if name.startswith("guess_")]
+    names = parameters_in(rows)
     if yardstick.truth:
         return {name: yardstick.truth[name] for name in names}
     best = best_run(rows)

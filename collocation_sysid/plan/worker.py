@@ -25,8 +25,8 @@ from ..result.record import result
 from ..runs.forward_simulation import Rollout
 from ..starting import heed_interrupts, leave
 from ..tree import as_json
-from .prediction import model_record
-from .store import ERROR, FINISHED
+from .choice import model_record
+from .process import ERROR, FINISHED
 
 
 def main() -> None:

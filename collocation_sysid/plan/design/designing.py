@@ -19,9 +19,8 @@ from ...recording import Experiment, PoseSequence
 from ...runs.solving import solve
 from ...statistics.linearised import linearised_fit
 from .criterion import Criterion, Errors, both_sides, draws_about
-from .information import Recording, Told, shared_information
+from .information import LinearRecording, Recording, Told, shared_information
 from .limits import REACHED, Bounds, Limits
-from .linear import LinearRecording
 from .motion import Motion
 from .search import Best, Watch, search
 

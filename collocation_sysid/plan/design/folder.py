@@ -20,7 +20,7 @@ from ...result.replay import Replay
 from ...result.writers import run_folder
 from ...tree import as_json, content
 from .designing import Bars, Design
-from .pictures import pictures
+from .page import pictures
 
 DESIGN_FILE, POSES_FILE, MARKERS_FILE = "design.json", "poses.csv", "predicted_markers.csv"
 WRENCH_FILE, PROBLEM_FILE, FILM_FILE = "predicted_wrench.csv", "problem.toml", "motion.gif"

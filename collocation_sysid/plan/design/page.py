@@ -1,12 +1,15 @@
-"""Pictures of a design: the motion, and the error bars before and after."""
+"""What people see of a design: the motion, and the error bars before and after."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from ...fem.constants import symbol_of
+from ...display import Line, Shown, Table
+from ...fem.constants import symbol_of, with_unit
 from ...result.style import (
     BLUE,
     CYCLE,
@@ -21,6 +24,55 @@ from ...result.style import (
 )
 from .designing import Design
 from .motion import angular_motion
+
+
+def design_summary(design: Design, folder: Path) -> list[Shown]:
+    """A design on one screen."""
+    tried = len(design.best.history)
+    interrupted = Line(f"interrupted: the best of {tried} motions", "check")
+    return [
+        *[interrupted] * design.best.interrupted,
+        _table(design),
+        _meaning(design),
+        f"limits reached: {', '.join(design.reached) or 'none'}",
+        f"written to {folder}",
+    ]
+
+
+def _table(design: Design) -> Table:
+    heads = ("", "value", "error before", "error after", "over the draws", "smaller by")
+    before, after, rows = design.before, design.after, []
+    for name, relative in after.relative.items():
+        earlier = before.relative[name] if before is not None else np.nan
+        rows.append(
+            (
+                with_unit(name),
+                f"{after.values[name]:.4g}",
+                _percent(earlier),
+                _percent(relative),
+                f"{_percent(after.lowest[name])} … {_percent(after.highest[name])}",
+                f"{earlier / relative:.2g}" if np.isfinite(earlier) else "",
+            )
+        )
+    return Table("", heads, tuple(rows))
+
+
+def _percent(share: float) -> str:
+    if np.isnan(share):
+        return ""
+    return f"{100 * share:.3g} %" if share < 10 else "not told"
+
+
+def _meaning(design: Design) -> str:
+    """What the columns are."""
+    duration = f"{design.experiment.duration_s:.4g} s"
+    after = f"after: the designed motion of {duration}"
+    if design.added:
+        return f"before: the recordings there are; {after} besides them"
+    if design.before is None:
+        return after
+    shipped = f"{design.recording.template.duration_s:.4g} s"
+    return f"before: the problem's own motion of {shipped}; {after}, alone"
 
 
 def pictures(design: Design) -> dict[str, Figure]:
