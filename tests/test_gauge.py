@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+from problem_files import AT_TRUTH, replace_text, run_command, settings, write
+from problem_files import TRUTH as TINY_TRUTH
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from test_static import HANGING, block
 from test_wrench import assert_slopes
@@ -222,3 +226,100 @@ def test_the_truth_is_found_from_a_load_cell_and_a_foil_alone(method):
     np.testing.assert_allclose(found, [0.05, 0.04], atol=2e-3)
     for name in ("lambda_pa", "mu_pa"):
         assert solution.parameters[name] == pytest.approx(TRUTH[name], rel=0.02)
+
+
+# In a file ----------------------------------------------------------------------------------------
+
+MINE = """
+import casadi as ca
+
+def specific_force(at, bias_m_s2):
+    return at.acceleration_m_s2[:, 0] + ca.vertcat(bias_m_s2, 0, 9.81)
+
+def pull(at):
+    return at.force_n[0]
+"""
+READINGS = """
+[[experiment.reading]]
+name = "chip"
+code = "mine.py"
+function = "specific_force"
+file = "data/swing_reading_chip.csv"
+sigma = 0.02
+points_m = [[0.03, 0.02, 0.03]]
+unknowns = { bias_m_s2 = 0.5 }
+
+[[experiment.reading]]
+name = "cell"
+code = "mine.py"
+function = "pull"
+file = "data/swing_reading_cell.csv"
+columns = ["pull_n"]
+sigma = 1e-3
+grasp = 1
+"""
+ALLOWED = ("problem.toml", "--allow-code", "--quiet")
+
+
+@pytest.fixture
+def worn(tiny: Path) -> Path:
+    """The tiny bar with a chip in it and a load cell in its clamp, without markers."""
+    write("mine.py", MINE)(tiny)
+    text = (tiny / "problem.toml").read_text()
+    (tiny / "problem.toml").write_text(text.partition("\n[experiment.markers]")[0] + READINGS)
+    truth = settings(*AT_TRUTH)
+    done = run_command("simulate", *ALLOWED, *truth, "--integrator", "midpoint", "--out", "data")
+    assert done.code == 0, done.err
+    return tiny
+
+
+def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
+    head = (worn / "data" / "swing_reading_cell.csv").read_text().splitlines()[0]
+    assert head == "t_s,pull_n"
+    done = run_command("solve", *ALLOWED, "--out", "found", "--method", "reduced-space")
+    assert done.code == 0, done.err
+    result = json.loads((worn / "found" / "result.json").read_text())
+    for name, value in TINY_TRUTH.items():
+        assert result["parameters"][name]["value"] == pytest.approx(value, rel=0.05)
+    assert abs(result["nuisance"]["swing"]["bias of chip [m/s²]"]["value"]) < 0.02
+
+
+def blank_cell(folder: Path) -> None:
+    file = folder / "data" / "swing_reading_cell.csv"
+    head, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([head, rows[0] + "x", *rows[1:]]))
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (
+            replace_text('"pull"', '"pul"'),
+            "no function 'pul'; expected one of specific_force, pull",
+        ),
+        (replace_text("bias_m_s2 = 0.5", "bias = 0.5"), "reading.0: the reading 'chip' cannot be"),
+        (replace_text("at.force_n[0]", "at.force_n", "mine.py"), "gives 3 numbers; expected 1"),
+        (
+            replace_text("grasp = 1", "grasp = 2"),
+            "reading.1.grasp: found 2; expected the number of a grasp, 1 to 1",
+        ),
+        (replace_text("grasp = 1\n", ""), "has neither points_m nor grasp"),
+        (replace_text('"cell"', '"chip"'), "two readings are called 'chip'"),
+        (replace_text('"pull_n"', '"pull"'), "swing_reading_cell.csv: line 1: there is no column"),
+        (replace_text("ing_cell.csv", "ing_sell.csv"), "reading.1.file: "),
+        (replace_text("points_m = [[0.03,", "points_m = [[0.9,"), "chip 1"),
+        (blank_cell, "swing_reading_cell.csv: line 2: column pull_n holds"),
+    ],
+)
+def test_what_is_no_reading_in_a_file_is_one_message(worn: Path, edit, words: str):
+    edit(worn)
+    done = run_command("check", *ALLOWED)
+    assert done.code == 2
+    assert words in " ".join(done.err.split())
+
+
+def test_a_readings_code_is_not_run_unless_it_is_allowed(worn: Path):
+    write("mine.py", "raise SystemExit")(worn)
+    done = run_command("solve", "problem.toml")
+    assert done.code == 2
+    assert "reading.0: found the file mine.py, which would be run" in done.err

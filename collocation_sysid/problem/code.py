@@ -27,7 +27,7 @@ def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -
     InputError
         See `load_function`; or if the function is no energy density, see `Material.of`.
     """
-    file, found = load_function(section, folder, key, allowed)
+    file, found = load_function(section.file, section.function, folder, f"{key}.file", allowed)
     if isinstance(found, Material):
         return found
     try:
@@ -44,7 +44,7 @@ def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool)
     InputError
         See `load_function`; or if the function is no force, see `NodeForce.of`.
     """
-    file, found = load_function(section, folder, key, allowed)
+    file, found = load_function(section.file, section.function, folder, f"{key}.file", allowed)
     nodes = None if section.nodes is None else selection(section.nodes)
     if isinstance(found, NodeForce):
         return found if nodes is None else replace(found, nodes=nodes)
@@ -55,22 +55,22 @@ def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool)
 
 
 def load_function(
-    section: CodeSection, folder: Path, key: str, allowed: bool
+    name: str, function: str, folder: Path, key: str, allowed: bool
 ) -> tuple[Path, Callable[..., Any]]:
-    """Run a file and take a function of it; the file's path too.
+    """Run a file, which a key names, and take a function of it; the file's path too.
 
     Raises
     ------
     InputError
         If running code is not allowed, the file or the function is not there, or the file fails.
     """
-    file, names = _run(section.file, folder, key, allowed)
-    found = names.get(section.function)
+    file, names = _run(name, folder, key, allowed)
+    found = names.get(function)
     if not callable(found) and not isinstance(found, NodeForce):
         functions = [n for n, v in names.items() if callable(v) and not n.startswith("_")]
         raise InputError(
-            f"there is no function {section.function!r}; expected one of "
-            f"{', '.join(functions) or 'none'}{hint_at(section.function, functions)}",
+            f"there is no function {function!r}; expected one of "
+            f"{', '.join(functions) or 'none'}{hint_at(function, functions)}",
             file,
         )
     return file, cast(Callable[..., Any], found)
@@ -84,7 +84,7 @@ def load_row(section: OwnRow, folder: Path, key: str, allowed: bool) -> Nuisance
     InputError
         If running code is not allowed, the file or the row is not there, or the file fails.
     """
-    file, names = _run(section.file, folder, key, allowed)
+    file, names = _run(section.file, folder, f"{key}.file", allowed)
     found = names.get(section.row)
     if not isinstance(found, NuisanceRow):
         rows = [name for name, value in names.items() if isinstance(value, NuisanceRow)]
@@ -103,9 +103,9 @@ def _run(name: str, folder: Path, key: str, allowed: bool) -> tuple[Path, dict[s
             f"found the file {name}, which would be run as Python code; allow that with "
             "--allow-code (allow_code=True from Python) if you trust it",
             None,
-            key,
+            key.rpartition(".")[0],
         )
-    file = existing_file(folder, name, f"{key}.file")
+    file = existing_file(folder, name, key)
     try:
         return file, runpy.run_path(str(file))
     except (Exception, SystemExit) as error:

@@ -19,13 +19,13 @@ from ..recording.nuisance import NuisanceRow
 from ..recording.selected import selection
 from ..stated import keys_of
 from ..statistics.plausible import oddities
-from .code import load_force, load_material, load_row
+from .code import load_force, load_function, load_material, load_row
 from .densities import completed, guessed
 from .nuisance_schema import OwnRow
 from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file
-from .recording_schema import LOADS
+from .recording_schema import LOADS, ReadingSection
 from .schema import (
     CodeSection,
     ObjectSection,
@@ -66,8 +66,13 @@ def contents_of(
     def row_of(section: OwnRow) -> NuisanceRow:
         return load_row(section, folder, "nuisance.own", allow_code)
 
+    def expression_of(section: ReadingSection, key: str) -> Callable[..., Any]:
+        code = section.code, section.function
+        return load_function(*code, folder, f"{key}.code", allow_code)[1]
+
+    own = row_of, expression_of
     for section in file.experiment:
-        reader = RecordingReader(section, folder, body, parameters, simulation, row_of)
+        reader = RecordingReader(section, folder, body, parameters, simulation, *own)
         with _blamed_on(odd):
             experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
         notes += reader.notes
@@ -90,7 +95,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """The files of data that a problem names, whether they are there or not."""
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
-        names += [section.markers.file]
+        names += [section.markers.file, *(reading.file for reading in section.reading)]
         for grasp in section.grasps:
             moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
             names += [grasp.poses or moved, sensed]

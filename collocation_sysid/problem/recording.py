@@ -19,6 +19,7 @@ from ..methods.scan import usual_constants
 from ..model.parameters import Parameters
 from ..recording import (
     Experiment,
+    Gauge,
     Grasp,
     Markers,
     MarkerTable,
@@ -33,6 +34,7 @@ from ..recording import (
 )
 from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.coverage import refuse_untold
+from ..recording.gauge_files import read_gauge
 from ..recording.nuisance import NuisanceRow
 from ..recording.selected import NodesSection, selection
 from ..recording.wrench_files import within
@@ -45,6 +47,7 @@ from .recording_schema import (
     ExperimentSection,
     GraspSection,
     MarkersSection,
+    ReadingSection,
     TableSection,
     WrenchSection,
 )
@@ -87,8 +90,9 @@ class RecordingReader:
         parameters: Parameters,
         simulation: bool,
         row_of: Callable[[OwnRow], NuisanceRow],
+        expression_of: Callable[[ReadingSection, str], Callable[..., Any]],
     ) -> None:
-        self.row_of = row_of
+        self.row_of, self.expression_of = row_of, expression_of
         self.section = section
         self.folder = folder
         self.body = body
@@ -116,6 +120,7 @@ class RecordingReader:
         forces = self._made("force")
         tendons = self._made("tendon")
         pressures = self._made("pressure")
+        readings = [self._reading(k, each, t_s) for k, each in enumerate(section.reading)]
 
         def build(markers: Markers) -> Experiment:
             return Experiment(
@@ -134,6 +139,7 @@ class RecordingReader:
                 forces=forces,
                 tendons=tendons,
                 pressures=pressures,
+                readings=readings,
                 nuisance=nuisance_of(section.nuisance, self.row_of),
             )
 
@@ -260,6 +266,31 @@ class RecordingReader:
         except InputError as error:
             raise error.located(None, key) from error
 
+    def _reading(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
+        """What is measured within the experiment's time; to be simulated without a file."""
+        key = f"reading.{k}"
+        told: dict[str, Any] = section.model_dump(
+            include={"name", "sigma", "points_m", "unknowns", "frame", "columns"}
+        )
+        told["expression"] = self.expression_of(section, key)
+        if section.grasp is not None:
+            count, told["grasp"] = len(self.section.grasps), section.grasp - 1
+            if section.grasp > count:
+                message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
+                raise InputError(message, None, f"{key}.grasp")
+        try:
+            if self.simulation and not (section.file and (self.folder / section.file).exists()):
+                return Gauge(t_s=t_s, values=None, **told)
+            if section.file is None:
+                raise InputError("missing; expected a file", None, f"{key}.file")
+            file = existing_file(self.folder, section.file, f"{key}.file")
+            at_s, values, told["columns"] = read_gauge(file, section.columns)
+            inside = within(at_s, t_s, section.file, self.section.kind == "static")
+            self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
+            return Gauge(t_s=at_s[inside], values=values[inside], **told)
+        except InputError as error:
+            raise error.located(None, key) from error
+
     def _made(self, word: str) -> tuple[Any, ...]:
         """What the tables of a kind state, on the body."""
         return tuple(
@@ -315,9 +346,11 @@ class RecordingReader:
         """Those of the wrench where there are no markers, else of the poses."""
         section = self.section
         sensed = [(k, grasp.wrench) for k, grasp in enumerate(section.grasps) if grasp.wrench]
-        if not sensed and not section.marked:
+        if not (sensed or section.marked or section.reading):
             raise InputError(
-                "nothing is measured: expected markers, or the wrench of a grasp", None, "markers"
+                "nothing is measured: expected markers, the wrench of a grasp, or a reading",
+                None,
+                "markers",
             )
         there = [s for s in sensed if (self.folder / str(section.file_of(s[1]))).exists()]
         if there and not section.marked:

@@ -366,6 +366,46 @@ Grasps = Annotated[
 ]
 
 
+class ReadingSection(Section):
+    """A reading of the user's own: a Python function of what it looks at and of its unknowns.
+
+    Attributes
+    ----------
+    name : str
+        Of its error bars, and of the file that `simulate` writes.
+    code : str
+        Python file; it is run, which needs --allow-code.
+    function : str
+        Name of the function in it.
+    sigma : float
+        Standard deviation of the noise of each number, in its unit.
+    file : str, optional
+        What it said: a column t_s, and one for each number; only `simulate` can do without.
+    columns : list of str
+        Columns of the numbers, in their order; all besides t_s by default.
+    points_m : list
+        Places [x, y, z] on the undeformed body that it looks at.
+    grasp : int, optional
+        In place of points: the number of the grasp, from 1, whose force and torque it looks at.
+    frame : str
+        Axes and origin of these: those of the undeformed body as the grasp carries it, or the
+        poses' world.
+    unknowns : dict
+        Standard deviation of each of its unknowns, about zero, by the argument's name.
+    """
+
+    name: Annotated[str, AfterValidator(_file_name)]
+    code: Text
+    function: Text
+    sigma: Positive
+    file: Text | None = None
+    columns: list[Text] = Field(default_factory=list)
+    points_m: list[Vector] = Field(default_factory=list)
+    grasp: AtLeastOne | None = None
+    frame: Literal["grasp", "world"] = "grasp"
+    unknowns: dict[str, Positive] = Field(default_factory=dict)
+
+
 class ExperimentSection(Section):
     """One recording.
 
@@ -400,6 +440,8 @@ class ExperimentSection(Section):
         [[experiment.tendon]] tables: tendons in the body.
     pressure : list of PressureSection
         [[experiment.pressure]] tables: pressures in cavities or on held patches.
+    reading : list of ReadingSection
+        [[experiment.reading]] tables: instruments of the user's own.
     nuisance : NuisanceOrNone
         What is estimated of this recording alone, as a table; or "none".
     validation : bool
@@ -422,6 +464,7 @@ class ExperimentSection(Section):
     force: list[ForceSection] = Field(default_factory=list)
     tendon: list[TendonSection] = Field(default_factory=list)
     pressure: list[PressureSection] = Field(default_factory=list)
+    reading: list[ReadingSection] = Field(default_factory=list)
     nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
     validation: Flag = False
 

@@ -17,7 +17,7 @@ from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
 from .tendon import Tendon
 from .wrench import Wrench
 from .wrench_files import read_wrench
-from .writers import write_markers_csv, write_poses_csv, write_wrench_csv
+from .writers import write_gauge_csv, write_markers_csv, write_poses_csv, write_wrench_csv
 
 __all__ = [
     "Aligned",
@@ -53,6 +53,7 @@ __all__ = [
     "read_tension",
     "read_wrench",
     "sample_interval_s",
+    "write_gauge_csv",
     "write_markers_csv",
     "write_poses_csv",
     "write_wrench_csv",

@@ -391,6 +391,8 @@ class Experiment:
                 within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
         for gauge in self.readings:
             what = f"the reading '{gauge.name}'"
+            if [other.name for other in self.readings].count(gauge.name) > 1:
+                raise InputError(f"two readings are called {gauge.name!r}; expected another name")
             within(gauge.times, self.t_s, what, self.static)
             if gauge.grasp is not None and gauge.grasp not in range(len(self.grasps)):
                 raise InputError(

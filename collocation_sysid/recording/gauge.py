@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import casadi as ca
 import numpy as np
@@ -53,8 +53,8 @@ class Gauge:
         CasADi operations; one number, or a column of m.
     t_s : (S,) array
         Times of its samples, ascending, within those of the experiment, at whatever rate.
-    values : (S,) or (S, m) array
-        What it said; NaN where missing.
+    values : (S,) or (S, m) array, or None
+        What it said; NaN where missing. None before it is simulated.
     sigma : float
         Standard deviation of the noise of each number.
     points_m : (P, 3) array, optional
@@ -67,6 +67,8 @@ class Gauge:
     frame : {"grasp", "world"}
         Axes and origin of these: those of the undeformed body as the grasp carries it, or those of
         the poses' world.
+    columns : sequence of str, optional
+        Names of its numbers, as files have them.
 
     Raises
     ------
@@ -78,32 +80,23 @@ class Gauge:
     name: str
     expression: Callable[..., Any]
     t_s: ArrayLike
-    values: ArrayLike
+    values: ArrayLike | None
     sigma: float
     points_m: ArrayLike = ()
     unknowns: Mapping[str, float] = field(default_factory=dict)
     grasp: int | None = None
     frame: Frame = "grasp"
+    columns: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        where = f"the reading '{self.name}'"
+        where, points = f"the reading '{self.name}'", cast(Sequence[Any], self.points_m)
         times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
-        given = np.array(self.values, dtype=float)
-        given = given[:, None] if given.ndim == 1 else given
-        points = np.asarray(self.points_m, dtype=float)
-        points = points if points.size else points.reshape(0, 3)
-        vars(self).update(
-            t_s=times,
-            values=read_only_floats(given, (len(times), None), f"values of {where}", finite=False),
-            points_m=read_only_floats(points, (None, 3), f"points_m of {where}"),
-            unknowns=dict(self.unknowns),
+        points = read_only_floats(
+            points if len(points) else np.zeros((0, 3)), (None, 3), f"points_m of {where}"
         )
+        vars(self).update(t_s=times, points_m=points, unknowns=dict(self.unknowns))
         if fault := first_time_fault(times):
             raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
-        if np.isinf(given).any():
-            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
-        if not np.isfinite(given).any():
-            raise InputError(f"{where} has no sample; expected some, or to be left out")
         for what, sigma in {"sigma": self.sigma, **self.unknowns}.items():
             if not (sigma > 0 and np.isfinite(sigma)):
                 raise InputError(f"{what} of {where} is {sigma:g}; expected more than 0")
@@ -113,7 +106,28 @@ class Gauge:
         if (self.grasp is None) == (not len(points)):
             both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
             raise InputError(f"{where} has {both}; expected one of them to look at")
-        self._refuse_other_count(self.numbers)
+        count = self._checked_count()
+        names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
+        vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
+
+    def _checked_values(self, count: int) -> Array:
+        """(S, m)."""
+        where, samples = f"the reading '{self.name}'", len(self.times)
+        if self.values is None:
+            return read_only_floats(np.zeros((samples, count)), (None, None), where)
+        given = np.array(self.values, dtype=float)
+        given = given[:, None] if given.ndim == 1 else given
+        values = read_only_floats(given, (samples, None), f"values of {where}", finite=False)
+        if np.isinf(values).any():
+            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
+        if not np.isfinite(values).any():
+            raise InputError(f"{where} has no sample; expected some, or to be left out")
+        if values.shape[1] != count:
+            raise InputError(
+                f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
+                "many as its values have columns"
+            )
+        return values
 
     def __repr__(self) -> str:
         return f"Gauge({self.name!r}: {len(self.times)} samples of {self.measured.shape[1]})"
@@ -148,15 +162,8 @@ class Gauge:
         found = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
         return ca.vec(ca.SX(ca.vertcat(*found) if isinstance(found, (list, tuple)) else found))
 
-    @property
-    def numbers(self) -> int:
-        """How many it reads at a time.
-
-        Raises
-        ------
-        InputError
-            If that cannot be told, or they or their slopes are no numbers at rest.
-        """
+    def _checked_count(self) -> int:
+        """How many numbers it reads; refused where these or their slopes are none at rest."""
         points = np.asarray(self.points_m).T
         still = np.zeros_like(points), np.zeros_like(points)
         rest = [points, *still] if self.grasp is None else [np.ones(3), np.ones(3)]
@@ -180,10 +187,3 @@ class Gauge:
                 "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
             )
         return read.numel()
-
-    def _refuse_other_count(self, numbers: int) -> None:
-        if numbers != (count := self.measured.shape[1]):
-            raise InputError(
-                f"the expression of the reading '{self.name}' gives {numbers} numbers; expected "
-                f"{count}, as many as its values have columns"
-            )

@@ -47,6 +47,13 @@ def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> Non
     _write_csv(path, header, np.column_stack([np.asarray(t_s), rows[:, there]]))
 
 
+def write_gauge_csv(
+    path: str | Path, t_s: ArrayLike, names: Sequence[str], values: ArrayLike
+) -> None:
+    """Write what an instrument said (S, m) as `read_gauge` reads it, blank for NaN."""
+    _write_csv(path, ["t_s", *names], np.column_stack([np.asarray(t_s), np.asarray(values)]))
+
+
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
     with whole_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -14,7 +14,13 @@ from ..files import whole_file
 from ..model.schemes import SCHEMES
 from ..problem import Problem
 from ..program.simulation import Trajectory, simulate
-from ..recording import Experiment, write_markers_csv, write_poses_csv, write_wrench_csv
+from ..recording import (
+    Experiment,
+    write_gauge_csv,
+    write_markers_csv,
+    write_poses_csv,
+    write_wrench_csv,
+)
 from .writers import FRAMES_FILE, require_replaceable, run_folder, write_frames
 
 
@@ -34,6 +40,8 @@ class Recipe:
         The same of measured forces.
     noise_nm : float
         The same of measured torques.
+    noise_own : float
+        The same of readings of one's own, in their sigmas.
     seed : int
         Seed of the noise.
     frames : --frames/--no-frames
@@ -50,6 +58,7 @@ class Recipe:
     noise_m: float = 0.0
     noise_n: float = 0.0
     noise_nm: float = 0.0
+    noise_own: float = 0.0
     seed: int = 0
     frames: bool = False
 
@@ -62,7 +71,8 @@ class Recipe:
             expected = "expected a number of seconds above 0"
             raise InputError(f"found {self.timestep_s:g}; {expected}", None, "--timestep-s")
         noises = {"-m": (self.noise_m, "metres"), "-n": (self.noise_n, "newtons")}
-        for end, (size, unit) in (noises | {"-nm": (self.noise_nm, "N m")}).items():
+        noises |= {"-nm": (self.noise_nm, "N m"), "-own": (self.noise_own, "sigmas")}
+        for end, (size, unit) in noises.items():
             if not 0 <= size < np.inf:
                 message = f"found {size:g}; expected {unit}, 0 or more"
                 raise InputError(message, None, f"--noise{end}")
@@ -85,7 +95,8 @@ def write_data(
     folder : str or Path
         Made where it is missing; gets ``<experiment>_markers.csv``, ``<experiment>_poses.csv``
         (``_poses_2`` … for further grasps), ``<experiment>_wrench.csv`` (``_wrench_2`` …) of
-        grasps whose wrench is measured, and ``<experiment>/`` with frames when asked for.
+        grasps whose wrench is measured, ``<experiment>_reading_<name>.csv`` of readings of one's
+        own, and ``<experiment>/`` with frames when asked for.
     recipe : Recipe, optional
         Without noise by default.
     progress : callable, optional
@@ -144,11 +155,17 @@ def _write_tables(
     for file, grasp in zip(files[1 : 1 + count], experiment.grasps, strict=True):
         write_poses_csv(file, grasp.poses)
     sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-    sensed = zip(files[1 + count :], sensors, trajectory.wrenches, strict=True)
+    sensed = zip(files[1 + count :], sensors, trajectory.wrenches, strict=False)
     for file, sensor, wrench in sensed:
         measured = np.where(sensor.measured, wrench, np.nan)
         noise = np.repeat([recipe.noise_n, recipe.noise_nm], 3) * rng.normal(size=wrench.shape)
         write_wrench_csv(file, sensor.t_s, measured + noise)
+    own = zip(
+        files[1 + count + len(sensors) :], experiment.readings, trajectory.readings, strict=True
+    )
+    for file, gauge, read in own:
+        noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
+        write_gauge_csv(file, gauge.times, gauge.columns, read + noise)
 
 
 def _refuse_unguessed(problem: Problem) -> None:
@@ -175,9 +192,10 @@ def _refuse_inputs(problem: Problem, place: Path) -> None:
 
 
 def _tables(experiment: Experiment, place: Path) -> list[Path]:
-    """The marker file, one of poses for each grasp, and one for each sensor."""
+    """The marker file, one of poses for each grasp, and one for each sensor and own reading."""
     sensors = sum(grasp.wrench is not None for grasp in experiment.grasps)
     kinds = [("poses", k) for k in range(len(experiment.grasps))]
     kinds += [("wrench", k) for k in range(sensors)]
     names = [f"{kind}_{k + 1}" if k else kind for kind, k in kinds]
+    names += [f"reading_{gauge.name}" for gauge in experiment.readings]
     return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]
