@@ -17,6 +17,7 @@ from matplotlib.image import imread
 from problem_files import Outcome, run_command
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from scipy.spatial.transform import Rotation
+from test_gauge import instrumented, strain_gauge
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -580,6 +581,7 @@ def test_problems_that_cannot_be_live_are_refused_in_words():
     for changed, said in (
         ([still], "never move"),
         ([hung, replace(hung, name="again")], "2 experiments"),
+        ([instrumented(hung, strain_gauge(hung.t_s))], "the readings 'foil', which frames do not"),
     ):
         with pytest.raises(InputError, match=said):
             Estimator(cs.Problem(changed, GUESS))

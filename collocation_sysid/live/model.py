@@ -276,6 +276,9 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a material with memory", "one without Prony branches")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
+    if experiment.readings:
+        names = ", ".join(repr(gauge.name) for gauge in experiment.readings)
+        raise refused(f"the readings {names}, which frames do not bring,", "none")
     if any(generated(force).takes(0) for force in experiment.body.forces):
         raise refused("a force that depends on time", "one that does not")
     if not experiment.markers.names:
@@ -307,7 +310,6 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
         t_s=t_s,
         grasps=[replace(g, wrench=None) for g in _held_at(experiment, _first_poses(experiment))],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
-        readings=(),
     )
 
 

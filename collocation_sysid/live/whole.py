@@ -45,7 +45,7 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
         poses = PoseSequence.from_matrices(t_s, matrices, smooth)
         grasps[number] = replace(grasps[number], poses=poses)
     markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
-    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=())
+    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers)
 
 
 def solved(problem: Problem, recording: Experiment) -> Run:
