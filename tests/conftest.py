@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from problem_files import write_problem
+from problems_small import uneven_box
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.result import heartbeat, record
 
 BodyFactory = Callable[..., Body]
@@ -41,9 +41,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def small_mesh() -> TetMesh:
     """A box of 27 nodes and 48 elements, of which no two are alike."""
-    box = box_mesh((0.10, 0.12, 0.09), (2, 2, 2))
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, box.points_m.shape)
-    return TetMesh(box.points_m + jitter, box.tetrahedra)
+    return uneven_box(2)
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,
@@ -60,6 +61,13 @@ def box(
 ) -> Body:
     """A foam box with a corner at the origin; bodies are shared, their kernels compile once."""
     return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=element)
+
+
+def uneven_box(divisions: int) -> TetMesh:
+    """A box of which no two elements are alike."""
+    made = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
+    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, made.points_m.shape)
+    return TetMesh(made.points_m + jitter, made.tetrahedra)
 
 
 def with_papers_damping(experiment: Experiment) -> Experiment:
@@ -292,3 +300,20 @@ def noisy(
 def relative_errors(solution: Solution) -> np.ndarray:
     """Errors of the four parameters over `TRUTH`."""
     return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
+
+
+def some_point(made: Collocation, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Variables that satisfy nothing, what is carried neither: rigid, then shaken."""
+    rng, positions = rng or np.random.default_rng(1), []
+    for segment in made.segments:
+        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
+    p, nq = made.guess_p, made.nq
+    p[:nq] += 0.1 * rng.normal(size=nq)
+    p[nq:] += 0.5 * rng.normal(size=made.nphi)
+    lags = np.array(["lag of" in name for name in made.names], dtype=bool)
+    p[lags] = np.abs(p[lags]) + 0.1
+    z = made.pack(p, positions)
+    for carried in made.carried:
+        z[carried.variables] += 0.01 * rng.normal(size=carried.count)
+    return z

@@ -14,6 +14,7 @@ from problems_small import (
     cube_with_nuisance,
     hung_cube,
     measured,
+    some_point,
 )
 
 from collocation_sysid.errors import InputError
@@ -64,25 +65,6 @@ def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
     return replace(with_markers(experiment, tracks), start=start, **changes)
 
 
-def some_point(collocation: Collocation, seed: int = 1) -> np.ndarray:
-    """Variables that satisfy nothing: carried rigidly, then shaken."""
-    rng = np.random.default_rng(seed)
-    positions = []
-    for segment in collocation.segments:
-        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
-        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    p, nq = collocation.guess_p, collocation.nq
-    p[nq:] = 0.5 * rng.normal(size=collocation.nphi)
-    p[:nq] += 0.1 * rng.normal(size=nq)
-    return collocation.pack(p, positions)
-
-
-def seen_with_gaps(experiment: Experiment) -> Experiment:
-    tracks = measured(experiment).markers.positions_m.copy()
-    tracks[np.random.default_rng(3).random(tracks.shape[:2]) < 0.3] = np.nan
-    return with_markers(experiment, tracks)
-
-
 def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
     q = collocation.parameters.guess_q if q is None else q
     motions = [
@@ -90,13 +72,6 @@ def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray
         for s in collocation.segments
     ]
     return collocation.pack(q, motions)
-
-
-def hessian(collocation: Collocation, z: np.ndarray, weight: float, y: np.ndarray) -> sp.csc_array:
-    indptr, indices = collocation.hessian_structure
-    values = collocation.hessian_values(z, weight, y)
-    upper = sp.csc_array((values, indices, indptr), shape=(collocation.variables,) * 2)
-    return sp.csc_array(upper + sp.triu(upper, 1).T)
 
 
 # Every scheme from every start, and every other pair of choices at least once.
@@ -174,29 +149,6 @@ def test_lengths_are_scaled_by_the_mean_edge():
     segment = Collocation([swung()], GUESS).segments[0]
     ends = segment.body.nodes_m[segment.body.mesh.edges]
     assert segment.length_m == pytest.approx(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
-
-
-@pytest.mark.parametrize(("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS)
-def test_structures_are_compressed_columns_with_ascending_rows(
-    scheme: str, start: str, explicit_grasps: bool, substeps: int
-):
-    experiments = [swung(start), swung(start, steps=3)]
-    collocation = Collocation(experiments, GUESS, scheme, substeps, explicit_grasps)
-    for indptr, indices, rows in (
-        (*collocation.jacobian_structure, collocation.constraints),
-        (*collocation.hessian_structure, collocation.variables),
-    ):
-        assert len(indptr) == collocation.variables + 1
-        assert indptr[0] == 0
-        assert indptr[-1] == len(indices)
-        assert (np.diff(indptr) >= 0).all()
-        assert indices.min() >= 0
-        assert indices.max() < rows
-        column = np.repeat(np.arange(collocation.variables), np.diff(indptr))
-        assert (np.diff(column * rows + indices) > 0).all()
-    indptr, indices = collocation.hessian_structure
-    column = np.repeat(np.arange(collocation.variables), np.diff(indptr))
-    assert (indices <= column).all()
 
 
 def test_gauss_newtons_model_of_wild_samples_is_nowhere_below_their_loss(rng):

@@ -16,17 +16,14 @@ from problems_small import (
     measured_with,
     quadratic_bar,
 )
-from wrenches_small import sensing, with_wrenches
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import is_density
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.methods import METHODS
-from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
-from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, PointMass
 
 # In the ratio that is stated: then known masses are damped alike.
@@ -126,44 +123,14 @@ def test_methods_find_densities_where_a_known_mass_sets_the_scale(name):
 # Along the equations of motion --------------------------------------------------------------
 
 REMEMBERED = TRUTH | {"prony_1.share": 0.4, "prony_1.tau_s": 0.03}
-TOLD = {name: (make, TRUTH) for name, make in MADE.items()} | {
-    "memory": (lambda: with_core(weighted(hung_cube(6)), prony=["prony_1"]), REMEMBERED)
-}
 
 
-@pytest.mark.parametrize("name", TOLD)
-def test_gradients_along_the_motion_forward_and_adjoint(name, rng):
-    make, truth = TOLD[name]
-    collocation = Collocation([noisy_with(make(), truth)], parameters(truth))
-    p = collocation.guess_p
-    z = simulated(collocation, p)
-    adjoint = adjoint_gradient(collocation, z)
-    rows = [segment.grid_rows for segment in collocation.segments]
-    point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
-    forward = 2 * collocation.loss_scale * point.fit.score
-    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
-
-    def objective(at: np.ndarray) -> float:
-        return collocation.objective(simulated(collocation, at))
-
-    assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
+def remembering_core() -> Experiment:
+    return with_core(weighted(hung_cube(6)), prony=["prony_1"])
 
 
-@pytest.mark.parametrize("make", [hung_cube, bar_loaded])
-def test_gradients_where_a_wrench_tells_the_density(make, rng):
-    cube = with_wrenches(with_core(sensing(make(8))), [0.01 * rng.standard_normal((9, 6))])
-    collocation = Collocation([noisy_with(cube, TRUTH)], parameters())
-    p = collocation.guess_p
-    z = simulated(collocation, p)
-    adjoint = adjoint_gradient(collocation, z)
-    point = Horizon(collocation, [9]).evaluate(p, collocation.unpack(z)[1])
-    forward = 2 * collocation.loss_scale * point.fit.score
-    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
-
-    def objective(at: np.ndarray) -> float:
-        return collocation.objective(simulated(collocation, at))
-
-    assert_derivative(objective, lambda d: adjoint @ d, p, rng, tolerance=1e-5)
+TOLD = {name: (make, TRUTH) for name, make in MADE.items()}
+TOLD["memory"] = remembering_core, REMEMBERED
 
 
 @pytest.mark.parametrize(("name", "integrator"), [*zip(TOLD, cycle(["newmark", "midpoint"]))])
@@ -183,10 +150,3 @@ def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
     found = simulate(free, truth, integrator).markers_m
     expected = simulate(replace(free, body=body), stated, integrator).markers_m
     np.testing.assert_allclose(found, expected, atol=1e-10)
-
-
-def noisy_with(experiment: Experiment, truth) -> Experiment:
-    made = measured_with(experiment, truth)
-    tracks = made.markers.positions_m
-    noise = 1e-3 * np.random.default_rng(7).normal(size=tracks.shape)
-    return with_markers(made, tracks + noise)

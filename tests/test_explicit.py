@@ -1,4 +1,4 @@
-"""Memory as variables: derivatives of that program, and what methods find with it."""
+"""Memory as variables: the recursion of that program, and what methods find with it."""
 
 from __future__ import annotations
 

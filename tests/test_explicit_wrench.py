@@ -1,4 +1,4 @@
-"""Wrenches as variables: derivatives of that program, and what methods find with it."""
+"""Wrenches as variables: the equations of that program, and what methods find with it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from memories_small import ONE, TWO, guesses, recorded
-from problems_small import GUESS, TRUTH, bar_let_go, bar_loaded, driven_bar, hung_cube
+from memories_small import ONE, guesses, recorded
+from problems_small import GUESS, TRUTH, hung_cube
 from test_explicit import explicit, of_branches
 from test_static import ELASTIC_ONLY, HANGING, block
 from wrenches_small import sensed, sensing, with_wrenches, wristed_cube
@@ -61,27 +61,8 @@ def several() -> list[Experiment]:
     return [first, between, last]
 
 
-MADE: dict[str, Callable[[], Collocation]] = {
-    "known": lambda: Collocation([wristed_cube(5)], GUESS),
-    "all unknown": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN, frame="grasp")], GUESS),
-    "huber": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN)], GUESS, huber=1.5),
-    "bdf2": lambda: Collocation([wristed_cube(6, ALL_UNKNOWN)], GUESS, "bdf2"),
-    "substeps": lambda: Collocation([wristed_cube(3)], GUESS, "backward-euler", substeps=2),
-    "rows for grasps": lambda: Collocation([wristed_cube(5)], GUESS, explicit_grasps=True),
-    "density": lambda: Collocation([weighed(wristed_cube(5, ALL_UNKNOWN))], free_density()),
-    "loads": lambda: Collocation([sensing(bar_loaded(6))], GUESS),
-    "let go": lambda: Collocation([sensing(bar_let_go(8))], GUESS),
-    "driven": lambda: Collocation([sensing(driven_bar(5))], GUESS),
-    "driven memory": lambda: Collocation([felt_memory("driven-bar", 4)], guesses(TWO, 1.1)),
-    "static": lambda: Collocation([sensing(block("xyz", gravity_m_s2=HANGING))], GUESS),
-    "memory": lambda: Collocation([felt_memory("cube-with-nuisance")], guesses(TWO, 1.1)),
-    "memory let go": lambda: Collocation([felt_memory("bar-let-go", 8)], guesses(TWO, 1.1)),
-    "several": lambda: Collocation(several(), guesses(TWO, 1.1)),
-}
-
-
 def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):
-    collocation = MADE["all unknown"]()
+    collocation = Collocation([wristed_cube(6, ALL_UNKNOWN, frame="grasp")], GUESS)
     program, p = explicit(collocation), collocation.guess_p
     p[collocation.nq :] = 0.1
     positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_rows, 1)) for s in program.segments]

@@ -13,7 +13,6 @@ from problem_files import AT_TRUTH, replace_text, run_command, settings, write
 from problem_files import TRUTH as TINY_TRUTH
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from test_static import HANGING, block
-from test_wrench import assert_slopes
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.interior_point import InteriorPoint
@@ -94,13 +93,6 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
     inside = slice(3, -3)
     error = np.abs(found - expected - [0, 0, 9.81])[inside].max()
     assert error < 0.05 * np.abs(expected[inside]).max()
-
-
-@pytest.mark.parametrize(
-    ("scheme", "huber"), [("midpoint", None), ("bdf2", None), ("midpoint", 2.0)]
-)
-def test_slopes_of_them_forward_and_backward(scheme: str, huber: float | None):
-    assert_slopes(Collocation([noisy(swung(12))], GUESS, scheme, huber=huber))
 
 
 @pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)

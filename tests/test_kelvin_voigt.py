@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from checks import assert_derivative, relative_error
 from materials_small import theta_for
-from problems_small import IDEAL, point_markers
+from problems_small import IDEAL, point_markers, uneven_box
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
@@ -41,10 +41,7 @@ def small_body(
     damping: str = "kelvin-voigt",
 ) -> Body:
     """Six elements, no two alike."""
-    mesh = box_mesh((0.10, 0.12, 0.09), (1, 1, 1))
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
-    mesh = TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
-    return Body(mesh, material, 30.0, element, damping=damping, evaluator=evaluator)
+    return Body(uneven_box(1), material, 30.0, element, damping=damping, evaluator=evaluator)
 
 
 def state(body: Body, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import skfem
 from checks import assert_derivative, observed_order, relative_error
 from materials_small import ELASTIC, elastic, theta_for
-from problems_small import box, nodes_where, point_markers, smooth_poses, times
+from problems_small import box, nodes_where, point_markers, smooth_poses, times, uneven_box
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 from skfem.helpers import ddot, div, dot, eye, sym_grad
@@ -42,10 +42,7 @@ def of_a_user(F, lambda_pa, mu_pa):
 @cache
 def small_body(material: str | Callable = "neo-hookean", evaluator="auto", element=P0) -> Body:
     """Six elements, no two alike."""
-    mesh = box_mesh((0.10, 0.12, 0.09), (1, 1, 1))
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
-    mesh = TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
-    return Body(mesh, material, 30.0, element, damping="rayleigh", evaluator=evaluator)
+    return Body(uneven_box(1), material, 30.0, element, damping="rayleigh", evaluator=evaluator)
 
 
 def deformed(body: Body, rng: np.random.Generator, states: int = 1) -> np.ndarray:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from checks import assert_derivative, directional_derivative, relative_error
+from checks import directional_derivative, relative_error
 from memories_small import ONE, TWO, guesses, recorded, remembering, truth
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.comparison.shooting import Shooting, adjoint_gradient, simulated
+from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation, Part
@@ -121,19 +121,6 @@ def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation
     )
     found = collocation.pulled_back(z, multipliers) @ (0.1 * direction)
     assert found == pytest.approx(float(expected), rel=1e-8)
-
-
-def test_the_adjoint_gradient_is_that_of_simulations(rng):
-    collocation = Collocation([recorded("cube-with-nuisance", 6, 2)], guesses(TWO, 1.2))
-    p = some_parameters(collocation)
-    found = adjoint_gradient(collocation, simulated(collocation, p))
-    shared = np.arange(len(p)) < collocation.nq
-
-    def loss(at: np.ndarray) -> float:
-        return collocation.objective(simulated(collocation, at))
-
-    for scale in (shared, ~shared):  # the ones would drown among the others
-        assert_derivative(loss, lambda d: found @ d, p, rng, tolerance=1e-5, scale=scale)
 
 
 def test_the_memory_that_made_a_recording_is_found():

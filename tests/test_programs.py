@@ -25,9 +25,14 @@ from problems_small import (
     driven_bar,
     hung_cube,
     measured,
+    measured_with,
+    some_point,
+    times,
+    with_papers_damping,
 )
 from test_collocation import ALL_FIXED, ENGINEERING, LAYOUTS, POISSON_FIXED, WITH_PRIOR, swung
 from test_density import MADE as DENSE
+from test_density import REMEMBERED, remembering_core
 from test_density import parameters as free_densities
 from test_explicit import REGIONS, of_regions
 from test_explicit_wrench import ALL_UNKNOWN, felt_memory, free_density, several, weighed
@@ -35,14 +40,19 @@ from test_gauge import accelerometer, instrumented, noisy, strain_gauge
 from test_own_nuisance import ROWS
 from test_sharing import sharing, swung_again
 from test_static import HANGING, block
-from wrenches_small import sensing, wristed_cube
+from test_terms import MODELS, waved_bar
+from test_terms import parameters as stated
+from test_wrench import pressed
+from wrenches_small import EVERYTHING, felt, sensing, wristed_cube
 
 import collocation_sysid as cs
+from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
+from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.sweep import Sweep
-from collocation_sysid.recording import Experiment, Markers, Nuisance
+from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
 
 Make = Callable[[], Collocation]
 
@@ -103,13 +113,13 @@ def in_field(law: Callable, scheme: str = "midpoint", **memory) -> Collocation:
     return program(replace(cube, body=body), parameters=known, scheme=scheme)
 
 
-def instruments(huber: float | None = None) -> Collocation:
+def instruments(scheme: str = "midpoint", huber: float | None = None) -> Collocation:
     """Of a user's own, so blunt that what is known of the markers is not drowned."""
     cube = hung_cube(7, (1, 1, 2))
     made = cs.with_markers(cube, cube.markers.positions_m)
     made = noisy(instrumented(made, accelerometer(made.t_s[2:]), strain_gauge(made.t_s)))
     blunt = [replace(gauge, sigma=100 * gauge.sigma) for gauge in made.readings]
-    return program(replace(made, readings=blunt), huber=huber)
+    return program(replace(made, readings=blunt), scheme=scheme, huber=huber)
 
 
 def clamp(**changes) -> Collocation:
@@ -164,6 +174,23 @@ def regions_and_several() -> Collocation:
 def memory(name: str, scheme: str = "midpoint", **changes) -> Collocation:
     experiment = remembering(name, 4, 2, **changes)
     return program(experiment, parameters=guesses(TWO, 1.1), scheme=scheme)
+
+
+OWN_TIMES_S = times(22, 0.0031) + 0.0017
+
+
+def loaded_cube(steps: int = 8) -> Experiment:
+    """A cube that a mass joins and leaves, in the hand and below, and a force pulls there."""
+    cube = hung_cube(steps)
+    dt, held = cube.timestep_s, cube.grasps[0].nodes
+    free = np.setdiff1d(np.arange(len(cube.body.nodes_m)), held)
+    both = np.concatenate([held[:2], free[:2]])
+    return replace(
+        cube,
+        masses=[PointMass(both, 0.01, 1.6 * dt, until_s=5.2 * dt)],
+        forces=[Force(both[1:3], [[0.02, 0.01, 0.03]], from_s=2.3 * dt)],
+        nuisance=replace(EVERYTHING, joining_s=0.004),
+    )
 
 
 ONE_OF = {
@@ -249,6 +276,14 @@ PROGRAMS: dict[str, Make] = {
     "density, let go, bdf2": lambda: program(
         DENSE["let go"](), parameters=free_densities(), scheme="bdf2"
     ),
+    "density, memory": lambda: program(remembering_core(), parameters=free_densities(REMEMBERED)),
+    **{
+        f"constants, {name}": lambda body=body, truth=truth, off=off: program(
+            measured_with(waved_bar(4, evaluator="casadi", **body), truth),
+            parameters=stated(truth, off),
+        )
+        for name, (body, truth, off) in MODELS.items()
+    },
     "shared": shared_by_four,
     "shared sensors": shared_sensors,
     "a user's nuisances": users_nuisances,
@@ -259,7 +294,8 @@ PROGRAMS: dict[str, Make] = {
         smooth_drag, **{"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)}
     ),
     "instruments": instruments,
-    "instruments, huber": lambda: instruments(1e3),
+    "instruments, bdf2": lambda: instruments("bdf2"),
+    "instruments, huber": lambda: instruments(huber=1e3),
     "load cell": clamp,
     "load cell, bdf2, huber": lambda: clamp(scheme="bdf2", huber=2.0),
     "memory, relaxed": lambda: memory("hung-cube"),
@@ -280,9 +316,18 @@ PROGRAMS: dict[str, Make] = {
         weighed(wristed_cube(5, ALL_UNKNOWN)), parameters=free_density()
     ),
     "wrench, loads": lambda: program(sensing(bar_loaded(6))),
+    **{
+        f"wrench, everything, {scheme}": lambda scheme=scheme: program(
+            felt(sensing(loaded_cube(), OWN_TIMES_S, frame="grasp")), scheme=scheme
+        )
+        for scheme in SCHEMES
+    },
+    "wrench, everything, in the world": lambda: program(felt(sensing(loaded_cube(), OWN_TIMES_S))),
+    "wrench, paper's damping": lambda: program(felt(sensing(with_papers_damping(hung_cube(8))))),
     "wrench, let go": lambda: program(sensing(bar_let_go(8))),
     "wrench, driven": lambda: program(sensing(driven_bar(5))),
     "wrench, static": lambda: program(sensing(block("xyz", gravity_m_s2=HANGING))),
+    "wrench, static, uneven": lambda: program(felt(pressed(nuisance=Nuisance()))),
     "wrench, driven, memory": lambda: program(
         felt_memory("driven-bar", 4), parameters=guesses(TWO, 1.1)
     ),
@@ -294,23 +339,6 @@ PROGRAMS: dict[str, Make] = {
     ),
     "wrench, several": lambda: program(*several(), parameters=guesses(TWO, 1.1)),
 }
-
-
-def some_point(made: Collocation, rng: np.random.Generator) -> np.ndarray:
-    """Variables that satisfy nothing, what is carried neither."""
-    positions = []
-    for segment in made.segments:
-        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
-        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    p, nq = made.guess_p, made.nq
-    p[:nq] += 0.1 * rng.normal(size=nq)
-    p[nq:] += 0.5 * rng.normal(size=made.nphi)
-    lags = np.array(["lag of" in name for name in made.names], dtype=bool)
-    p[lags] = np.abs(p[lags]) + 0.1
-    z = made.pack(p, positions)
-    for carried in made.carried:
-        z[carried.variables] += 0.01 * rng.normal(size=carried.count)
-    return z
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
@@ -335,6 +363,8 @@ def test_matrices_are_those_of_differences_and_laid_out_in_order(name: str, rng)
         columns = np.repeat(np.arange(made.variables), np.diff(indptr))
         entries = columns * max(made.variables, made.constraints) + rows
         assert (np.diff(entries) > 0).all(), "an entry twice, or out of order"
+        assert columns.shape == rows.shape
+    assert (rows <= columns).all(), "an entry below the diagonal"
 
 
 @pytest.mark.parametrize("name", ["places unknown", "places unknown, huber", "wrench, huber"])
@@ -370,3 +400,26 @@ def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
         change = jacobian @ made.pack(p, moved)
         forced = jacobian @ made.pack(p, still)
         assert np.abs(change).max() <= 1e-9 * np.abs(forced).max()
+
+
+def can_be_simulated(name: str) -> bool:
+    made = PROGRAMS[name]()
+    return len(made.guess_p) > 0 and not made.explicit_grasps
+
+
+@pytest.mark.parametrize("name", [name for name in PROGRAMS if can_be_simulated(name)])
+def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(name: str, rng):
+    made = PROGRAMS[name]()
+    q, phi = made.parameters.guess_q, 0.1 + 0.3 * np.abs(rng.normal(size=made.nphi))
+    p = np.clip(np.concatenate([q, phi]), *made.bounds_p)
+    z = simulated(made, p)
+    rows = [segment.grid_rows for segment in made.segments]
+    point = Horizon(made, rows).evaluate(p, made.unpack(z)[1])
+    forward, backward = 2 * made.loss_scale * point.fit.score, adjoint_gradient(made, z)
+    assert point.loss == pytest.approx(made.objective(z) / made.loss_scale, rel=1e-7)
+    np.testing.assert_allclose(backward, forward, atol=1e-6 * np.abs(forward).max())
+
+    def loss(at: np.ndarray) -> float:
+        return made.objective(simulated(made, at))
+
+    assert_derivative(loss, lambda d: forward @ d, p, rng, 1e-5, 0.1, 1)

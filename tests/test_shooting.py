@@ -9,7 +9,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from checks import directional_derivative
 from problems_small import (
     GUESS,
     SMALL_EXPERIMENTS,
@@ -17,18 +16,15 @@ from problems_small import (
     as_theta,
     bar_in_two_hands,
     bar_let_go,
-    cube_with_nuisance,
     hung_cube,
     measured,
     noisy,
-    quadratic_bar,
     relative_errors,
 )
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.methods.comparison import shooting
 from collocation_sysid.methods.comparison.shooting import Shooting, adjoint_gradient, simulated
-from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameter, Parameters
@@ -61,25 +57,6 @@ def cube() -> Collocation:
 
 
 # Gradients
-
-
-@pytest.mark.parametrize("huber", [None, 2.0])
-@pytest.mark.parametrize("make", [hung_cube, bar_let_go, quadratic_bar, cube_with_nuisance])
-def test_both_gradients_are_those_of_differences(make, huber, rng):
-    collocation = with_noise(make(), huber=huber)
-    p = some_parameters(collocation)
-    z = simulated(collocation, p)
-    adjoint = adjoint_gradient(collocation, z)
-    rows = [segment.grid_rows for segment in collocation.segments]
-    point = Horizon(collocation, rows).evaluate(p, collocation.unpack(z)[1])
-    forward = 2 * collocation.loss_scale * point.fit.score
-    np.testing.assert_allclose(adjoint, forward, atol=1e-9 * np.abs(forward).max())
-    direction = rng.normal(size=len(p))
-    differences = directional_derivative(
-        lambda at: collocation.objective(simulated(collocation, at)), p, direction
-    )
-    size = float(np.linalg.norm(adjoint) * np.linalg.norm(direction))
-    assert adjoint @ direction == pytest.approx(float(differences), abs=1e-6 * size)
 
 
 def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():

@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from checks import assert_derivative, relative_error
+from checks import relative_error
 from problems_small import bar_in_two_hands, measured_with
 
 from collocation_sysid.fem.body import Body
@@ -98,25 +98,6 @@ def test_both_methods_recover_the_truth(name):
     values = [[*solution.parameters.values()] for solution in (reduced, interior)]
     np.testing.assert_allclose(*values, rtol=1e-5)
     assert reduced.kkt_residual < 1e-8
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", MODELS)
-def test_derivatives_of_the_program_by_any_number_of_parameters(name, rng):
-    collocation = collocation_of(name)
-    z = METHODS["reduced-space"](max_iterations=2)(collocation).z
-    scale = np.concatenate([np.full(collocation.nq, 0.1), np.full(len(z) - collocation.nq, 0.01)])
-    jacobian = collocation.jacobian(z)
-    assert_derivative(
-        collocation.constraint_values, lambda d: jacobian @ d, z, rng, tolerance=1e-7, scale=scale
-    )
-    weights = rng.standard_normal(collocation.constraints)
-    hessian = collocation.hessian(z, 1.0, weights)
-
-    def slope(at: np.ndarray) -> np.ndarray:
-        return collocation.gradient(at) + collocation.jacobian(at).T @ weights
-
-    assert_derivative(slope, lambda d: hessian @ d, z, rng, tolerance=1e-7, scale=scale)
 
 
 def test_error_bars_of_regions_follow_the_noise(rng):

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from checks import assert_derivative, observed_order
 from materials_small import LAME, elastic, theta_for
 from problem_files import AT_TRUTH, TRUTH, run_command, settings
+from problems_small import uneven_box
 from scipy.sparse.linalg import eigsh, spsolve
 from scipy.spatial.transform import Rotation
 
@@ -32,10 +33,7 @@ LENGTH_M = 0.03  # a large change of a position
 @cache
 def small_body(material: str = "neo-hookean", evaluator: str = "auto") -> Body:
     """Six elements, no two alike."""
-    box = box_mesh((0.10, 0.12, 0.09), (1, 1, 1))
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, box.points_m.shape)
-    mesh = TetMesh(box.points_m + jitter, box.tetrahedra)
-    return Body(mesh, material, 30.0, "tet10", damping="rayleigh", evaluator=evaluator)
+    return Body(uneven_box(1), material, 30.0, "tet10", damping="rayleigh", evaluator=evaluator)
 
 
 @pytest.fixture

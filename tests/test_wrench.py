@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checks import relative_error
-from memories_small import guesses, remembering, truth
 from problems_small import (
     EDGE_M,
     GUESS,
     IDEAL,
-    SMALL_EXPERIMENTS,
     TRUTH,
     as_theta,
     bar_in_two_hands,
@@ -21,12 +19,11 @@ from problems_small import (
     nodes_where,
     times,
     vertex_markers,
-    with_papers_damping,
 )
 from scipy.spatial.transform import Rotation
-from wrenches_small import fitted, sensing, with_wrenches, wristed_cube
+from wrenches_small import EVERYTHING, felt, fitted, sensing, wristed_cube
 
-from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
+from collocation_sysid.methods.comparison.shooting import simulated
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.schemes import SCHEMES
@@ -40,17 +37,7 @@ from collocation_sysid.program.wrench_channel import (
     smoothed,
     smoothed_slope,
 )
-from collocation_sysid.recording import Experiment, Force, Grasp, Nuisance, PointMass, PoseSequence
-
-EVERYTHING = Nuisance(
-    gravity_rad=0.03,
-    hand_eye_m=0.002,
-    hand_eye_rad=0.02,
-    sensor_time_s=0.001,
-    sensor_lag_s=0.003,
-    tool_kg=0.01,
-    tool_m=0.02,
-)
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 
 def at_truth(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Part:
@@ -141,97 +128,14 @@ def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
     np.testing.assert_array_equal(moving.channel.grid, [1])
 
 
-# Derivatives --------------------------------------------------------------------------------------
-
-
-def loaded_cube(steps: int = 12) -> Experiment:
-    """A cube that a mass joins and leaves, in the hand and below, and a force pulls there."""
-    cube = hung_cube(steps)
-    dt, held = cube.timestep_s, cube.grasps[0].nodes
-    free = np.setdiff1d(np.arange(len(cube.body.nodes_m)), held)
-    both = np.concatenate([held[:2], free[:2]])
-    return replace(
-        cube,
-        name="loaded",
-        masses=[PointMass(both, 0.01, 2.6 * dt, until_s=7.2 * dt)],
-        forces=[Force(both[1:3], [[0.02, 0.01, 0.03]], from_s=3.3 * dt)],
-        nuisance=replace(EVERYTHING, joining_s=0.004),
-    )
-
-
-def cases() -> list:
-    own = times(33, 0.0031) + 0.0017
-    with_everything = replace(wristed_cube(nuisance=EVERYTHING, frame="grasp"), name="everything")
-    made = [(name, make(12)) for name, make in SMALL_EXPERIMENTS.items()]
-    found = [(name, sensing(each), "midpoint", {}) for name, each in made]
-    found += [(f"cube-{scheme}", wristed_cube(), scheme, {}) for scheme in SCHEMES]
-    found += [
-        (f"everything-{scheme}", sensing(with_everything, own, frame="grasp"), scheme, {})
-        for scheme in SCHEMES
-    ]
-    found += [
-        (f"loaded-{scheme}", sensing(loaded_cube(), own, frame="grasp"), scheme, {})
-        for scheme in SCHEMES
-    ]
-    found += [
-        ("everything-in-the-world", sensing(with_everything, own), "midpoint", {}),
-        ("substeps", sensing(hung_cube(8), own[:20]), "midpoint", {"substeps": 2}),
-        ("huber", sensing(hung_cube(8), own[:20]), "midpoint", {"huber": 1.5}),
-        ("papers-damping", sensing(with_papers_damping(hung_cube(8))), "midpoint", {}),
-    ]
-    return [pytest.param(*each[1:], id=each[0]) for each in found]
-
-
-def noisy_wrenches(experiment: Experiment) -> Experiment:
-    rng = np.random.default_rng(3)
-    values = [
-        np.where(rng.random(w.values.shape) < 0.1, np.nan, 0.01 * rng.normal(size=w.values.shape))
-        for w in (grasp.wrench for grasp in experiment.grasps)
-        if w is not None
-    ]
-    return with_wrenches(experiment, values)
-
-
 def some_p(collocation: Collocation) -> np.ndarray:
     low, high = collocation.bounds_p
     phi = np.abs(0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)) + 0.1
     return np.clip(np.concatenate([collocation.parameters.guess_q, phi]), low, high)
 
 
-@pytest.mark.parametrize(("experiment", "scheme", "options"), cases())
-def test_slopes_forward_and_backward_are_those_of_the_loss(
-    experiment: Experiment, scheme: str, options: dict
-):
-    collocation = Collocation([noisy_wrenches(experiment)], GUESS, scheme, **options)
-    assert_slopes(collocation)
-
-
-def test_slopes_with_memory():
-    cube = noisy_wrenches(sensing(remembering("cube-with-nuisance", 12, 2)))
-    assert_slopes(Collocation([cube], guesses(truth(2))))
-
-
-def assert_slopes(collocation: Collocation) -> None:
-    p = some_p(collocation)
-    z = simulated(collocation, p)
-    (segment,) = collocation.segments
-    point = Horizon(collocation, [segment.grid_rows]).evaluate(p, collocation.unpack(z)[1])
-    scale = 1 / collocation.loss_scale
-    assert point.loss == pytest.approx(scale * collocation.objective(z), rel=1e-9)
-    forward = 2 * point.fit.score
-    backward = scale * adjoint_gradient(collocation, z)
-    assert relative_error(backward, forward) < 1e-8
-    direction = np.random.default_rng(2).standard_normal(len(p))
-
-    def loss(steps: float) -> float:
-        return scale * collocation.objective(simulated(collocation, p + 1e-4 * steps * direction))
-
-    differences = (8 * (loss(1) - loss(-1)) - (loss(2) - loss(-2))) / 12e-4
-    assert forward @ direction == pytest.approx(differences, rel=2e-6)
-
-
 def test_rows_that_are_continued_sense_the_same():
-    collocation = Collocation([noisy_wrenches(wristed_cube(nuisance=EVERYTHING))], GUESS)
+    collocation = Collocation([felt(wristed_cube(nuisance=EVERYTHING))], GUESS)
     p = some_p(collocation)
     (x,) = collocation.unpack(simulated(collocation, p))[1]
     part = Horizon(collocation, [8]).evaluate(p, [x[:8]])
@@ -314,12 +218,8 @@ def test_a_platen_gives_what_the_plate_and_the_weight_take():
     assert (np.diff(above[:, 2]) < 0).all()
 
 
-def test_slopes_of_a_static_experiment():
-    assert_slopes(Collocation([noisy_wrenches(pressed(nuisance=Nuisance()))], GUESS))
-
-
 def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
-    (segment,) = fitted(noisy_wrenches(wristed_cube(8, frame="grasp")), GUESS).segments
+    (segment,) = fitted(felt(wristed_cube(8, frame="grasp")), GUESS).segments
     (sensor,) = segment.sensors
     grasp, rows, dofs = sensor.channel.grasp, segment.grid_rows, len(segment.sensed_dofs)
     poses = grasp.poses

@@ -15,6 +15,15 @@ from collocation_sysid.recording import Experiment, Nuisance, Wrench
 
 SIGMA_N, SIGMA_NM = 1e-3, 1e-4
 POINT_M = (0.02, -0.01, 0.12)
+EVERYTHING = Nuisance(
+    gravity_rad=0.03,
+    hand_eye_m=0.002,
+    hand_eye_rad=0.02,
+    sensor_time_s=0.001,
+    sensor_lag_s=0.003,
+    tool_kg=0.01,
+    tool_m=0.02,
+)
 
 
 def sensing(experiment: Experiment, t_s: np.ndarray | None = None, **changes) -> Experiment:
@@ -45,6 +54,17 @@ def with_wrenches(experiment: Experiment, values: list[np.ndarray]) -> Experimen
             for grasp in experiment.grasps
         ],
     )
+
+
+def felt(experiment: Experiment) -> Experiment:
+    """The experiment with wrenches that nobody would measure, a tenth of them missing."""
+    rng = np.random.default_rng(3)
+    values = [
+        np.where(rng.random(w.values.shape) < 0.1, np.nan, 0.01 * rng.normal(size=w.values.shape))
+        for w in (grasp.wrench for grasp in experiment.grasps)
+        if w is not None
+    ]
+    return with_wrenches(experiment, values)
 
 
 def sensed(
