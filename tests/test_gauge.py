@@ -205,11 +205,6 @@ def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
         assert np.abs(found.wrenches[0] - found.readings[0])[there].max() < 1e-4 * size
 
 
-@pytest.mark.parametrize("huber", [None, 2.0])
-def test_slopes_of_a_load_cell_forward_and_backward(huber: float | None):
-    assert_slopes(Collocation([noisy(clamped(12))], GUESS, "midpoint", huber=huber))
-
-
 @pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
 def test_the_truth_is_found_from_a_load_cell_and_a_foil_alone(method):
     solution = method(Collocation([clamped()], GUESS))
