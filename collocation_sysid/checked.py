@@ -51,6 +51,8 @@ _EXPECTED = {
 
 def expected(fault: Mapping[str, Any]) -> str:
     """What a value should have been, by one of pydantic's complaints about it."""
+    if fault["type"] == "value_error":
+        return str(fault["ctx"]["error"]).partition("expected ")[2]
     if fault["type"] in _EXPECTED:
         return _EXPECTED[fault["type"]].format(**fault.get("ctx", {}))
     return fault["msg"].removeprefix("Input should be ")

@@ -4,17 +4,45 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, Literal, Optional, get_type_hints
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal, Union, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    Tag,
+    create_model,
+    model_validator,
+)
 
 from .checked import Boundless, Finite
-from .stated import attributes, documented, keys_of, optional_keys
+from .errors import InputError
+from .stated import attributes, documented, keys_of
 
 Vector = tuple[Finite, Finite, Finite]
 Corner = tuple[Boundless, Boundless, Boundless]
 Unit = Literal["m", "cm", "mm", "in"]
+
+
+@dataclass(frozen=True)
+class ByForm:
+    """Which of its two forms a key takes: a value of these types is of the first.
+
+    A tag in <> tells them apart; messages leave it out.
+    """
+
+    first: type | tuple[type, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        first, second = get_args(source)
+        forms = Union[Annotated[first, Tag("<first>")], Annotated[second, Tag("<second>")]]  # noqa: UP007
+        return handler.generate_schema(Annotated[forms, Discriminator(self._tag)])
+
+    def _tag(self, value: Any) -> str:
+        return "<first>" if isinstance(value, self.first) else "<second>"
 
 
 class Section(BaseModel):
@@ -45,12 +73,8 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
         The table with what else a file may say.
     """
     stated = [key for _, key in keys_of(kind)]
-    optional = optional_keys(kind)
     keys: dict[str, Any] = {
-        key.name: (Optional[key.form], Field(None, description=key.said))  # noqa: UP045
-        if key.name in optional
-        else (key.form, Field(description=key.said))
-        for key in stated
+        key.name: (key.form, Field(key.default, description=key.said)) for key in stated
     }
     checks: dict[str, Any] = {
         f"_{key.name}_or": model_validator(mode="after")(_either(key.constant, key.name))
@@ -68,6 +92,25 @@ def _options(kind: Any) -> dict[str, Any]:
         each.name: (types[each.name], Field(each.default, description=said.get(each.name)))
         for each in fields(kind)
     }
+
+
+def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:
+    """The fields of a class by what a table says of them; those of files are to be read yet.
+
+    Raises
+    ------
+    InputError
+        For a value that cannot be, naming its key in the table that is `where`.
+    """
+    fields: dict[str, Any] = {}
+    for name, key in keys_of(kind):
+        value = getattr(section, key.name)
+        if value is not None and key.constant is None:
+            try:
+                fields[name] = key.read(value) if key.read else value
+            except InputError as error:
+                raise error.located(None, f"{where}.{key.name}") from error
+    return fields
 
 
 def _either(*names: str) -> Callable[[Any], Any]:

@@ -21,8 +21,8 @@ from collocation_sysid.plan.design.designing import Judge, design
 from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
 from collocation_sysid.plan.design.information import LinearRecording, Recording, shared_information
 from collocation_sysid.plan.design.motion import angular_motion
-from collocation_sysid.plan.progress import DesignProgress
 from collocation_sysid.plan.design.search import search
+from collocation_sysid.plan.progress import DesignProgress
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.marching import march

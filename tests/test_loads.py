@@ -111,7 +111,7 @@ def test_a_force_is_linear_between_its_rows_and_nothing_outside():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: PointMass([0], 0.0), "expected more than 0"),
+        (lambda: PointMass([0], 0.0), "expected a number above 0"),
         (lambda: PointMass([], 1.0), "found none"),
         (lambda: Force([0], [[0, 0, 0], [0, 0, 1]]), "expected t_s"),
         (lambda: Force([0], [[0, 0, 0], [0, 0, 1]], [1.0, 1.0]), "row 2: .*time must increase"),

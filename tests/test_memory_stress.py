@@ -268,5 +268,5 @@ def test_descriptions_that_make_no_sense_are_refused():
         body_of(prony=["a b"])
     with pytest.raises(InputError, match="loaded_since_s"):
         remembering("released-cube", 5, loaded_since_s=1.0)
-    with pytest.raises(InputError, match="loaded_since_s = -1"):
+    with pytest.raises(InputError, match="loaded_since_s is -1"):
         remembering("hung-cube", 5, loaded_since_s=-1.0)

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from itertools import groupby
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Optional
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, create_model, model_validator
+from pydantic import AfterValidator, Field, create_model, model_validator
 
 from ..checked import Positive, Text
 from ..recording import Nuisance
 from ..recording.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
-from ..section import Section, given_keys
+from ..section import ByForm, Section, given_keys
 
 KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}
 
@@ -68,18 +68,6 @@ class Prior(Scoped):
         return self
 
 
-def or_none(section: Any) -> Any:
-    """The type of a key that is a table, or "none"."""
-    return Annotated[
-        Annotated[Literal["none"], Tag("<none>")] | Annotated[section, Tag("<table>")],
-        Discriminator(_form),
-    ]
-
-
-def _form(value: Any) -> str:
-    return "<none>" if isinstance(value, str) else "<table>"
-
-
 def _prior(key: str, rows: list[NuisanceRow]) -> type[Section]:
     """The table of a key."""
     # What another prior goes with has to be there.
@@ -101,7 +89,8 @@ def _section() -> type[Section]:
     fields: dict[str, Any] = {}
     for key, rows in KEYS.items():
         said = " ".join(f"{row.said[0].upper()}{row.said[1:]}: {_said(row)}." for row in rows)
-        fields[key] = (or_none(_prior(key, rows)) | None, Field(None, description=said))
+        kind: Any = Annotated[Literal["none"] | _prior(key, rows), ByForm(str)]
+        fields[key] = (kind | None, Field(None, description=said))
     said = "[[experiment.nuisance.own]] tables: what a Python file makes of markers' readings."
     fields["own"] = (list[OwnRow], Field(default_factory=list, description=said))
     said = (
@@ -119,7 +108,7 @@ NuisanceSection = _section()
 if TYPE_CHECKING:
     NuisanceOrNone = Section | Literal["none"]
 else:
-    NuisanceOrNone = or_none(NuisanceSection)
+    NuisanceOrNone = Annotated[Literal["none"] | NuisanceSection, ByForm(str)]
 
 
 def nuisance_of(

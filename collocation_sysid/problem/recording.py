@@ -36,9 +36,8 @@ from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.coverage import refuse_untold
 from ..recording.gauge_files import read_gauge
 from ..recording.nuisance import NuisanceRow
-from ..recording.selected import NodesSection, selection
 from ..recording.wrench_files import within
-from ..section import Section
+from ..section import Section, stated_in
 from ..stated import keys_of
 from ..statistics.modal import doubts
 from .nuisance_schema import OwnRow, nuisance_of
@@ -54,6 +53,9 @@ from .recording_schema import (
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
 Build = Callable[[Markers], Experiment]
+
+# The field of an experiment that the tables of each word fill.
+LISTS = {"mass": "masses", "force": "forces", "tendon": "tendons", "pressure": "pressures"}
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
@@ -116,31 +118,20 @@ class RecordingReader:
             self._grasp(k, grasp, sequence, t_s)
             for k, (grasp, sequence) in enumerate(zip(section.grasps, poses, strict=True))
         )
-        masses = self._made("mass")
-        forces = self._made("force")
-        tendons = self._made("tendon")
-        pressures = self._made("pressure")
+        loads: dict[str, Any] = {name: self._made(word) for word, name in LISTS.items()}
         readings = [self._reading(k, each, t_s) for k, each in enumerate(section.reading)]
 
         def build(markers: Markers) -> Experiment:
             return Experiment(
                 name=section.name,
-                kind=section.kind,
                 body=self.body,
                 t_s=t_s,
                 grasps=grasps,
                 markers=markers,
-                gravity_m_s2=np.array(section.gravity_m_s2),
-                start=section.start,
-                start_rule=section.start_rule,
-                loaded_since_s=np.inf if section.loaded_since_s is None else section.loaded_since_s,
-                validation=section.validation,
-                masses=masses,
-                forces=forces,
-                tendons=tendons,
-                pressures=pressures,
                 readings=readings,
                 nuisance=nuisance_of(section.nuisance, self.row_of),
+                **stated_in(section, Experiment, ""),
+                **loads,
             )
 
         n = len(self.body.nodes_m)
@@ -153,8 +144,9 @@ class RecordingReader:
             )
         return self._place(t_s, table, build)
 
-    def _grasp_key(self, k: int, key: str) -> str:
-        return f"grasp.{k}.{key}" if len(self.section.grasps) > 1 else f"grasp.{key}"
+    def _grasp_key(self, k: int, key: str = "") -> str:
+        one = f"grasp.{k}" if len(self.section.grasps) > 1 else "grasp"
+        return f"{one}.{key}" if key else one
 
     def _poses(self, k: int, grasp: GraspSection) -> PoseSequence:
         if grasp.markers is not None:
@@ -211,17 +203,17 @@ class RecordingReader:
         self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
 
     def _grasp(self, k: int, grasp: GraspSection, poses: PoseSequence, t_s: Array) -> Grasp:
-        nodes = self._nodes(grasp.nodes, self._grasp_key(k, "nodes"))
-        return Grasp(
-            nodes,
-            poses,
-            **grasp.model_dump(
-                include={"axes", "from_s", "until_s", "sigma_m", "sigma_rad"}, exclude_none=True
-            ),
-            selection=selection(grasp.nodes),
+        where = self._grasp_key(k, "wrench")
+        made = Grasp(
+            **stated_in(grasp, Grasp, self._grasp_key(k)),
+            poses=poses,
             zero=self._zero(k, grasp),
-            wrench=grasp.wrench and self._wrench(grasp.wrench, self._grasp_key(k, "wrench"), t_s),
+            wrench=grasp.wrench and self._wrench(grasp.wrench, where, t_s),
         )
+        try:
+            return made.on(self.body, t_s)
+        except InputError as error:
+            raise error.located(None, self._grasp_key(k, "nodes")) from error
 
     def _zero(self, k: int, grasp: GraspSection) -> str:
         """The axes of its displacement."""
@@ -249,20 +241,21 @@ class RecordingReader:
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
         """What is measured within the experiment's time; zeros to simulate without a file."""
         name = str(self.section.file_of(section))
-        given = section.model_dump(include={"frame", "point_m"})
-        given["sigma_n"] = section.sigma_n / section.symmetry
-        given["sigma_nm"] = section.sigma_nm and section.sigma_nm / section.symmetry
+        said: dict[str, Any] = stated_in(section, Wrench, key)
+        for sigma in ("sigma_n", "sigma_nm"):
+            if sigma in said:
+                said[sigma] /= section.symmetry
         try:
             if self.simulation and not (self.folder / name).exists():
-                given["sigma_nm"] = section.sigma_nm or 1.0
-                return Wrench(t_s, np.zeros((len(t_s), 6)), **given)
+                said.setdefault("sigma_nm", 1.0)
+                return Wrench(t_s, np.zeros((len(t_s), 6)), **said)
             at_s, values = self._read_wrench(section, key)
             static = self.section.kind == "static"
             inside = within(at_s, t_s, name, static)
             if static and not self.section.marked:
                 inside &= _among(at_s, t_s)
             self._note(f"{name}: {inside.sum()} of {len(at_s)} samples are used")
-            return Wrench(at_s[inside], values[inside], **given)
+            return Wrench(at_s[inside], values[inside], **said)
         except InputError as error:
             raise error.located(None, key) from error
 
@@ -299,27 +292,17 @@ class RecordingReader:
         )
 
     def _one_made(self, kind: type, table: Section, where: str, name: str) -> Any:
-        given: dict[str, Any] = {"name": name} if "name" in type(table).model_fields else {}
+        usual = {"name": name} if "name" in type(table).model_fields else {}
+        said = usual | stated_in(table, kind, where)
         for field, key in keys_of(kind):
-            if (said := getattr(table, key.name)) is None:
-                continue
-            if key.constant is not None and key.read is not None:
-                file = existing_file(self.folder, said, f"{where}.{key.name}")
-                given[field], given[key.constant] = key.read(file)
-            else:
-                given[field] = key.read(said) if key.read else said
+            if key.constant and key.read and (named := getattr(table, key.name)):
+                file = existing_file(self.folder, named, f"{where}.{key.name}")
+                said[field], said[key.constant] = key.read(file)
         try:
-            made = kind(**given)
-            where = f"{where}.nodes" if "nodes" in given else where
-            return made.on(self.body)
+            where = f"{where}.nodes" if "nodes" in said else where
+            return kind(**said).on(self.body)
         except InputError as error:
             raise error.located(None, where) from error
-
-    def _nodes(self, nodes: NodesSection | str, key: str) -> NDArray[np.int64]:
-        try:
-            return self.body.select(selection(nodes))
-        except InputError as error:
-            raise InputError(error.message, None, key) from error
 
     def _table(self, poses: list[PoseSequence]) -> MarkerTable:
         """The measured tracks; to simulate without them, zeros at the poses' times."""

@@ -6,15 +6,14 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..checked import AtLeastOne, Boundless, Finite, Flag, NotNegative, Positive, Text
-from ..recording import Force, PointMass, Pressure, Tendon
+from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
+from ..recording import Experiment, Force, Grasp, PointMass, Pressure, Tendon, Wrench
 from ..recording.poses import QUATERNION_NORM_TOLERANCE
-from ..recording.selected import Nodes
-from ..section import Section, Unit, Vector, given_keys, section_of
+from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 
@@ -93,7 +92,7 @@ class DisplacementSection(TableSection):
     length_m: Positive | None = None
 
 
-class WrenchSection(TableSection):
+class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
     """The force and the torque that the grasp was measured to give the body.
 
     Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
@@ -106,28 +105,10 @@ class WrenchSection(TableSection):
     symmetry : int
         The mesh is one of so many equal parts of what was measured, 4 for a quarter: forces and
         sigmas are divided by it.
-    sigma_n : float
-        Standard deviation of the noise of each force [N].
-    sigma_nm : float, optional
-        Standard deviation of the noise of each torque [N m]; needed with any.
-    frame : {"world", "grasp"}
-        Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
-        body as the grasp carries it.
-    point_m : (3,) array
-        Point [x, y, z] of the torque: fixed in the world, or on the undeformed body and moving
-        along.
     """
 
     area_m2: Positive | None = None
     symmetry: AtLeastOne = 1
-    sigma_n: Positive
-    sigma_nm: Positive | None = None
-    frame: Literal["world", "grasp"] = "world"
-    point_m: Vector = (0.0, 0.0, 0.0)
-
-
-def _displacement_form(value: Any) -> str:
-    return "<file>" if isinstance(value, str) else "<table>"
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
@@ -138,22 +119,15 @@ if TYPE_CHECKING:
     Displacement = DisplacementSection
 else:
     Displacement = Annotated[
-        Annotated[DisplacementSection, Tag("<table>")]
-        | Annotated[Text, AfterValidator(_as_table), Tag("<file>")],
-        Discriminator(_displacement_form),
+        Annotated[Text, AfterValidator(_as_table)] | DisplacementSection, ByForm(str)
     ]
 
 
-class GraspSection(Section):
+class GraspSection(section_of(Grasp, "GraspSection")):
     """Nodes held by a gripper or a test bench, and how it moves.
 
     Attributes
     ----------
-    nodes : Nodes
-        Selection: a table of box_m, ball_m or indices, or the name of a point array or physical
-        group.
-    axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
-        Axes of the world along which it holds; the nodes slide along the others.
     poses : str, optional
         Poses, CSV or .npz; held where they are without poses or markers.
     displacement : Displacement, optional
@@ -175,21 +149,10 @@ class GraspSection(Section):
         quaternion_xyzw.
     interpolation : {"smooth", "linear", "hold"}
         Motion between the samples of poses.
-    sigma_m : float, optional
-        Standard deviation of the noise in each position of poses.
-    sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad].
     wrench : WrenchSection, optional
         What it was measured to give the body: file, sigma_n, sigma_nm, …
-    from_s : float, optional
-        First time at which it holds.
-    until_s : float, optional
-        Last time at which it holds; at the start's, the body is let go from its equilibrium in this
-        grasp.
     """
 
-    nodes: Nodes
-    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = "xyz"
     poses: Text | None = None
     displacement: Displacement | None = None
     quaternion: Literal["xyzw", "wxyz"] | None = None
@@ -199,11 +162,7 @@ class GraspSection(Section):
     max_residual_m: Positive | None = None
     gripper_to_body: TransformSection | None = None
     interpolation: Literal["smooth", "linear", "hold"] = "smooth"
-    sigma_m: NotNegative | None = None
-    sigma_rad: NotNegative | None = None
     wrench: WrenchSection | None = None
-    from_s: Finite | None = None
-    until_s: Finite | None = None
 
     @model_validator(mode="after")
     def _window(self) -> GraspSection:
@@ -239,21 +198,9 @@ class GraspSection(Section):
         return self
 
 
-def _sigma_form(value: Any) -> str:
-    return "<by marker>" if isinstance(value, dict) else "<for all>"
-
-
-Sigma = Annotated[
-    Annotated[Positive, Tag("<for all>")] | Annotated[dict[str, Positive], Tag("<by marker>")],
-    Discriminator(_sigma_form),
-]
-
-
-ReferenceSigma = Annotated[
-    Annotated[NotNegative, Tag("<for all>")]
-    | Annotated[dict[str, NotNegative], Tag("<by marker>")],
-    Discriminator(_sigma_form),
-]
+# For each marker by name, or for all.
+Sigma = Annotated[dict[str, Positive] | Positive, ByForm(dict)]
+ReferenceSigma = Annotated[dict[str, NotNegative] | NotNegative, ByForm(dict)]
 
 
 class MarkersSection(Section):
@@ -356,17 +303,16 @@ else:
     )
 
 
-def _grasp_form(value: Any) -> str:
-    return "<several>" if isinstance(value, list) else "<one>"
+Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
 
 
-Grasps = Annotated[
-    Annotated[GraspSection, Tag("<one>")] | Annotated[list[GraspSection], Tag("<several>")],
-    Discriminator(_grasp_form),
-]
+class NamedSection(Section):
+    """Something whose name is one of files."""
+
+    name: Annotated[str, AfterValidator(_file_name)]
 
 
-class ReadingSection(Section):
+class ReadingSection(NamedSection):
     """A reading of the user's own: a Python function of what it looks at and of its unknowns.
 
     Attributes
@@ -394,7 +340,6 @@ class ReadingSection(Section):
         Standard deviation of each of its unknowns, about zero, by the argument's name.
     """
 
-    name: Annotated[str, AfterValidator(_file_name)]
     code: Text
     function: Text
     sigma: Positive
@@ -406,14 +351,11 @@ class ReadingSection(Section):
     unknowns: dict[str, Positive] = Field(default_factory=dict)
 
 
-class ExperimentSection(Section):
+class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection)):
     """One recording.
 
     Attributes
     ----------
-    kind : {"dynamic", "static"}
-        A motion; or samples each of which is an equilibrium of its own, at any times (with memory,
-        quasi-static in time).
     file : str, optional
         Table that displacements and wrenches are read from which name no file: CSV as a test bench
         writes it.
@@ -421,11 +363,6 @@ class ExperimentSection(Section):
         A table of nodes and poses, or a list of them.
     markers : MarkersSection
         Tracked points; none are needed where the wrench of a grasp is measured.
-    loaded_since_s : float, optional
-        How long a body with memory has been in the shape of its equilibrium; it has relaxed by
-        default.
-    gravity_m_s2 : (3,) array
-        Acceleration of gravity [x, y, z].
     window_s : list, optional
         First and last time to use [start, end].
     resample_hz : float, optional
@@ -444,19 +381,12 @@ class ExperimentSection(Section):
         [[experiment.reading]] tables: instruments of the user's own.
     nuisance : NuisanceOrNone
         What is estimated of this recording alone, as a table; or "none".
-    validation : bool
-        Not fitted, only predicted.
     """
 
-    name: Annotated[str, AfterValidator(_file_name)]
-    kind: Literal["dynamic", "static"] = "dynamic"
     file: Text | None = None
     grasp: Grasps = Field(default_factory=list)
     markers: MarkersSection = Field(default_factory=lambda: MarkersSection.model_construct())
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
-    start_rule: Literal["standard", "paper"] = "standard"
-    loaded_since_s: NotNegative | None = None
-    gravity_m_s2: Vector = (0.0, 0.0, -9.81)
     window_s: tuple[Boundless, Boundless] | None = None
     resample_hz: Positive | None = None
     every: AtLeastOne = 1
@@ -466,7 +396,6 @@ class ExperimentSection(Section):
     pressure: list[PressureSection] = Field(default_factory=list)
     reading: list[ReadingSection] = Field(default_factory=list)
     nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
-    validation: Flag = False
 
     @property
     def marked(self) -> bool:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from ..checked import Finite, Flag, Positive, Text, Whole
+from ..checked import Finite, Flag, Positive, Text
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.selected import Nodes
-from ..section import Section, Unit, given_keys, require_one, section_of
+from ..section import ByForm, Section, Unit, given_keys, require_one, section_of
 from .options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
@@ -58,14 +58,7 @@ class NodeForceSection(CodeSection):
     nodes: Nodes | None = None
 
 
-def _material_form(value: Any) -> str:
-    return "<name>" if isinstance(value, str) else "<code>"
-
-
-Material = Annotated[
-    Annotated[CodeSection, Tag("<code>")] | Annotated[MaterialName, Tag("<name>")],
-    Discriminator(_material_form),
-]
+Material = Annotated[MaterialName | CodeSection, ByForm(str)]
 
 
 class RegionSection(Section):
@@ -256,10 +249,6 @@ class ParameterSection(Section):
         return self
 
 
-def _parameter_form(value: Any) -> str:
-    return "<table>" if isinstance(value, (dict, ParameterSection)) else "<value>"
-
-
 def _flat(given: Any, *, front: str = "") -> Any:
     """Regions' parameters, ``core.mu_pa``, also where they are written as tables in a table."""
     if not isinstance(given, dict):
@@ -275,16 +264,9 @@ def _flat(given: Any, *, front: str = "") -> Any:
     return flat
 
 
-Parameters = Annotated[
-    dict[
-        str,
-        Annotated[
-            Annotated[ParameterSection, Tag("<table>")] | Annotated[Finite, Tag("<value>")],
-            Discriminator(_parameter_form),
-        ],
-    ],
-    BeforeValidator(_flat),
-]
+OneParameter = Annotated[ParameterSection | Finite, ByForm((dict, ParameterSection))]
+Parameters = Annotated[dict[str, OneParameter], BeforeValidator(_flat)]
+Substeps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
 
 
 class TranscriptionSection(Section):
@@ -300,11 +282,7 @@ class TranscriptionSection(Section):
     """
 
     scheme: SchemeName = "midpoint"
-    substeps: Annotated[
-        Annotated[Literal["auto"], Tag("<auto>")]
-        | Annotated[Whole, Field(ge=1, le=MOST_STEPS), Tag("<number>")],
-        Discriminator(lambda value: "<auto>" if isinstance(value, str) else "<number>"),
-    ] = "auto"
+    substeps: Annotated[Literal["auto"] | Substeps, ByForm(str)] = "auto"
     explicit_grasps: Flag = False
 
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import KW_ONLY
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
+from ..checked import Flag, NotNegative
 from ..errors import InputError
+from ..section import Vector
+from ..stated import key, stated
 from .actuator import Actuator
-from .arrays import read_only_floats
+from .arrays import floats, read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
 from .freedom import free_motions
 from .gauge import Gauge
@@ -37,7 +40,15 @@ EARTH_M_S2 = (0.0, 0.0, -9.81)
 AS_IN_A_LABORATORY = Nuisance()
 
 
-@dataclass(frozen=True, eq=False)
+def _markers(markers: Markers | None) -> Any:
+    return markers
+
+
+def _state(name: str) -> Callable[[ArrayLike], Array]:
+    return floats((None, 3), f"start_{name}")
+
+
+@stated
 class Experiment:
     """What was done to a body and what was measured.
 
@@ -54,12 +65,12 @@ class Experiment:
         Tracks at the times `t_s`, at least one sample present. Those given by their places are put
         on the body, see `place_markers`. None are needed where wrenches or `readings` are measured.
     gravity_m_s2 : (3,) array
-        Acceleration of gravity.
+        Acceleration of gravity [x, y, z].
     name : str
         For messages and reports; experiments of one problem have different names.
     kind : {"dynamic", "static"}
-        A motion, or samples each of which is an equilibrium of its own; with memory, quasi-static
-        in time.
+        A motion; or samples each of which is an equilibrium of its own, at any times (with memory,
+        quasi-static in time).
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
@@ -67,10 +78,10 @@ class Experiment:
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
     loaded_since_s : float
-        How long the body has been in the shape of its equilibrium since its loads came at once; a
-        body with memory has relaxed by default.
+        How long a body with memory has been in the shape of its equilibrium; it has relaxed by
+        default.
     validation : bool
-        Predicted only, not fitted.
+        Not fitted, only predicted.
     masses : sequence of PointMass
         Tied to the body.
     forces : sequence of Force
@@ -92,80 +103,44 @@ class Experiment:
     """
 
     body: Body
-    t_s: Array
-    grasps: tuple[Grasp, ...]
-    markers: Markers
-    gravity_m_s2: Array
-    name: str
-    kind: Kind
-    start: Start
-    start_rule: StartRule
-    start_positions_m: Array | None
-    start_velocities_m_s: Array | None
-    loaded_since_s: float
-    validation: bool
-    masses: tuple[PointMass, ...]
-    forces: tuple[Force, ...]
-    tendons: tuple[Tendon, ...]
-    pressures: tuple[Pressure, ...]
-    readings: tuple[Gauge, ...]
-    nuisance: Nuisance
+    t_s: Array = key(converter=floats((None,), "t_s"))
+    grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
+    markers: Markers = key(converter=_markers, default=None)
+    gravity_m_s2: Array = key(Vector, converter=floats((3,), "gravity_m_s2"), default=EARTH_M_S2)
+    name: str = "experiment"
+    _: KW_ONLY
+    kind: Kind = key(Kind, default="dynamic")
+    start: Start = key(Start, default="equilibrium")
+    start_rule: StartRule = key(StartRule, default="standard")
+    start_positions_m: Array | None = key(converter=_state("positions_m"), default=None)
+    start_velocities_m_s: Array | None = key(converter=_state("velocities_m_s"), default=None)
+    loaded_since_s: float = key(NotNegative | None, default=np.inf)
+    validation: bool = key(Flag, default=False)
+    masses: tuple[PointMass, ...] = key(converter=tuple[PointMass, ...], default=())
+    forces: tuple[Force, ...] = key(converter=tuple[Force, ...], default=())
+    tendons: tuple[Tendon, ...] = key(converter=tuple[Tendon, ...], default=())
+    pressures: tuple[Pressure, ...] = key(converter=tuple[Pressure, ...], default=())
+    readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
+    nuisance: Nuisance = AS_IN_A_LABORATORY
 
-    def __init__(
-        self,
-        body: Body,
-        t_s: ArrayLike,
-        grasps: Iterable[Grasp],
-        markers: Markers | None = None,
-        gravity_m_s2: ArrayLike = EARTH_M_S2,
-        name: str = "experiment",
-        *,
-        kind: Kind = "dynamic",
-        start: Start = "equilibrium",
-        start_rule: StartRule = "standard",
-        start_positions_m: ArrayLike | None = None,
-        start_velocities_m_s: ArrayLike | None = None,
-        loaded_since_s: float = np.inf,
-        validation: bool = False,
-        masses: Iterable[PointMass] = (),
-        forces: Iterable[Force] = (),
-        tendons: Iterable[Tendon] = (),
-        pressures: Iterable[Pressure] = (),
-        readings: Iterable[Gauge] = (),
-        nuisance: Nuisance = AS_IN_A_LABORATORY,
-    ) -> None:
-        n = len(body.nodes_m)
-        try:
-            times = read_only_floats(t_s, (None,), "t_s")
-            vars(self).update(
-                body=body,
-                t_s=times,
-                grasps=tuple(grasp.on(body, times) for grasp in grasps),
-                markers=Markers.none(times) if markers is None else markers,
-                gravity_m_s2=read_only_floats(gravity_m_s2, (3,), "gravity_m_s2"),
-                name=name,
-                kind=kind,
-                start=start,
-                start_rule=start_rule,
-                start_positions_m=_state(start_positions_m, n, "start_positions_m"),
-                start_velocities_m_s=_state(start_velocities_m_s, n, "start_velocities_m_s"),
-                loaded_since_s=float(loaded_since_s),
-                validation=validation,
-                masses=tuple(mass.on(body) for mass in masses),
-                forces=tuple(force.on(body) for force in forces),
-                tendons=tuple(tendon.on(body) for tendon in tendons),
-                pressures=tuple(pressure.on(body) for pressure in pressures),
-                readings=tuple(readings),
-                nuisance=nuisance,
-            )
-            self._check_kind()
-            self._check_time()
-            vars(self)["markers"] = self.markers.on(body, self._carried_back)
-            self._check_nodes()
-            self._check_start()
-            self._check_actuators()
-        except InputError as error:
-            raise error.located(where=f"experiment '{name}'") from error
+    def __post_init__(self) -> None:
+        loads = ("masses", "forces", "tendons", "pressures")
+        vars(self).update(
+            grasps=tuple(grasp.on(self.body, self.t_s) for grasp in self.grasps),
+            markers=Markers.none(self.t_s) if self.markers is None else self.markers,
+            **{name: tuple(load.on(self.body) for load in getattr(self, name)) for name in loads},
+        )
+        self._check_kind()
+        self._check_time()
+        vars(self)["markers"] = self.markers.on(self.body, self._carried_back)
+        self._check_nodes()
+        self._check_start()
+        self._check_actuators()
+
+    @property
+    def place(self) -> str:
+        """What it is called in messages."""
+        return f"experiment '{self.name}'"
 
     def __repr__(self) -> str:
         static = "static, " if self.static else ""
@@ -352,15 +327,13 @@ class Experiment:
         return np.where(markers.located, given, body_m)
 
     def _check_kind(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise InputError(f"kind is {self.kind!r}; expected one of {', '.join(get_args(Kind))}")
         if not self.static:
             return
-        for key, usual in (("start", "equilibrium"), ("start_rule", "standard")):
-            if getattr(self, key) != usual:
+        for name, usual in (("start", "equilibrium"), ("start_rule", "standard")):
+            if getattr(self, name) != usual:
                 raise InputError(
-                    f"{key} is {getattr(self, key)!r}, but the experiment is static: each sample "
-                    f"is an equilibrium, and nothing moves; expected no {key}"
+                    f"{name} is {getattr(self, name)!r}, but the experiment is static: each sample "
+                    f"is an equilibrium, and nothing moves; expected no {name}"
                 )
 
     def _check_time(self) -> None:
@@ -440,14 +413,6 @@ class Experiment:
         vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
-        for key, choices in (("start", Start), ("start_rule", StartRule)):
-            if getattr(self, key) not in get_args(choices):
-                expected = ", ".join(get_args(choices))
-                raise InputError(f"{key} is {getattr(self, key)!r}; expected one of {expected}")
-        if not self.loaded_since_s >= 0:
-            raise InputError(
-                f"loaded_since_s = {self.loaded_since_s:g}; expected a time of zero or more"
-            )
         if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
             raise InputError(
                 f"loaded_since_s is given, but start is '{self.start}'; it says how long a body "
@@ -458,8 +423,9 @@ class Experiment:
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
-                n = len(self.body.nodes_m)
-                vars(self)["start_velocities_m_s"] = _state(np.zeros((n, 3)), n, "velocity")
+                vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
+            for name in ("start_positions_m", "start_velocities_m_s"):
+                read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
         elif given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
         if self.start == "equilibrium":
@@ -475,7 +441,3 @@ class Experiment:
                 f"{int(held.any(axis=1).sum())} nodes are held then. Grasp at least 3 nodes that "
                 "do not lie on one line, or more axes, or start 'undeformed'"
             )
-
-
-def _state(given: ArrayLike | None, nodes: int, name: str) -> Array | None:
-    return None if given is None else read_only_floats(given, (nodes, 3), name)

@@ -3,49 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
+from ..checked import Finite, NotNegative
 from ..errors import InputError
 from ..fem.selection import Selection
+from ..stated import key, stated
 from .clock import TIME_TOLERANCE_S
 from .poses import PoseSequence
-from .selected import on_body, some_nodes
+from .selected import Nodes, on_body, selection, some_nodes
 from .wrench import Wrench
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
 
-AXES = ("x", "y", "z", "xy", "xz", "yz", "xyz")
+Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
-@dataclass(frozen=True, eq=False)
+def _poses(motion: PoseSequence | ArrayLike) -> Any:
+    return motion  # matrices stay until there are times
+
+
+@stated
 class Grasp:
     """Nodes held by the robot, and the motion that carries them.
+
+    Node numbers are kept sorted and without repeats. An experiment looks a selection up, and takes
+    matrices as the poses at its times.
 
     Parameters
     ----------
     nodes : (h,) int array or Selection
-        Node numbers, kept sorted and without repeats; an experiment looks a selection up.
+        Selection: a table of box_m, ball_m or indices, or the name of a point array or physical
+        group.
     poses : PoseSequence or (T, 4, 4) array
-        Where they are held; an experiment takes matrices as the poses at its times.
-    from_s, until_s : float
-        First and last time at which they are held; throughout by default.
-    sigma_m, sigma_rad : float, optional
-        Standard deviations of the noise of each pose, which widen the error bars; judged by how
-        rough the poses are where they are not given.
+        Where they are held.
+    from_s : float
+        First time at which it holds.
+    until_s : float
+        Last time at which it holds; at the start's, the body is let go from its equilibrium in this
+        grasp.
+    sigma_m : float, optional
+        Standard deviation of the noise in each position of poses; judged by how rough they are
+        where it is not given.
+    sigma_rad : float, optional
+        Standard deviation of the noise in each rotation, about each axis [rad]; likewise.
     selection : Selection, optional
         What selected the nodes, where something did: on a finer mesh it selects others.
     axes : str
-        Along which axes of the world they are held, such as "z" for a platen on which the body
-        slides; "xyz" by default.
+        Axes of the world along which it holds; the nodes slide along the others.
     zero : str
         Along which axes the zero of the poses is known no better than the experiment's `nuisance`
         says, as that of a test bench's crosshead; along none by default.
@@ -53,55 +67,29 @@ class Grasp:
         What it was measured to give the body.
     """
 
-    nodes: Index
-    poses: PoseSequence
-    from_s: float
-    until_s: float
-    sigma_m: float | None
-    sigma_rad: float | None
-    selection: Selection | None
-    axes: str
-    zero: str
-    wrench: Wrench | None
+    nodes: Index = key(Nodes, converter=some_nodes("the grasp"), read=selection)
+    poses: PoseSequence = key(converter=_poses)
+    from_s: float = key(Finite | None, default=-np.inf)
+    until_s: float = key(Finite | None, default=np.inf)
+    sigma_m: float | None = key(NotNegative | None, default=None)
+    sigma_rad: float | None = key(NotNegative | None, default=None)
+    selection: Selection | None = None
+    axes: Axes = key(Axes, default="xyz")
+    zero: str = ""
+    wrench: Wrench | None = None
 
-    def __init__(
-        self,
-        nodes: ArrayLike | Selection,
-        poses: PoseSequence | ArrayLike,
-        from_s: float = -np.inf,
-        until_s: float = np.inf,
-        sigma_m: float | None = None,
-        sigma_rad: float | None = None,
-        selection: Selection | None = None,
-        axes: str = "xyz",
-        zero: str = "",
-        wrench: Wrench | None = None,
-    ) -> None:
-        if not from_s <= until_s:
+    def __post_init__(self) -> None:
+        if not self.from_s <= self.until_s:
             raise InputError(
-                f"a grasp holds from {from_s:g} s until {until_s:g} s; expected from_s <= until_s"
+                f"a grasp holds from {self.from_s:g} s until {self.until_s:g} s; expected "
+                "from_s <= until_s"
             )
-        for name, given, known in (("axes", axes, AXES), ("zero", zero, ("", *AXES))):
-            if given not in known:
-                raise InputError(
-                    f"{name} of a grasp is {given!r}; expected one of {', '.join(AXES)}"
-                )
-        held = some_nodes("the grasp")(nodes)
-        for name, value in (("sigma_m", sigma_m), ("sigma_rad", sigma_rad)):
-            if value is not None and not value >= 0:
-                raise InputError(f"{name} of a grasp is {value:g}; expected 0 or more")
-        vars(self).update(
-            nodes=held,
-            poses=poses,
-            from_s=from_s,
-            until_s=until_s,
-            sigma_m=sigma_m,
-            sigma_rad=sigma_rad,
-            selection=held if isinstance(held, Selection) else selection,
-            axes=axes,
-            zero="".join(axis for axis in zero if axis in axes),
-            wrench=wrench,
-        )
+        if self.zero not in ("", *get_args(Axes)):
+            expected = ", ".join(get_args(Axes))
+            raise InputError(f"zero of a grasp is {self.zero!r}; expected one of {expected}")
+        vars(self)["zero"] = "".join(axis for axis in self.zero if axis in self.axes)
+        if isinstance(self.nodes, Selection):
+            vars(self)["selection"] = self.nodes
 
     def on(self, body: Body, t_s: Array) -> Grasp:
         """The same grasp with the nodes of a body, and matrices as the poses at `t_s`."""

@@ -66,13 +66,11 @@ class PointMass:
 
     nodes: Index = key(Nodes, converter=some_nodes("the point mass"), read=selection)
     mass_kg: float = key(Positive)
-    from_s: float = key(Finite, default=-np.inf)
+    from_s: float = key(Finite | None, default=-np.inf)
     selection: Selection | None = None
-    until_s: float = key(Finite, default=np.inf)
+    until_s: float = key(Finite | None, default=np.inf)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.mass_kg) and self.mass_kg > 0):
-            raise InputError(f"mass_kg of a point mass is {self.mass_kg:g}; expected more than 0")
         _begin(self, "point mass")
 
     def on(self, body: Body) -> PointMass:
@@ -87,7 +85,9 @@ class PointMass:
         return mass
 
 
-_TABLE = Key("file", Text, read_forces, "force_n", "CSV with the columns t_s, fx_n, fy_n, fz_n.")
+_TABLE = Key(
+    "file", Text | None, read_forces, "force_n", "CSV with the columns t_s, fx_n, fy_n, fz_n."
+)
 
 
 @stated
@@ -113,11 +113,11 @@ class Force:
     """
 
     nodes: Index = key(Nodes, converter=some_nodes("the force"), read=selection)
-    force_n: Array = key(Vector, converter=np.atleast_2d)
+    force_n: Array = key(Vector | None, converter=np.atleast_2d)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     selection: Selection | None = None
-    from_s: float = key(Finite, default=-np.inf)
-    until_s: float = key(Finite, default=np.inf)
+    from_s: float = key(Finite | None, default=-np.inf)
+    until_s: float = key(Finite | None, default=np.inf)
 
     def __post_init__(self) -> None:
         _begin(self, "force")

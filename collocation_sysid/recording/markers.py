@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import read_only_floats, read_only_tracks
+from ..stated import key, stated
+from .arrays import floats, read_only_floats, read_only_tracks
 from .placement import Attachment, Placement, Shape, place_markers
 
 if TYPE_CHECKING:
@@ -25,7 +26,11 @@ SHOWN = 4
 CarriedBack = Callable[[Array, Array], Array]
 
 
-@dataclass(frozen=True, eq=False)
+def _placement(placement: Placement | None) -> Any:
+    return placement
+
+
+@stated
 class Markers:
     """Marker tracks and the markers' places on the body.
 
@@ -50,8 +55,10 @@ class Markers:
         nuisance by default.
     on_surface : bool
         Places that are estimated stay on the surface: two coordinates in place of three.
-    attach, max_distance_m
+    attach : {"auto", "vertex", "embedded"}
         See `place_markers`.
+    max_distance_m : float, optional
+        Farthest a marker may be from the body; the mean edge length by default.
 
     Raises
     ------
@@ -60,35 +67,32 @@ class Markers:
         are given.
     """
 
-    t_s: Array
-    positions_m: Array
-    sigma_m: Array
-    names: tuple[str, ...]
-    places_m: Array | None
-    placement: Placement
-    places_sigma_m: Array | None
-    on_surface: bool
-    located: NDArray[np.bool_]
-    attach: Attachment
-    max_distance_m: float | None
+    t_s: Array = key(converter=floats((None,), "t_s of the markers"))
+    positions_m: Array = key(converter=np.asarray)
+    sigma_m: Array = key(converter=np.asarray)
+    names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
+    places_m: Array | None = key(converter=np.asarray, default=None)
+    placement: Placement = key(converter=_placement, default=None)
+    places_sigma_m: Array | None = key(converter=np.asarray, default=None)
+    on_surface: bool = False
+    located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
+    attach: Attachment = key(Attachment, default="auto")
+    max_distance_m: float | None = None
 
-    def __init__(
-        self,
-        t_s: ArrayLike,
-        positions_m: ArrayLike,
-        sigma_m: ArrayLike,
-        names: Sequence[str] | None = None,
-        places_m: ArrayLike | None = None,
-        placement: Placement | None = None,
-        places_sigma_m: ArrayLike | None = None,
-        on_surface: bool = False,
-        located: ArrayLike | None = None,
-        attach: Attachment = "auto",
-        max_distance_m: float | None = None,
-    ) -> None:
-        times = read_only_floats(t_s, (None,), "t_s of the markers")
-        tracks = read_only_tracks(positions_m, (len(times), None, 3), "marker positions")
+    def __post_init__(self) -> None:
+        shape = len(self.t_s), None, 3
+        tracks = read_only_tracks(self.positions_m, shape, "marker positions")
         m = tracks.shape[1]
+        if self.names is None:
+            vars(self)["names"] = tuple(f"m{k}" for k in range(1, m + 1))
+        vars(self).update(
+            positions_m=tracks, sigma_m=_deviations(self.sigma_m, _distinct(self.names, m))
+        )
+        self._find_places(m)
+
+    def _find_places(self, m: int) -> None:
+        """Check what is said of the places of m markers."""
+        places_m, placement, known = self.places_m, self.placement, self.located
         if places_m is not None and placement is not None:
             raise InputError(
                 "the markers have places_m and a placement; expected one of them, or neither "
@@ -99,25 +103,12 @@ class Markers:
         if placement is None:
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m
             places_m = read_only_floats(places_m, (m, 3), "places_m", finite=False)
-            located = np.isfinite(places_m).all(axis=1)
-        known = np.ones(m, dtype=bool) if located is None else np.asarray(located, dtype=bool)
-        if places_sigma_m is not None:
-            each = np.broadcast_to(places_sigma_m, m)
-            places_sigma_m = read_only_floats(each, (m,), "places_sigma_m", finite=False)
-        labels = tuple(f"m{k}" for k in range(1, m + 1)) if names is None else tuple(names)
-        vars(self).update(
-            t_s=times,
-            positions_m=tracks,
-            sigma_m=_deviations(sigma_m, _distinct(labels, m)),
-            names=labels,
-            places_m=places_m,
-            placement=placement,
-            places_sigma_m=places_sigma_m,
-            on_surface=on_surface,
-            located=known,
-            attach=attach,
-            max_distance_m=max_distance_m,
-        )
+            known = np.isfinite(places_m).all(axis=1)
+        vars(self).update(places_m=places_m, located=np.ones(m, bool) if known is None else known)
+        if self.places_sigma_m is not None:
+            each = np.broadcast_to(self.places_sigma_m, m)
+            sigma_m = read_only_floats(each, (m,), "places_sigma_m", finite=False)
+            vars(self)["places_sigma_m"] = sigma_m
 
     def __repr__(self) -> str:
         if not self.names:

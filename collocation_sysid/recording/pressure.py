@@ -41,7 +41,7 @@ def _faces(given: Selection | ArrayLike) -> Selection | Index:
 
 _TABLE = Key(
     "pressure",
-    Text,
+    Text | None,
     read_pressure,
     "pressure_pa",
     "CSV with the columns t_s and pressure_pa, over all of the recording.",
@@ -71,9 +71,9 @@ class Pressure(Actuator[Volume]):
     """
 
     faces: Selection | Index = key(Nodes, converter=_faces, read=selection)
-    pressure_pa: Array = key(Finite, converter=np.asarray)
+    pressure_pa: Array = key(Finite | None, converter=np.asarray)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
-    name: str = key(Text, default="pressure")
+    name: str = key(Text | None, default="pressure")
     _: KW_ONLY
     factor: float = 1.0
     lost_pa: float = 0.0

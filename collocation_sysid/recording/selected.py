@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Discriminator, Tag, model_validator
+from pydantic import model_validator
 
 from ..arrays import Index
 from ..checked import Positive, Text, Whole
 from ..errors import InputError
 from ..fem.selection import Ball, Box, Indices, Named, Selection
-from ..section import Corner, Section, Vector, require_one
+from ..section import ByForm, Corner, Section, Vector, require_one
 from .arrays import read_only_nodes
 
 if TYPE_CHECKING:
@@ -47,17 +47,7 @@ class NodesSection(Section):
         return self
 
 
-# Where a key takes one of two forms, a tag in <> tells them apart; messages leave the tag out.
-
-
-def _nodes_form(value: Any) -> str:
-    return "<name>" if isinstance(value, str) else "<table>"
-
-
-Nodes = Annotated[
-    Annotated[NodesSection, Tag("<table>")] | Annotated[Text, Tag("<name>")],
-    Discriminator(_nodes_form),
-]
+Nodes = Annotated[Text | NodesSection, ByForm(str)]
 
 
 def selection(section: NodesSection | str) -> Selection:

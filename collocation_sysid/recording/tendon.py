@@ -29,7 +29,7 @@ FARTHEST = 1.0
 
 _TABLE = Key(
     "tension",
-    Text,
+    Text | None,
     read_tension,
     "tension_n",
     "CSV with the columns t_s and tension_n, over all of the recording.",
@@ -61,9 +61,9 @@ class Tendon(Actuator[Length]):
         Annotated[list[Vector], Field(min_length=2)],
         converter=floats((None, 3), "points_m of the tendon"),
     )
-    tension_n: Array = key(NotNegative, converter=np.asarray)
+    tension_n: Array = key(NotNegative | None, converter=np.asarray)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
-    name: str = key(Text, default="tendon")
+    name: str = key(Text | None, default="tendon")
     _: KW_ONLY
     factor: float = 1.0
     lost_n: float = 0.0

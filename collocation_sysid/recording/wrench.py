@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
+from ..checked import Positive
 from ..errors import InputError
-from .arrays import read_only_floats
+from ..section import Vector
+from ..stated import key, stated
+from .arrays import floats, read_only_floats
 from .clock import first_time_fault
 
 Frame = Literal["world", "grasp"]
@@ -19,7 +21,14 @@ COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 UNITS = ("N",) * 3 + ("N m",) * 3
 
 
-@dataclass(frozen=True, eq=False)
+def _six(values: ArrayLike) -> Array:
+    """Forces with torques, that are missing where there are forces alone."""
+    rows = np.array(values, dtype=float)
+    forces_alone = rows.ndim == 2 and rows.shape[1] == 3
+    return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
+
+
+@stated
 class Wrench:
     """What a sensor says of the force and torque that a grasp gives the body.
 
@@ -29,13 +38,16 @@ class Wrench:
         Times of its samples, at whatever rate, on the clock of the grasps.
     values : (S, 3) or (S, 6) array
         fx, fy, fz [N], and tx, ty, tz [N m]; NaN where missing.
-    sigma_n, sigma_nm : float
-        Standard deviations of the noise of each component; that of torques where there are any.
+    sigma_n : float
+        Standard deviation of the noise of each force [N].
+    sigma_nm : float, optional
+        Standard deviation of the noise of each torque [N m]; needed with any.
     frame : {"world", "grasp"}
-        Axes of the components: those of the poses' world, or those of the undeformed body as the
-        grasp carries it.
+        Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
+        body as the grasp carries it.
     point_m : (3,) array
-        The torque's point: fixed in the world, or in the grasp's frame and moving along.
+        Point [x, y, z] of the torque: fixed in the world, or on the undeformed body and moving
+        along.
 
     Raises
     ------
@@ -43,44 +55,23 @@ class Wrench:
         If shapes disagree, time does not increase, nothing is measured, or a sigma is missing.
     """
 
-    t_s: Array
-    values: Array
-    sigma_n: float
-    sigma_nm: float | None
-    frame: Frame
-    point_m: Array
+    t_s: Array = key(converter=floats((None,), "t_s of the wrench"))
+    values: Array = key(converter=_six)
+    sigma_n: float = key(Positive)
+    sigma_nm: float | None = key(Positive | None, default=None)
+    frame: Frame = key(Frame, default="world")
+    point_m: Array = key(
+        Vector, converter=floats((3,), "point_m of the wrench"), default=(0.0,) * 3
+    )
 
-    def __init__(
-        self,
-        t_s: ArrayLike,
-        values: ArrayLike,
-        sigma_n: float,
-        sigma_nm: float | None = None,
-        frame: Frame = "world",
-        point_m: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> None:
-        times = read_only_floats(t_s, (None,), "t_s of the wrench")
-        given = np.array(values, dtype=float)
-        if given.ndim == 2 and given.shape[1] == 3:
-            given = np.hstack([given, np.full_like(given, np.nan)])
-        vars(self).update(
-            t_s=times,
-            values=read_only_floats(given, (len(times), 6), "values of the wrench", finite=False),
-            sigma_n=sigma_n,
-            sigma_nm=sigma_nm,
-            frame=frame,
-            point_m=read_only_floats(point_m, (3,), "point_m of the wrench"),
-        )
-        self._check()
-
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         if not len(self.t_s):
             raise InputError("a wrench without samples; expected some")
+        shape = len(self.t_s), 6
+        values = read_only_floats(self.values, shape, "values of the wrench", finite=False)
+        vars(self)["values"] = values
         if fault := first_time_fault(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
-        if self.frame not in get_args(Frame):
-            expected = ", ".join(get_args(Frame))
-            raise InputError(f"frame of a wrench is {self.frame!r}; expected one of {expected}")
         if np.isinf(self.values).any():
             raise InputError(
                 "a wrench holds an infinite value; expected numbers, or NaN if missing"
@@ -91,9 +82,6 @@ class Wrench:
             raise InputError(
                 "a wrench with torques needs sigma_nm, the standard deviation of their noise [N m]"
             )
-        for name, sigma in (("sigma_n", self.sigma_n), ("sigma_nm", self.sigma_nm)):
-            if sigma is not None and not (sigma > 0 and np.isfinite(sigma)):
-                raise InputError(f"{name} of a wrench is {sigma:g}; expected more than 0")
 
     def __repr__(self) -> str:
         names = ", ".join(self.names)
