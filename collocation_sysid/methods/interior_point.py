@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -125,20 +125,14 @@ class InteriorPoint(Options):
             program = condensed(collocation.made_explicit())
             hessian = _DampedHessian(program, self)
         settings = hessian, self._settings, IPOPT_STATUS
-        found = nlpsol.solve(recorder, program, start, "ipopt", *settings)
-        if found.said == "Invalid_Option":
-            recorder.notes.append(
-                f"linear_solver = '{self.linear_solver}' needs a library that is not installed; "
-                "'mumps' and 'spral' come with CasADi"
-            )
-        return recorder.solution(
-            found.status,
-            f"{found.status.sentence} (IPOPT: {found.said})",
-            found.z,
-            found.multipliers,
-            found.iterations,
-            found.evaluations,
+        solution = nlpsol.solve(recorder, program, start, "ipopt", *settings)
+        if "Invalid_Option" not in solution.message:
+            return solution
+        missing = (
+            f"linear_solver = '{self.linear_solver}' needs a library that is not installed; "
+            "'mumps' and 'spral' come with CasADi"
         )
+        return replace(solution, notes=(*solution.notes, missing))
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
         settings: dict[str, Any] = {

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from contextvars import copy_context
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -22,7 +21,10 @@ from ..starting import LEFT
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .condensed import whole_multipliers
 from .recorder import Recorder
-from .solution import Status
+from .solution import Solution, Status
+
+# Of solvers that are written otherwise.
+NAMES = {"ipopt": "IPOPT"}
 
 Settings = Callable[[NlpFunctions], Mapping[str, Any]]
 
@@ -36,28 +38,6 @@ _COMMON = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """The last iterate, or where it did not converge the best.
-
-    Attributes
-    ----------
-    status : Status
-    said : str
-        The solver's own word for it.
-    z : (variables,)
-    multipliers : (constraints,)
-    iterations, evaluations : int
-    """
-
-    status: Status
-    said: str
-    z: Array
-    multipliers: Array
-    iterations: int
-    evaluations: int
-
-
 def solve(
     recorder: Recorder,
     program: Collocation,
@@ -66,7 +46,8 @@ def solve(
     hessian: HessianValues,
     settings: Settings,
     statuses: Mapping[str, Status],
-) -> Outcome:
+    judged: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
+) -> Solution:
     """Solve the recorder's collocation; Ctrl-C ends it after the iteration, or after 2 s.
 
     Parameters
@@ -82,6 +63,8 @@ def solve(
         The plugin's settings, given the functions.
     statuses : mapping
         Its words for how it ended in ours; a failure where one is not among them.
+    judged : callable
+        What to say of the status, variables and multipliers of the recorder's collocation.
 
     Raises
     ------
@@ -113,7 +96,9 @@ def solve(
     iterations = 0 if status is Status.REFUSED else count or max(0, len(recorder.history) - 1)
     of_rows = whole_multipliers(program, z, multipliers)[: collocation.constraints]
     at = carried_over(z, program, collocation)
-    return Outcome(status, said, at, of_rows, iterations, functions.calls)
+    status = judged(status, at, of_rows)
+    message = f"{status.sentence} ({NAMES.get(plugin, plugin)}: {said})"
+    return recorder.solution(status, message, at, of_rows, iterations, functions.calls)
 
 
 def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
@@ -128,7 +113,7 @@ def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> c
         unknown = [line for line in lines if "Unknown option" in line]
         reason = (said.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
         reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
-        name = "IPOPT" if plugin == "ipopt" else plugin
+        name = NAMES.get(plugin, plugin)
         raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
 
 

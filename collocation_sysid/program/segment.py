@@ -6,7 +6,7 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -39,6 +39,8 @@ from .wrench import WrenchReading, wrench_readings
 from .wrench_channel import Grid, sensed_dofs
 
 T = TypeVar("T", bound=np.generic)
+# Of what two stencils (p, q) of an evaluation make of its two matrices.
+Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 CHARTED = ("markers", "readings", "local_loss", "_loss_scale")
 
@@ -518,66 +520,46 @@ class Segment:
 
         The nq rows of q stand above the rows of x.
         """
-        return BlockBand(self.dofs, self._hessian_starts, self._hessian_blocks(), top=self.nq)
+        blocks = self._hessian_blocks(_of_states)
+        return BlockBand(self.dofs, self._hessian_starts, blocks, top=self.nq)
 
     @cached_property
     def _skew_hessian(self) -> BlockBand:
         """The same, to add what the skew part of ∂²φ/∂x∂v gives."""
-        blocks = self._hessian_blocks(self._skew_terms)
+        blocks = self._hessian_blocks(lambda p, q, pp, qq: (pp * q - qq * p, 0 * q))
         return adding_skew(self.dofs, self._hessian_starts, blocks, top=self.nq)
 
     @cached_property
     def _rate_hessian(self) -> BlockBand:
         """The same, to add what ∂²φ/∂v² gives."""
-        blocks = self._hessian_blocks(self._rate_terms)
+        blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
         return BlockBand(self.dofs, self._hessian_starts, blocks, self.nq, adds=True)
 
     @property
     def _hessian_starts(self) -> Index:
         return self.nq + np.arange(self.grid_rows) * self.dofs
 
-    def _hessian_blocks(self, of: Callable[[int], Iterator[Term]] | None = None) -> list[Block]:
+    def _hessian_blocks(self, factors: Factors) -> list[Block]:
+        """Blocks ∂²φ/∂x_{t−distance}∂x_t where those of ∂²φ/∂x² and ∂²φ/∂x∂v are."""
         rows, columns, source = self.pattern.full
         blocks = []
         for distance in range(self.dynamics.reach + 1):
-            terms = list(self._curvature_terms(distance))
-            if distance > 0 and not terms:
+            if distance > 0 and not self._curvature_terms(distance, _of_states):
                 continue
-            terms = terms if of is None else list(of(distance))
             kept = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
-            entries = rows[kept], columns[kept], source[kept]
-            blocks.append(Block(-distance, *entries, terms, np.flatnonzero(kept)))
+            entries, terms = np.flatnonzero(kept), self._curvature_terms(distance, factors)
+            blocks.append(Block(-distance, rows[kept], columns[kept], source[kept], terms, entries))
         return blocks
 
-    def _curvature_terms(self, distance: int) -> Iterator[Term]:
-        """Terms of ∂²φ/∂x_{t−distance}∂x_t, from evaluations k = t + i."""
-        p, q = self.dynamics.state_weights, self.dynamics.tables.q
-        scale = self.length_m**2
-        step = self.dynamics.step_s
+    def _curvature_terms(self, distance: int, factors: Factors) -> list[Term]:
+        """Terms of such a block, from evaluations k = t + i."""
+        p, q = self.dynamics.state_weights, self.dynamics.tables.q / self.dynamics.step_s
+        terms = []
         for i in range(self.dynamics.reach + 1 - distance):
-            other = i + distance
-            xx = scale * p[:, i] * p[:, other]
-            xv = scale * (p[:, i] * q[:, other] + q[:, i] * p[:, other]) / step
-            if xx.any() or xv.any():
-                yield Term(i, ahead(xx, i), ahead(xv, i))
-
-    def _skew_terms(self, distance: int) -> Iterator[Term]:
-        """The same of the skew part of ∂²φ/∂x∂v."""
-        t = self.dynamics.tables
-        scale = self.length_m**2 / self.dynamics.step_s
-        for i in range(self.dynamics.reach + 1 - distance):
-            other = i + distance
-            skew = scale * (t.p[:, other] * t.q[:, i] - t.q[:, other] * t.p[:, i])
-            if skew.any():
-                yield Term(i, ahead(skew, i), np.zeros(len(skew)))
-
-    def _rate_terms(self, distance: int) -> Iterator[Term]:
-        """The same of ∂²φ/∂v²."""
-        q, scale = self.dynamics.tables.q, (self.length_m / self.dynamics.step_s) ** 2
-        for i in range(self.dynamics.reach + 1 - distance):
-            vv = scale * q[:, i] * q[:, i + distance]
-            if vv.any():
-                yield Term(i, ahead(vv, i), np.zeros(len(vv)))
+            pair = factors(p[:, i], q[:, i], p[:, i + distance], q[:, i + distance])
+            if any(each.any() for each in pair):
+                terms.append(Term(i, *(ahead(self.length_m**2 * each, i) for each in pair)))
+        return terms
 
     def hessian_values(
         self,
@@ -694,3 +676,8 @@ class Segment:
         rows, columns = self.local_loss.structure
         powers = (rows < self.variables).astype(float) + (columns < self.variables)
         return self.length_m**powers
+
+
+def _of_states(p: Array, q: Array, pp: Array, qq: Array) -> tuple[Array, Array]:
+    """Factors of ∂²φ/∂x² and ∂²φ/∂x∂v."""
+    return p * pp, p * qq + q * pp

@@ -19,6 +19,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -87,16 +88,8 @@ class CasadiSolver(Options):
         with recorder.stopwatch.building():
             program = collocation.made_explicit()
         settings = _curvature(program, self.hessian), self._settings, self.statuses
-        found = nlpsol.solve(recorder, program, start, plugin, *settings)
-        status = _judged(found.status, collocation, found.z, found.multipliers)
-        return recorder.solution(
-            status,
-            f"{status.sentence} ({plugin}: {found.said})",
-            found.z,
-            found.multipliers,
-            found.iterations,
-            found.evaluations,
-        )
+        judged = partial(_judged, collocation)
+        return nlpsol.solve(recorder, program, start, plugin, *settings, judged)
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
         cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
@@ -207,7 +200,7 @@ def why_not(name: str) -> str | None:
     return f"found {name!r}, which CasADi does not have; {hint}expected one of {offered}"
 
 
-def _judged(status: Status, collocation: Collocation, z: Array, multipliers: Array) -> Status:
+def _judged(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
     """What a solver says of its answer, after a look at the NLP's own functions there."""
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
