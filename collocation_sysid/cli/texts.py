@@ -89,8 +89,7 @@ class New:
 )
 def new(options: New) -> None:
     """Write a commented problem file to start from."""
-    from ..problem.beginning import begin
-    from ..problem.template import write_template
+    from ..problem.beginning import begin, write_template
 
     folder, kind = Path(options.name), options.kind
     file, *data = [write_template(folder)] if kind is None else begin(folder, kind.value)

@@ -1,7 +1,8 @@
-"""A new problem with a recording of its own, simulated, so that it runs as it is."""
+"""A new problem: a commented file, and a recording simulated for it, so that it runs as it is."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,19 +11,39 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
+from ..errors import InputError
 from ..fem.body import Body
 from ..fem.selection import Box
 from ..fem.structured import cylinder_of_edge
 from ..files import write_whole
+from ..folders import require_possible
 from ..program.simulation import simulate
 from ..recording import Grasp, Markers, PoseSequence, write_markers_csv, write_poses_csv
 from ..recording.experiment import Experiment
 from . import Problem
-from .template import write_template
 
 YOUNG_PA = 8e4
 SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 1.0}
 SEED = 1
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def write_template(folder: Path, kind: str = "swing") -> Path:
+    """Write problem.toml of a kind into a folder, which is made; its name is the title.
+
+    Raises
+    ------
+    InputError
+        Where there is one already, or the folder cannot be made.
+    """
+    file = folder / "problem.toml"
+    require_possible(folder)
+    if file.exists():
+        raise InputError("it is there already; choose another name", file)
+    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
+    text = (TEMPLATES / f"{kind}.toml").read_text(encoding="utf-8")
+    write_whole(file, text.replace('title = ""', f"title = {title}", 1))
+    return file
 
 
 def begin(folder: Path, kind: str) -> list[Path]:
