@@ -86,7 +86,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 def test_the_answer_is_on_stdout_alone(solved):
     assert solved.outcome.code == 0
     assert solved.outcome.err == ""
-    for words in ("Converged", "λ Pa", "300", "roll-out 'swing'", "validation 'twist'"):
+    for words in ("Converged", "λ Pa", "300", "forward simulation 'swing'", "validation 'twist'"):
         assert words in solved.outcome.out
     assert f"written to {solved.run}\n" in solved.outcome.out
 

@@ -117,7 +117,7 @@ def test_the_verdict_tells_how_well_parameters_are_identified():
     assert "λ is least well, but well identified: ±2 %." in said(1.0)
     assert "λ is weakly identified: ±39 %." in said(20.0)
     assert "No error bar for λ: see the notes." in said(None)
-    assert "the roll-out misses by 0.8 mm, at most 2 mm" in said(1.0)[-1]
+    assert "the forward simulation misses by 0.8 mm, at most 2 mm" in said(1.0)[-1]
 
 
 def test_the_verdict_tells_of_failures_and_predictions():
@@ -126,7 +126,7 @@ def test_the_verdict_tells_of_failures_and_predictions():
         "b": SimulatedExperiment(False, rms_m=3e-3, max_m=4e-3),
     }
     said = verdict(a_result(rollout=replace(ROLLOUT, experiments=experiments)))
-    assert "The roll-out of 'a' failed: no step." in said
+    assert "The forward simulation of 'a' failed: no step." in said
     assert "'b' was predicted, not fitted: 3 mm RMS." in said
 
 

@@ -305,7 +305,7 @@ def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
         ({"start": "undeformed"}, "start is 'undeformed', but the experiment is static"),
         ({"start_rule": "paper"}, "start_rule is 'paper', but the experiment is static"),
         ({"t_s": TIMES[[0, 2, 1, 3]]}, "row 3: t_s: t_s = 1 follows 1.5; time must increase"),
-        ({"markers": None}, "nothing is measured: there are no markers and no wrench"),
+        ({"markers": None}, "nothing is measured: there are no markers, no wrench and no reading"),
     ],
 )
 def test_static_experiments_that_make_no_sense_are_refused(change, message):
@@ -462,7 +462,7 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
     said = plain_text(summary(found, tmp_path))
     assert " mm RMS" not in said
     assert re.search(r"wrench of 'press': \S+ N RMS \(sigma 0.01 N\)", said)
-    assert re.search(r"roll-out 'press': \S+ N RMS", said)
+    assert re.search(r"forward simulation 'press': \S+ N RMS", said)
     assert "a finer step" not in said
     assert re.search(r"zero of a displacement off by 1(\.0)? mm \(prior 2\)", said)
     assert found.solution.max_violation_relative < 1e-6
@@ -477,7 +477,11 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
         ("displacement_zero =", "time_shift = { prior_s = 1.0 }  #", "found nuisance.time_shift"),
         ('displacement = "', 'poses = "p.csv"\ndisplacement = "', "poses and displacement"),
         ('displacement = "', 'length_unit = "mm"\ndisplacement = "', "length_unit without poses"),
-        ("wrench =", "# wrench =", "nothing is measured: expected markers, or the wrench"),
+        (
+            "wrench =",
+            "# wrench =",
+            "nothing is measured: expected markers, the wrench of a grasp, or a reading",
+        ),
         ('axes = "x"', 'axes = "xz"', "held by the grasps 1 and 3 at the same time along z"),
         ('axes = "x"', 'axes = "w"', "grasp.2.axes"),
         ('axes = "y"', 'axes = "y"\nfrom_s = 7.0', "it can move along y"),

@@ -188,7 +188,7 @@ def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
         assert f"{coarse.parameters['mu_pa']:.5g}" in said
         assert f"{low:.5g} … {high:.5g}" in said
         assert "Verdict: check" in said
-        assert "intervals hold the noise and the step, not the mesh" in said
+        assert "intervals cover the noise and the step, not the mesh" in said
     found_mu = result(coarse).parameters["mu_pa"]
     assert found_mu.ci95 == (low, high)
     assert found_mu.ci95_holds == ("noise", "step")

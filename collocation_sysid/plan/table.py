@@ -54,12 +54,18 @@ COLUMNS = {
     "loss": Column(of=lambda r: r.history[-1].loss if r.history else None, summed_up=False),
     "rms_m": Column("markers mm", "markers, RMS [mm]", 1e3, of=lambda r: r.fit.rms_m),
     "violation_n": Column(
-        "violation N", "dynamics violated by [N]", 1, ".1e", lambda r: r.dynamics.max_violation_n
+        "violation N",
+        "equations of motion violated by [N]",
+        1,
+        ".1e",
+        lambda r: r.dynamics.max_violation_n,
     ),
     "violation_relative": Column(
         "relative", "of the largest force", 1, ".1e", lambda r: r.dynamics.max_violation_relative
     ),
-    "rollout_rms_m": Column("roll-out mm", "roll-out, RMS [mm]", 1e3, of=lambda r: r.rollout.rms_m),
+    "rollout_rms_m": Column(
+        "forward mm", "forward simulation, RMS [mm]", 1e3, of=lambda r: r.rollout.rms_m
+    ),
     "rollout_max_m": Column(of=lambda r: r.rollout.max_m, summed_up=False),
     "tip_max_m": Column("tip mm", "tip, at most [mm]", 1e3),
     "iterations": Column("iter.", "iterations", 1, ".4g", lambda r: r.iterations),

@@ -36,7 +36,7 @@ REMEDIES: Mapping[str, Remedy] = {
         "The description",
         "wrong_description",
         "Compare units, frames, labels and clocks of the problem file with the laboratory's notes; "
-        "check draws conclusions from the recordings before any solve.",
+        "check looks for mistakes in the recordings before any solve.",
     ),
     "noise": Remedy(
         "The size of the noise",
@@ -47,8 +47,8 @@ REMEDIES: Mapping[str, Remedy] = {
     "residuals": Remedy(
         "Residuals that are not noise",
         "trust",
-        "Look at the residuals over time: a constant part is a place or an offset, a large "
-        "beginning the time of release, an oscillation stiffness or damping that differ. "
+        "Look at the residuals over time: a constant part means a wrong place or offset, a large "
+        "beginning a wrong time of release, an oscillation a wrong stiffness or damping. "
         "compare --materials tells whether another model predicts better.",
     ),
     "information": Remedy(
@@ -65,8 +65,8 @@ REMEDIES: Mapping[str, Remedy] = {
     "nuisance": Remedy(
         "What is not known of a recording",
         "motion_capture",
-        "Look whether it can be true: gravity, clock, grasp or places as the file describes them. "
-        "If so, widen its prior in [experiment.nuisance].",
+        "Ask whether it can be true: are gravity, clock, grasp and places as the file describes "
+        "them? If the value can be true, widen its prior in [experiment.nuisance].",
     ),
     "scheme": Remedy(
         "Step and scheme",
@@ -77,8 +77,8 @@ REMEDIES: Mapping[str, Remedy] = {
     "stability": Remedy(
         "States that are not stable",
         "material",
-        "Look whether the body buckles there. If not, the damping feeds energy in: take "
-        'damping = "kelvin-voigt", which cannot, and see that moduli and densities can be true.',
+        "Does the body buckle there? If not, the damping feeds energy in: take damping = "
+        '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
     ),
     "mesh": Remedy(
         "The mesh",
@@ -87,18 +87,16 @@ REMEDIES: Mapping[str, Remedy] = {
         "refine RUN measures what is left.",
     ),
     "roll-out": Remedy(
-        "The roll-out",
+        "The forward simulation",
         "trust",
-        "Where the fit is good and the simulation is not, the step is too long; where a recording "
-        "is predicted badly, the model lacks something that this recording shows.",
+        "If the fit is good and the simulation is not, the step is too long. If a recording is "
+        "predicted badly, the model lacks something that this recording shows.",
     ),
-    "memory": Remedy(
-        "The memory", "large", "Take reduced-space, fewer timesteps or a coarser mesh."
-    ),
+    "memory": Remedy("RAM", "large", "Take reduced-space, fewer timesteps or a coarser mesh."),
     "solve": Remedy(
         "The solve",
         "trust",
-        "Start from another guess, or none, and see that check finds nothing wrong.",
+        "Start from another guess, or from none, and make sure that check finds nothing wrong.",
     ),
 }
 

@@ -202,7 +202,7 @@ def _numerical(finished: Answer) -> list[Shown]:
     segments = finished.solution.collocation.segments
     possible = ["step", "mesh"] if any(not s.experiment.static for s in segments) else ["mesh"]
     left = [f"the {kind}" for kind in possible if kind not in holds]
-    said = f"intervals hold {listed(f'the {kind}' for kind in holds)}"
+    said = f"intervals cover {listed(f'the {kind}' for kind in holds)}"
     said += f", not {listed(left)}: see refine" if left else ""
     if found is None:
         return [said]
@@ -254,7 +254,7 @@ def _nuisance(finished: Answer) -> list[str]:
         name = part.segment.experiment.name
         said = _places(finished.places[name]) + _of_rows(part, finished)
         if said:
-            lines.append(f"estimated beside them of '{name}': {'; '.join(said)}")
+            lines.append(f"also estimated for '{name}': {'; '.join(said)}")
     return lines
 
 
@@ -333,7 +333,7 @@ def _fit(finished: Answer) -> list[str]:
     """How well the markers and the equations are met, and how long that took."""
     solution = finished.solution
     violated = (
-        f"dynamics violated by at most {solution.max_violation_n:.1e} N "
+        f"equations of motion violated by at most {solution.max_violation_n:.1e} N "
         f"({solution.max_violation_relative:.1e} of the largest force)"
     )
     marked = any(s.experiment.markers.samples for s in solution.collocation.segments)
@@ -348,7 +348,7 @@ def _fit(finished: Answer) -> list[str]:
             lines.append(f"wrench of '{segment.experiment.name}': {sizes}{_sigmas(segment)}")
     for experiment in finished.problem.experiments:
         rollout = finished.rollouts[experiment.name]
-        kind = "validation" if experiment.validation else "roll-out"
+        kind = "validation" if experiment.validation else "forward simulation"
         if isinstance(rollout, Rollout):
             tracks = f"{rollout.rms_m * 1e3:.3f} mm RMS, at most {rollout.max_m * 1e3:.2f} mm"
             said = (tracks if experiment.markers.samples else "", _wrench_sizes(rollout.wrench_rms))
@@ -502,7 +502,7 @@ def _solve_section(findings: Findings) -> Table:
     if findings.overstresses:
         rows["memory"] = (
             f"{findings.overstresses:,} more variables and constraints for interior-point, the "
-            "overstress of every point, in these nonzeros"
+            "viscoelastic stress of every point, in these nonzeros"
         )
     if findings.wrenches:
         rows["wrenches"] = (

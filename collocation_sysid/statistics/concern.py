@@ -39,24 +39,24 @@ SENTENCES: Mapping[str, str] = {
     "nuisance/clock": "the markers of '{experiment}' were seen {shift_ms:.2g} ms {when} than their "
     "times say: the estimates allow for it; better find out why",
     "scheme/step": "the step moves {name} by {percent:+.2g} %, {errors:.2g} standard errors: its "
-    "interval allows for that; raise transcription.substeps, or see what refine says",
+    "interval allows for that; raise transcription.substeps, or run refine to measure it",
     "scheme/damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
     "first mode of '{experiment}'",
     "scheme/period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
     "mesh/refined": "step and mesh move {name} by {percent:+.2g} %, {errors:.2g} standard errors: "
     "its interval allows for that",
-    "roll-out/failed": "the roll-out of '{experiment}' failed: {said}",
-    "roll-out/misses": "the roll-out of '{experiment}' misses by {rms_mm:.2g} mm, the fit by "
-    "{fit_mm:.2g} mm",
+    "roll-out/failed": "the forward simulation of '{experiment}' failed: {said}",
+    "roll-out/misses": "the forward simulation of '{experiment}' misses by {rms_mm:.2g} mm, "
+    "the fit by {fit_mm:.2g} mm",
     "roll-out/predicted": "'{experiment}' is predicted {times:.2g} times worse than the others are "
     "fitted",
     "solve/lost": "the solve did not converge: {said}",
     "solve/acceptable": "the solve converged to the acceptable tolerance only",
     "solve/no-error-bars": "no error bars could be found",
     "solve/interrupted": "interrupted: {said}",
-    "solve/moves": "the estimate still moves: it is further than its error from where it was "
+    "solve/moves": "the estimate still moves: it is farther than its error bar from where it was "
     "simulated",
-    "solve/anew": "begun anew {times}, as if the body had been at rest there",
+    "solve/anew": "restarted {times}, as if the body had been at rest there",
 }
 
 

@@ -116,13 +116,13 @@ def verdict(result: Result) -> list[str]:
     sentence = f"The fitted markers are {millimetres(fit.rms_m)} off (RMS)"
     if rolled.rms_m is not None:
         sentence += (
-            f"; the roll-out misses by {millimetres(rolled.rms_m)}, at most "
+            f"; the forward simulation misses by {millimetres(rolled.rms_m)}, at most "
             f"{millimetres(rolled.max_m)}"
         )
     said.append(f"{sentence}.")
     for name, found in rolled.experiments.items():
         if found.failed is not None:
-            said.append(f"The roll-out of '{name}' failed: {found.failed}.")
+            said.append(f"The forward simulation of '{name}' failed: {found.failed}.")
         elif not found.fitted:
             said.append(f"'{name}' was predicted, not fitted: {millimetres(found.rms_m)} RMS.")
     return said
@@ -262,7 +262,7 @@ def _residuals(result: Result, run: Path) -> Iterator[Shown]:
 def _provenance(result: Result, run: Path) -> Iterator[Shown]:
     violated, share = result.dynamics.max_violation_n, result.dynamics.max_violation_relative
     said = f"{number(violated, 2)} N ({number(share, 2)} of the largest force)"
-    rows = content(result.problem) | {"dynamics violated by at most": said}
+    rows = content(result.problem) | {"equations of motion violated by at most": said}
     rows |= content(result.provenance)
     yield Table("", (), tuple((key, str(each)) for key, each in rows.items()), texts=1)
     file = run / "problem.toml"
