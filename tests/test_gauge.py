@@ -22,6 +22,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
 from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
+from collocation_sysid.result.pictures.readings import readings_picture
 
 LOW_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
@@ -269,6 +270,17 @@ def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
     for name, value in TINY_TRUTH.items():
         assert result["parameters"][name]["value"] == pytest.approx(value, rel=0.05)
     assert abs(result["nuisance"]["swing"]["bias of chip [m/s²]"]["value"]) < 0.02
+    sizes = result["fit"]["experiments"]["swing"]["reading_rms"]
+    assert sizes.keys() == {"chip", "cell"}
+    assert f"chip of 'swing': {sizes['chip']:.2g} RMS (sigma 0.02)" in done.out
+    assert "estimated beside them of 'swing': bias of chip" in " ".join(done.out.split())
+    with np.load(worn / "found" / "trajectory.npz") as arrays:
+        drawn = (
+            readings_picture(arrays["reading_chip"], "xyz"),
+            readings_picture(arrays["reading_cell"], ["cell"]),
+        )
+    shown = [[len(axes.lines) for axes in figure.axes] for figure in drawn]
+    assert shown == [[3, 3, 3], [3]]  # measured, fitted, rolled out
 
 
 def blank_cell(folder: Path) -> None:

@@ -77,7 +77,7 @@ def test_error_bars_are_those_of_the_slopes():
     collocation = Collocation([swung()], GUESS)
     solution = ReducedSpace()(collocation)
     markers, sensor = linearised_fit(collocation, solution.z).blocks
-    assert (sensor.of_sensor, markers.of_sensor) == (True, False)
+    assert (sensor.stated, markers.stated) == ("sigma_n", "sigma_m")
     assert sensor.measurements == int(collocation.segments[0].sensors[0].present.sum())
     rows = [b.slope.reshape(-1, 4)[b.seen.ravel()] for b in (markers, sensor)]
     of_both = np.linalg.inv(sum(r.T @ r for r in rows))

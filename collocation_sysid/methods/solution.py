@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from enum import Enum
 from functools import cached_property
@@ -226,6 +226,17 @@ class Solution:
         return found
 
     @cached_property
+    def readings(self) -> dict[str, dict[str, Array]]:
+        """What the readings of one's own of each fitted experiment should say, (S, m) by name."""
+        return {
+            part.segment.experiment.name: {
+                gauge.gauge.name: gauge.said(gauge.of_motion(part.motion, part.phi))
+                for gauge in part.segment.gauges
+            }
+            for part in self.collocation.parts(self.z)
+        }
+
+    @cached_property
     def rms_m(self) -> float:
         """Root mean square distance of markers from their measurements."""
         return self.collocation.rms_m(self.z)
@@ -277,6 +288,12 @@ def wrench_rms(
         for each in (both[:, :3], both[:, 3:])
     )
     return force, torque
+
+
+def reading_rms(experiment: Experiment, readings: Mapping[str, Array]) -> dict[str, float]:
+    """RMS between readings of one's own (S, m) and what was measured, by name."""
+    apart = ((g.name, readings[g.name] - g.measured) for g in experiment.readings)
+    return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in apart}
 
 
 def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:

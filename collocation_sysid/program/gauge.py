@@ -44,7 +44,7 @@ class GaugeReading(Reading):
     at_s: Array
     static: bool
 
-    has_offsets = True
+    stated, has_offsets = "sigma", True
 
     @classmethod
     def of(

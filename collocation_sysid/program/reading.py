@@ -174,6 +174,8 @@ class Reading(ABC):
     measured : (S, E, m), NaN where missing
     components : (S, G, 3) numbers that are compared
     own : (E, f) positions in φ of what each reads by
+    stated : str
+        What states σ in a problem.
     has_offsets : bool
         Whether it is off by what nothing else tells, such as its tare: where nothing is fitted yet
         that is allowed for.
@@ -191,6 +193,7 @@ class Reading(ABC):
     components: NDArray[np.bool_]
     own: Index
 
+    stated: ClassVar[str] = "sigma_m"
     has_offsets: ClassVar[bool] = False
     has_fixed_windows: ClassVar[bool] = True
 

@@ -42,7 +42,7 @@ class WrenchReading(Reading):
     channel: GraspWrench
     wrench: Wrench
 
-    has_offsets, has_fixed_windows = True, False
+    stated, has_offsets, has_fixed_windows = "sigma_n", True, False
 
     @classmethod
     def of(

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..files import SCHEMA
-from ..methods.solution import Solution, pooled_wrench_rms
+from ..methods.solution import Solution, pooled_wrench_rms, reading_rms
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..recording.experiment import Experiment
@@ -123,8 +123,8 @@ def replays(finished: Answer) -> list[Replay]:
             motion = finished.motions.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _places_m(finished, experiment.name)
-            sensed = _sensed(finished, experiment)
-            found.append(Replay.of(experiment, fit, rolled_out, natural, places_m, sensed))
+            read = _sensed(finished, experiment), _own_readings(finished, experiment)
+            found.append(Replay.of(experiment, fit, rolled_out, natural, places_m, *read))
     return found
 
 
@@ -139,6 +139,23 @@ def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
         rolled = rollout.wrenches[k] if isinstance(rollout, Rollout) else nothing
         found.append(np.column_stack([sensor.t_s, sensor.values, fit, rolled]))
     return found
+
+
+def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
+    """(S, 1 + 3m) of each reading of one's own: time, as measured, fitted and rolled out."""
+    rollout, fit = finished.rollouts[experiment.name], finished.solution.readings
+    rolled = rollout.readings if isinstance(rollout, Rollout) else {}
+    both = fit.get(experiment.name, {}), rolled
+    return {
+        gauge.name: np.column_stack(
+            [
+                gauge.times,
+                gauge.measured,
+                *(each.get(gauge.name, np.full_like(gauge.measured, np.nan)) for each in both),
+            ]
+        )
+        for gauge in experiment.readings
+    }
 
 
 def _places_m(finished: Answer, experiment: str) -> Array | None:
@@ -303,7 +320,8 @@ def _fit(finished: Answer) -> FoundFit:
             solution.rms_by_experiment_m[name],
             markers.samples,
             int(markers.missing.sum()),
-            *solution.wrench_rms.get(name, ()),
+            *solution.wrench_rms.get(name, (None, None)),
+            reading_rms(segment.experiment, solution.readings[name]) or None,
         )
     pooled = pooled_wrench_rms(solution)
     return FoundFit(solution.rms_m, finished.noise_rms_m, experiments, *pooled)
@@ -326,6 +344,7 @@ def _rollout(finished: Answer) -> FoundRollout:
             failed=None,
             wrench_rms_n=force,
             wrench_rms_nm=torque,
+            reading_rms=found.reading_rms or None,
         )
         if name in fitted:
             squares, counts = squares + count * found.rms_m**2, counts + count

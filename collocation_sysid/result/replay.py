@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ from ..runs.result import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # Of the body, and so the same for all experiments of a run.
+# What stands before the name of a reading of one's own.
+READING = "reading_"
 SHARED = ("undeformed_m", "tetrahedra", "surface", "surface_parts")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes.
 LAYOUT = {
@@ -78,6 +80,8 @@ class Replay:
     wrenches : sequence of (S, 19)
         Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
         out, NaN where there are none.
+    readings : mapping of name to (S, 1 + 3m)
+        The same of readings of one's own, of m numbers each.
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
@@ -105,6 +109,7 @@ class Replay:
     wrenches: Sequence[Array] = ()
     static: bool = False
     tendons_m: Array | None = None
+    readings: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -115,6 +120,7 @@ class Replay:
         natural_hz: Array | None = None,
         places_m: Array | None = None,
         wrenches: Sequence[Array] = (),
+        readings: Mapping[str, Array] | None = None,
     ) -> Replay:
         """Gather an experiment with (positions, markers) as fitted, and as rolled out.
 
@@ -144,6 +150,7 @@ class Replay:
             wrenches,
             experiment.static,
             _apart([tendon.points_m for tendon in experiment.tendons]),
+            readings or {},
         )
 
     @property
@@ -170,6 +177,7 @@ class Replay:
             "tendons_m": self.tendons_m,
             "static": np.array(True) if self.static else None,
         } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
+        own |= {f"{READING}{name}": values for name, values in self.readings.items()}
         shared: dict[str, Any] = {
             "undeformed_m": self.undeformed_m,
             "tetrahedra": self.tetrahedra.astype(np.int32),
@@ -205,6 +213,8 @@ class Replay:
         found |= {key: arrays.get(prefix + key) for key in optional}
         keys = (f"{prefix}wrench_{k}" for k in count(1))
         found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
+        own = f"{prefix}{READING}"
+        found["readings"] = {k.removeprefix(own): arrays[k] for k in arrays if k.startswith(own)}
         found["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(found)
         names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
@@ -251,6 +261,9 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             raise ValueError(f"{key} holds numbers that are not finite")
         if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
             raise ValueError(f"{key} holds numbers above {LARGEST:g}")
+    for name, said in arrays["readings"].items():
+        if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] % 3 != 1 or said.size < 4:
+            raise ValueError(f"{READING}{name} is {said.dtype} of shape {said.shape}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} names nodes that are not there")

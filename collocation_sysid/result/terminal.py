@@ -14,12 +14,12 @@ from ..console import Watched
 from ..display import Line, Shown, Table, labelled, on_terminal
 from ..errors import listed
 from ..fem.constants import GAMMA_R, symbol_of, unit_of, with_unit
-from ..methods.solution import Iteration
+from ..methods.solution import Iteration, reading_rms
 from ..model.parameters import Parameter
 from ..problem import Problem
 from ..program.collocation import Part
 from ..program.segment import Segment
-from ..recording.nuisance import JOINING, PLACE, in_unit_for_people
+from ..recording.nuisance import GAUGE, JOINING, PLACE, in_unit_for_people
 from ..runs.answer import Answer
 from ..runs.check import BodyFinding, Findings, Glance, Recording
 from ..runs.check.hold import hold_sentence
@@ -284,7 +284,7 @@ def _of_rows(part: Part, finished: Answer) -> list[str]:
     """What was found of each row of the table but the places, beside its prior."""
     nuisance, said = part.segment.nuisance, []
     values = part.phi * nuisance.scales
-    for row in part.segment.experiment.nuisance.rows:
+    for row in (*part.segment.experiment.nuisance.rows, GAUGE):
         here = nuisance.places(row).tolist()
         if row == PLACE or not here:
             continue
@@ -346,12 +346,17 @@ def _fit(finished: Answer) -> list[str]:
         found = solution.wrench_rms.get(segment.experiment.name, (None, None))
         if sizes := _wrench_sizes(found):
             lines.append(f"wrench of '{segment.experiment.name}': {sizes}{_sigmas(segment)}")
+        read = reading_rms(segment.experiment, solution.readings[segment.experiment.name])
+        for gauge in segment.experiment.readings:
+            sizes = f"{_short(read[gauge.name])} RMS (sigma {_short(gauge.sigma)})"
+            lines.append(f"{gauge.name} of '{segment.experiment.name}': {sizes}")
     for experiment in finished.problem.experiments:
         rollout = finished.rollouts[experiment.name]
         kind = "validation" if experiment.validation else "forward simulation"
         if isinstance(rollout, Rollout):
             tracks = f"{rollout.rms_m * 1e3:.3f} mm RMS, at most {rollout.max_m * 1e3:.2f} mm"
-            said = (tracks if experiment.markers.samples else "", _wrench_sizes(rollout.wrench_rms))
+            said = [tracks if experiment.markers.samples else "", _wrench_sizes(rollout.wrench_rms)]
+            said += [f"{name} {rms:.2g} RMS" for name, rms in rollout.reading_rms.items()]
             found = "; ".join(each for each in said if each)
         else:
             found = f"failed: {rollout}"
@@ -472,7 +477,8 @@ def _measurements_section(findings: Glance | Findings) -> Table:
 
 def _markers_seen(recording: Recording) -> str:
     if not recording.markers:
-        return "the wrench, no markers"
+        return f"{', '.join(recording.instruments)}, no markers"
+    besides = "".join(f", {name}" for name in recording.instruments)
     far, lost = recording.farthest, recording.least_seen
     missing = (
         f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"
@@ -481,7 +487,7 @@ def _markers_seen(recording: Recording) -> str:
     )
     return (
         f"{len(recording.markers)} markers, {missing}; farthest from the body "
-        f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm"
+        f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm{besides}"
     )
 
 

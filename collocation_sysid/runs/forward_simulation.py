@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ..arrays import Array, root_mean
 from ..errors import SimulationError
 from ..fem.kernels import side_by_side
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Solution, wrench_rms
+from ..methods.solution import Solution, reading_rms, wrench_rms
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.channel import Forced, Motion
@@ -44,6 +44,9 @@ class Rollout:
     wrenches : tuple of (S, 6)
         What the sensors of its grasps should read, NaN where that is not known.
     wrench_rms : RMS of force [N] and torque [N m], None where there is none
+    readings : mapping of name to (S, m)
+        What readings of one's own should say.
+    reading_rms : RMS of each of them, by name
     """
 
     rms_m: float
@@ -53,6 +56,8 @@ class Rollout:
     places_m: Mapping[str, list[float]]
     wrenches: Sequence[Array] = ()
     wrench_rms: tuple[float | None, float | None] = (None, None)
+    readings: Mapping[str, Array] = field(default_factory=dict)
+    reading_rms: Mapping[str, float] = field(default_factory=dict)
 
 
 def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
@@ -81,6 +86,13 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]
     nuisance, wrenches = segment.nuisance, _read(segment, phi, trajectory)
+    x = trajectory.positions_m.reshape(len(trajectory.positions_m), -1)
+    gauged = {
+        gauge.gauge.name: gauge.said(read)
+        for gauge, read in zip(
+            segment.gauges, _gauged(segment, x, trajectory.reactions, phi), strict=True
+        )
+    }
     return Rollout(
         root_mean(present**2),
         float(present.max(initial=0.0)),
@@ -93,6 +105,8 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         else {},
         wrenches,
         wrench_rms(experiment, wrenches),
+        gauged,
+        reading_rms(experiment, gauged),
     )
 
 
@@ -168,16 +182,18 @@ def _of_gauges(
     (part,) = (p for p in solution.collocation.parts(solution.z) if p.segment is segment)
     fitted = part.x[segment.markers.grid_rows], (Grid.of(segment.dynamics), part.motion.forced)
     rolled = trajectory.positions_m.reshape(len(fitted[0]), -1), trajectory.reactions
-
-    def read(x: Array, reactions: tuple[Grid, Forced]) -> list[Array]:
-        (grid, forced), nuisance = reactions, segment.nuisance
-        gauges = gauge_readings(segment.experiment, segment.experiment.t_s, grid, nuisance)
-        return [gauge.of_motion(Motion(x, lambda: forced), part.phi) for gauge in gauges]
-
+    here, there = (_gauged(segment, *each, part.phi) for each in (fitted, rolled))
     return [
-        share * np.nan_to_num(there - here) / gauge.sigmas[:, None]
-        for gauge, here, there in zip(segment.gauges, read(*fitted), read(*rolled), strict=True)
+        share * np.nan_to_num(far - near) / gauge.sigmas[:, None]
+        for gauge, near, far in zip(segment.gauges, here, there, strict=True)
     ]
+
+
+def _gauged(segment: Segment, x: Array, reactions: tuple[Grid, Forced], phi: Array) -> list[Array]:
+    """What readings of one's own say (S, G, 3) of positions x (T, 3n) at the samples."""
+    grid, motion = reactions[0], Motion(x, lambda: reactions[1])
+    gauges = gauge_readings(segment.experiment, segment.experiment.t_s, grid, segment.nuisance)
+    return [gauge.of_motion(motion, phi) for gauge in gauges]
 
 
 def _share(problem: Problem, segment: Segment) -> float | None:

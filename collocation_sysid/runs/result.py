@@ -113,6 +113,7 @@ class FittedExperiment:
     missing: int
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
+    reading_rms: Mapping[str, float] | None = optional()
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,7 @@ class SimulatedExperiment:
     places_m: Mapping[str, tuple[float, ...]] | None = optional()
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
+    reading_rms: Mapping[str, float] | None = optional()
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def diagnose(fit: LinearisedFit, extra: Extra | None = None) -> tuple[MarkerDiag
     return tuple(
         _diagnose(block, marker, fit.shared, _estimated(fit, block), level, alone)
         for block in fit.blocks
-        if not block.of_sensor
+        if block.stated == "sigma_m"
         for marker in np.flatnonzero(block.present.any(axis=0)).tolist()
     )
 

@@ -82,9 +82,10 @@ AT_BOUND = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class FitBlock:
-    """Residuals of an experiment's markers, or of one of its sensors, and slopes at the answer.
+    """Residuals of one of an experiment's readings, and slopes at the answer.
 
-    A sensor has two "markers", its force and its torque, in newtons and newton metres.
+    A sensor of a wrench has two "markers", its force and its torque, in newtons and newton metres;
+    a reading of one's own has one for each three numbers.
 
     Attributes
     ----------
@@ -100,8 +101,8 @@ class FitBlock:
         Residuals as they are, where Huber's loss has shortened those in `residual`.
     components : (T, M, 3) bool, optional
         Coordinates that are there, where not all three of a sample need be.
-    of_sensor : bool
-        Of a sensor, not of markers.
+    stated : str
+        What states σ in the problem: "sigma_m" of places.
     static : bool
         Whether samples are equilibria, of which no frequency can be told.
     relaxed_first : bool
@@ -117,7 +118,7 @@ class FitBlock:
     sigma_m: Array
     misfit: Array | None = None
     components: Mask | None = None
-    of_sensor: bool = False
+    stated: str = "sigma_m"
     static: bool = False
     relaxed_first: bool = False
 
@@ -183,7 +184,7 @@ class LinearisedFit:
     Attributes
     ----------
     blocks : tuple of FitBlock
-        Of each fitted experiment that of its markers, then those of its sensors.
+        Of each fitted experiment that of its markers, then those of its other readings.
     names : (p,) the shared parameters first, which are q; then φ, with their unit in
         brackets: ``"gravity/offset Tip1 x [m]"``
     shared : int
@@ -247,7 +248,7 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                     sigma_m=reading.sigmas,
                     misfit=misfit,
                     components=reading.components,
-                    of_sensor=reading is not segment.markers,
+                    stated=reading.stated,
                     static=experiment.static,
                     relaxed_first=relaxed,
                 )

@@ -157,8 +157,9 @@ def noise_level(
         information.prior,
         of_score,
     )
-    marked = any(block.present.any() for block in fit.blocks if not block.of_sensor)
-    return level if marked else replace(level, stated="sigma_n")
+    stated = [block.stated for block in fit.blocks if block.present.any()]
+    # That of places stands for all.
+    return replace(level, stated=min(stated, key="sigma_m".__ne__, default="sigma_m"))
 
 
 def drawn(fit: LinearisedFit, extra: Extra) -> list[Array]:

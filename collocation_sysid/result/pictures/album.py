@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from ...arrays import Array
 from ...files import safe_name, whole_file
 from ...methods.solution import Iteration
+from ...recording.wrench import COMPONENTS, UNITS
 from ...runs.result import Result
 from ..replay import Replay
 from ..style import RESOLUTION_DPI
@@ -19,11 +20,11 @@ from .convergence import convergence
 from .elements import elements_picture
 from .errors import error_over_time
 from .mesh import mesh_picture
+from .readings import readings_picture
 from .scan import scan_picture
 from .shapes import shapes
 from .spectrum import spectrum
 from .tracks import tracks
-from .wrench import wrench_picture
 
 
 def album(
@@ -86,7 +87,11 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
         pictures[f"spectrum_{replay.name}"] = spectral
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
-        pictures[f"wrench_{replay.name}{which}"] = wrench_picture(sensed)
+        pictures[f"wrench_{replay.name}{which}"] = readings_picture(sensed, COMPONENTS, UNITS)
+    for name, said in replay.readings.items():
+        count = said.shape[1] // 3
+        names = [f"{name} {k + 1}" for k in range(count)] if count > 1 else [name]
+        pictures[f"reading_{replay.name}_{name}"] = readings_picture(said, names)
     if replay.shapes_m is not None and np.isfinite(replay.shapes_m).all(axis=(1, 2)).any():
         pictures[f"shapes_{replay.name}"] = shapes(
             t_s, replay.shapes_m, replay.surface, replay.held, measured, replay.up,

@@ -35,6 +35,7 @@ CAPTIONS = {
     "mesh": "The mesh, its grasped nodes and the markers' places as found.",
     "tracks": "Measured, fitted and rolled-out markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and rolled out.",
+    "reading": "A reading of your own: measured, fitted and rolled out.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % confidence ellipses of pairs of parameters, for the noise.",

@@ -52,6 +52,7 @@ class Recording:
     samples: int
     missing: int
     markers: tuple[MarkerFinding, ...]
+    instruments: tuple[str, ...]
 
     @property
     def farthest(self) -> MarkerFinding:
@@ -100,6 +101,10 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
         markers.samples,
         int(markers.missing.sum()),
         tuple(findings),
+        (
+            *(["the wrench"] if any(g.wrench is not None for g in experiment.grasps) else []),
+            *(gauge.name for gauge in experiment.readings),
+        ),
     )
 
 
