@@ -15,7 +15,7 @@ from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.beginning import SWUNG, YOUNG_PA
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
-from collocation_sysid.recording.force_files import read_pressure
+from collocation_sysid.recording.tables import read_pressure
 from collocation_sysid.statistics.modal import doubts
 
 TIMES = [0.0, 0.1, 0.2]

@@ -33,10 +33,9 @@ from ..recording import (
     read_wrench,
 )
 from ..recording.clock import TIME_TOLERANCE_S
-from ..recording.coverage import refuse_untold
-from ..recording.gauge_files import read_gauge
 from ..recording.nuisance import NuisanceRow
-from ..recording.wrench_files import within
+from ..recording.poses import refuse_untold
+from ..recording.tables import read_gauge, within
 from ..section import Section, stated_in
 from ..stated import keys_of
 from ..statistics.modal import doubts

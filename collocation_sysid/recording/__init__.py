@@ -3,20 +3,26 @@
 from .alignment import Aligned, align
 from .clock import sample_interval_s
 from .experiment import Experiment
-from .force_files import read_forces, read_pressure, read_tension
 from .gauge import Gauge, Look
 from .grasp import Grasp, held_dofs, held_nodes
 from .loads import Force, PointMass
 from .markers import Markers, Placement, place_markers
 from .nuisance import Nuisance, NuisanceRow
-from .pose_files import displaced_axes, read_displacement, read_poses
+from .pose_files import read_poses
 from .poses import PoseSequence
 from .pressure import Pressure
 from .readers import MarkerTable, read_markers
 from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
+from .tables import (
+    displaced_axes,
+    read_displacement,
+    read_forces,
+    read_pressure,
+    read_tension,
+    read_wrench,
+)
 from .tendon import Tendon
 from .wrench import Wrench
-from .wrench_files import read_wrench
 from .writers import write_gauge_csv, write_markers_csv, write_poses_csv, write_wrench_csv
 
 __all__ = [

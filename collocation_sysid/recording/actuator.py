@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.shape import Length, Volume
-from .course import Course
+from .loads import Course
 
 if TYPE_CHECKING:
     from ..fem.body import Body

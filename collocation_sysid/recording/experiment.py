@@ -18,15 +18,14 @@ from ..stated import key, stated
 from .actuator import Actuator
 from .arrays import floats, read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
-from .freedom import free_motions
 from .gauge import Gauge
-from .grasp import Grasp, held_dofs
+from .grasp import Grasp, free_motions, held_dofs
 from .loads import Change, Force, PointMass, ramp
 from .markers import Markers
 from .nuisance import Nuisance
 from .pressure import Pressure
+from .tables import within
 from .tendon import Tendon
-from .wrench_files import within
 
 if TYPE_CHECKING:
     from ..fem.body import Body

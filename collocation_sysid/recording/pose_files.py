@@ -1,9 +1,8 @@
-"""Pose files: CSV with quaternions, 4x4 matrices or shifts alone, and archives of matrices."""
+"""Pose files: CSV with quaternions or 4x4 matrices, and archives of matrices."""
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..errors import InputError
-from .formats.columns import DISPLACEMENT, SHIFTS, STRAIN, Columns, read_columns
 from .formats.plain import read_grid
 from .formats.text import Grid, Row, decode, is_number, listed, numbers, read_bytes
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
@@ -71,69 +69,6 @@ def read_poses(
     positions_m = _columns(table, axes) * METRES_PER_UNIT[unit]
     quaternions = _columns(table, components)
     return _sequence(path, t_s, positions_m, quaternions, lines)
-
-
-def read_displacement(
-    path: str | Path,
-    columns: Mapping[str, str] | None = None,
-    axis: str = "z",
-    sign: int = 1,
-    length_m: float | None = None,
-    timed: bool = True,
-) -> PoseSequence:
-    """Read shifts from the undeformed place over time, such as those of a test bench's crosshead.
-
-    A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement or
-    strain, in any order; along the other axes nothing moves.
-
-    Parameters
-    ----------
-    path : str or Path
-    columns : mapping, optional
-        The column of x, y, z, or of a machine's displacement or strain, and of t, where their names
-        are not recognised.
-    axis : {"x", "y", "z"}
-        Along which a machine's displacement or strain is.
-    sign : {1, -1}
-        What multiplies the file's values: -1 where positive ones go against the axis.
-    length_m : float, optional
-        The undeformed length that an engineering strain multiplies.
-    timed : bool
-        Whether there must be times; else rows count as seconds where there are none.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
-        does not increase; the line is named.
-    """
-    found = _shifts(path, columns, length_m, timed)
-    positions_m = np.zeros((len(found.t_s), 3))
-    for key, values in found.values.items():
-        along = key if key in "xyz" else axis
-        positions_m[:, "xyz".index(along)] = sign * (length_m or 1.0) * values
-    unturned = np.tile([0.0, 0.0, 0.0, 1.0], (len(positions_m), 1))
-    lines = [f"line {line}" for line in found.grid.lines]
-    return _sequence(path, found.t_s, positions_m, unturned, lines)
-
-
-def displaced_axes(
-    path: str | Path,
-    columns: Mapping[str, str] | None = None,
-    axis: str = "z",
-    length_m: float | None = None,
-) -> str:
-    """Return along which axes a file tells shifts, such as "z"; see `read_displacement`."""
-    found = _shifts(path, columns, length_m, timed=False).values
-    named = {key if key in "xyz" else axis for key in found}
-    return "".join(axis for axis in "xyz" if axis in named)
-
-
-def _shifts(
-    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
-) -> Columns:
-    wanted = (*SHIFTS, DISPLACEMENT) if length_m is None else (STRAIN,)
-    return read_columns(path, wanted, columns, timed=timed)
 
 
 def _sequence(

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PPoly
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..errors import InputError
 from .arrays import read_only_floats
 from .clock import TIME_TOLERANCE_S, first_time_fault
-from .splines import jumps, smooth_spline
 
 Interpolation = Literal["smooth", "linear", "hold"]
 
@@ -27,6 +28,14 @@ QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
 _HOLD_SNAP = 1e-6
 _ORTHONORMAL, _LAST_ROW = 1e-3, 1e-6
+# No motion that its samples resolve is this many times slower just before and just after.
+_JUMP_RATIO = 10.0
+# Of the whole range: less is rounding.
+_LEAST_JUMP = 1e-3
+# Poses further apart do not tell how a grasp moves between them.
+LONGEST_STEP_S = 1.0
+# Poses that differ by less, in metres and in a quaternion's components, are of one that stands.
+STILL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +54,7 @@ class PoseSequence:
     interpolation : {"smooth", "linear", "hold"}
         Between samples: cubic splines of the position and of the quaternion, which is then
         normalised; linear in position with SLERP in rotation; or the latest sample. Across a jump
-        (see `splines`) and between two poses alone "smooth" is linear.
+        (see `jumps`) and between two poses alone "smooth" is linear.
 
     Raises
     ------
@@ -268,3 +277,96 @@ def _unit_and_continuous(quaternions: Array) -> Array:
     continuous = unit * signs[:, None]
     continuous.setflags(write=False)
     return continuous
+
+
+# Between samples ---------------------------------------------------------------------------------
+
+
+def jumps(t_s: Array, values: Array) -> Index:
+    """Return the intervals in which values (m, k) jump, numbered by their first sample.
+
+    A jump is a change that is more than 10 times as fast as those just before and just after.
+    """
+    change = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    rate = change / np.diff(t_s)
+    large = change > _LEAST_JUMP * np.linalg.norm(np.ptp(values, axis=0))
+    around = np.maximum(rate[:-2], rate[2:])
+    return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _JUMP_RATIO * around))
+
+
+def smooth_spline(t_s: Array, values: Array) -> PPoly:
+    """Return the cubic spline through values (m, k), m > 1, with two continuous derivatives.
+
+    Across a jump it is linear, and separate splines end on either side: one spline would
+    overshoot around it. Few samples make a parabola or a line.
+    """
+    broken = jumps(t_s, values)
+    coefficients = np.zeros((4, len(t_s) - 1, values.shape[1]))
+    for first, end in pairwise([0, *(broken + 1), len(t_s)]):
+        if end - first > 1:
+            piece = CubicSpline(t_s[first:end], values[first:end])
+            coefficients[:, first : end - 1] = piece.c
+    coefficients[3, broken] = values[broken]
+    steps_s = (t_s[broken + 1] - t_s[broken])[:, None]
+    coefficients[2, broken] = (values[broken + 1] - values[broken]) / steps_s
+    return PPoly(coefficients, t_s)
+
+
+# Over a recording --------------------------------------------------------------------------------
+
+
+def refuse_untold(
+    poses: PoseSequence, t_s: Array, held_s: tuple[float, float], file: str | Path
+) -> None:
+    """Refuse poses that leave open how a grasp moves while it holds.
+
+    Parameters
+    ----------
+    poses : PoseSequence
+    t_s : (T,) times of the recording's samples
+    held_s : (float, float)
+        First and last time at which the grasp holds.
+    file : str or Path
+        Where the poses are from.
+
+    Raises
+    ------
+    InputError
+        Of a single pose, of poses that are missing for more than a sample at an end, and of a
+        smooth motion that is sampled below 1 Hz.
+    """
+    first_s, last_s = max(t_s[0], held_s[0]), min(t_s[-1], held_s[1])
+    lasts = f"the recording lasts from {first_s:.6g} s to {last_s:.6g} s"
+    if len(poses.t_s) == 1:
+        raise InputError(
+            f"holds one pose, and {lasts}; expected poses over all of it, or the same pose at "
+            "both times if the grasp stands still",
+            file,
+        )
+    step_s = _typical_step_s(poses, first_s, last_s)
+    if poses.interpolation == "smooth" and step_s > LONGEST_STEP_S:
+        raise InputError(
+            f"the poses move and are {step_s:.6g} s apart, and {lasts}; expected several a second, "
+            "with t_s in seconds and not in milliseconds; or interpolation = 'linear' or 'hold' if "
+            "that is how it moves between them",
+            file,
+        )
+    start_s, end_s = poses.t_s[[0, -1]]
+    slack_s = 1.01 * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    shared = np.count_nonzero((t_s >= start_s) & (t_s <= end_s))  # none if of two recordings
+    if shared > 2 and (start_s > first_s + slack_s or end_s < last_s - slack_s):
+        window = f"[{max(start_s, t_s[0]):.6g}, {min(end_s, t_s[-1]):.6g}]"
+        raise InputError(
+            f"the poses run from {start_s:.6g} s to {end_s:.6g} s, and {lasts}; expected poses "
+            f"over all of it, in seconds of the same clock: add rows, or set window_s = {window}",
+            file,
+        )
+
+
+def _typical_step_s(poses: PoseSequence, first_s: float, last_s: float) -> float:
+    """Median time from pose to pose within a span, of those between which the grasp moves."""
+    shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
+    turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)
+    within = (poses.t_s[1:] > first_s) & (poses.t_s[:-1] < last_s)
+    steps_s = np.diff(poses.t_s)[within & (np.maximum(shift_m, turn) > STILL)]
+    return float(np.median(steps_s)) if len(steps_s) else 0.0

@@ -16,9 +16,9 @@ from ..fem.selection import Indices, Selection, rows_of_faces
 from ..fem.shape import Volume
 from ..stated import Key, key, stated
 from .actuator import Actuator, Placed
-from .course import Course
-from .force_files import read_pressure
+from .loads import Course
 from .selected import Nodes, selection
+from .tables import read_pressure
 
 if TYPE_CHECKING:
     from ..fem.body import Body

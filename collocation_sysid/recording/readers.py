@@ -13,12 +13,18 @@ from ..arrays import Array
 from ..errors import InputError, hint_at
 from .arrays import read_only_floats, read_only_tracks
 from .clock import first_time_fault
-from .formats import Choose, RawTracks, read_tracks
-from .formats.text import listed
+from .formats import Choose, RawTracks, c3d, motive, plain, qualisys, trc
+from .formats.text import decode, listed, read_bytes
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
 
 # A frame rate and a column of times agree within this part.
 _RATE_TOLERANCE = 0.01
+# What the first line begins with.
+_TEXT_FORMATS = {
+    trc.BEGINNING: trc.read,
+    qualisys.BEGINNING: qualisys.read,
+    motive.BEGINNING: motive.read,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +100,31 @@ def read_markers(
     if rate_hz is not None and not 0 < rate_hz < np.inf:
         raise InputError(f"rate_hz is {rate_hz:g}; expected a rate above 0")
     labels = dict(labels or {})
-    raw = read_tracks(path, _choice(path, names, labels))
+    raw = _read_tracks(path, _choice(path, names, labels))
     metres = METRES_PER_UNIT[_unit(path, raw, length_unit)]
     t_s = _times_s(path, raw, rate_hz)
     taken = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _present(raw, taken)
     return MarkerTable(t_s, tuple(taken), coordinates * metres, (*raw.notes, *notes))
+
+
+def _read_tracks(path: str | Path, choose: Choose) -> RawTracks:
+    """Read the markers that `choose` picks from a file of any known format.
+
+    Raises
+    ------
+    InputError
+        Naming the file, and the line where there is one.
+    """
+    content = read_bytes(path)
+    if c3d.recognises(content):
+        return c3d.read(path, content, choose)
+    text = decode(content, path)
+    start = text.lstrip().lstrip('"')
+    for beginning, read in _TEXT_FORMATS.items():
+        if start.startswith(beginning):
+            return read(path, text, choose)
+    return plain.read(path, text, choose)
 
 
 def _choice(path: str | Path, names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:

@@ -16,9 +16,9 @@ from ..section import Vector
 from ..stated import Key, key, stated
 from .actuator import Actuator, Placed
 from .arrays import floats
-from .course import Course
-from .force_files import read_tension
+from .loads import Course
 from .placement import Shape
+from .tables import read_tension
 
 if TYPE_CHECKING:
     from ..fem.body import Body

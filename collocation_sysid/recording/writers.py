@@ -15,7 +15,7 @@ from ..files import whole_file
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
 from .readers import MarkerTable
-from .wrench_files import WRENCH_COLUMNS
+from .tables import WRENCH_COLUMNS
 
 _DIGITS = "%.12g"
 

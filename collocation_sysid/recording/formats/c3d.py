@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...apart import Failed, computed_apart
 from ...errors import InputError
-from .tracks import Choose, RawTracks
+from . import Choose, RawTracks
 from .units import stated_unit
 
 _KEY = 0x50

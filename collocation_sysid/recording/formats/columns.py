@@ -136,10 +136,21 @@ def read_columns(
     values = {key: _values(grid, column, blank_allowed) for key, column in found.items()}
     if t is None:
         return Columns(grid, np.arange(float(len(grid.rows))), values)
-    t_s = _values(grid, t, False)
+    return Columns(grid, times_of(grid, *t), values)
+
+
+def times_of(grid: Grid, place: int, factor: float = 1.0) -> Array:
+    """The times in a column.
+
+    Raises
+    ------
+    InputError
+        If a cell is not a number, or time does not increase; the line is named.
+    """
+    t_s = factor * numbers(grid, [place], blank_allowed=False)[:, 0]
     if fault := first_time_fault(t_s):
-        raise InputError(fault[1], path, f"line {grid.lines[fault[0]]}")
-    return Columns(grid, t_s, values)
+        raise InputError(fault[1], grid.path, f"line {grid.lines[fault[0]]}")
+    return t_s
 
 
 def _values(grid: Grid, column: tuple[int, float], blank_allowed: bool) -> Array:

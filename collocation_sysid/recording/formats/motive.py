@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import InputError
+from . import Choose, RawTracks
 from .text import Row, grid, header_number, numbers, refuse_other_count, separated_rows
-from .tracks import Choose, RawTracks
 from .units import stated_unit
 
 BEGINNING = "Format Version"

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...errors import InputError
 from ..clock import first_time_fault
+from . import Choose, RawTracks
 from .text import Grid, Row, grid, is_number, listed, numbers, separated_rows
-from .tracks import Choose, RawTracks
 from .units import METRES_PER_UNIT, UNITS, si_factor
 
 _AXES = ("x", "y", "z")

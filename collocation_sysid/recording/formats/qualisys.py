@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 from ...errors import InputError
+from . import Choose, RawTracks
 from .text import (
     Row,
     grid,
@@ -19,7 +20,6 @@ from .text import (
     tab_rows,
     tracks,
 )
-from .tracks import Choose, RawTracks
 
 BEGINNING = "NO_OF_"
 _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...errors import InputError
+from . import Choose, RawTracks
 from .text import (
     grid,
     header_number,
@@ -18,7 +19,6 @@ from .text import (
     tab_rows,
     tracks,
 )
-from .tracks import Choose, RawTracks
 from .units import stated_unit
 
 BEGINNING = "PathFileType"

@@ -11,8 +11,8 @@ from ...arrays import Array
 from ...problem import Problem
 from ...program.collocation import Collocation, carried_over
 from ...recording.experiment import Experiment
+from ...recording.tables import FEWEST
 from ...recording.wrench import Wrench
-from ...recording.wrench_files import FEWEST
 
 # All kinds of rows are among these samples, those of equilibria among fewer; derivatives do not
 # depend on how many follow.

@@ -1,0 +1,277 @@
+"""What acts or is measured over time, as tables: columns with units, in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array
+from ..errors import InputError, hint_at
+from .clock import TIME_TOLERANCE_S, unrounded_s
+from .formats.columns import (
+    DISPLACEMENT,
+    FORCE,
+    FORCES,
+    PRESSURE,
+    SHIFTS,
+    STRAIN,
+    STRESS,
+    TENSION,
+    TORQUES,
+    Columns,
+    Quantity,
+    read_columns,
+    times_of,
+)
+from .formats.plain import read_grid
+from .formats.text import Grid, decode, listed, numbers, read_bytes
+from .poses import PoseSequence
+
+WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
+# Pressures far above these are likely in another unit, tensions in grams or from a raw sensor.
+LARGEST_PA, LARGEST_N = 1e8, 1e5
+# So many samples must lie within an experiment.
+FEWEST = 3
+
+
+def read_forces(path: str | Path) -> tuple[Array, Array]:
+    """Read a force over time: t_s, fx_n, fy_n, fz_n, in any order.
+
+    Returns
+    -------
+    t_s : (T,) array
+    force_n : (T, 3) array
+
+    Raises
+    ------
+    InputError
+        If a column is missing or unknown, a cell is not a number, or time does not increase; the
+        line is named.
+    """
+    table = read_columns(path, FORCES, all_of=True)
+    return table.t_s, np.column_stack([table.values[quantity.key] for quantity in FORCES])
+
+
+def read_tension(path: str | Path) -> tuple[Array, Array]:
+    """Read the tension of a tendon, `t_s` (T,) and `tension_n` (T,), columns in any order.
+
+    Raises
+    ------
+    InputError
+        If a column is missing or unknown, a cell is not a number, time does not increase, or a
+        tension is negative; the line is named.
+    """
+    grid, t_s, tension = _one(path, TENSION, LARGEST_N)
+    for row in (tension < 0).nonzero()[0]:
+        raise InputError(
+            f"tension_n is {tension[row]:g}; expected 0 or more, since a tendon only pulls: take "
+            "the sensor's offset off",
+            path,
+            f"line {grid.lines[row]}",
+        )
+    return t_s, tension
+
+
+def read_pressure(path: str | Path) -> tuple[Array, Array]:
+    """Read a pressure above the surroundings', `t_s` (T,) and `pressure_pa` (T,); see above."""
+    return _one(path, PRESSURE, LARGEST_PA)[1:]
+
+
+def _one(path: str | Path, quantity: Quantity, largest: float) -> tuple[Grid, Array, Array]:
+    table = read_columns(path, [quantity])
+    values = table.values[quantity.key]
+    for row in (abs(values) > largest).nonzero()[0]:
+        raise InputError(
+            f"{quantity.column} is {values[row]:g}, which no soft body bears; check the unit of "
+            "the column",
+            path,
+            f"line {table.grid.lines[row]}",
+        )
+    return table.grid, table.t_s, values
+
+
+# Of a grasp, as a robot or a test bench tells it --------------------------------------------------
+
+
+def read_wrench(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    area_m2: float | None = None,
+    symmetry: int = 1,
+    timed: bool = True,
+) -> tuple[Array, Array]:
+    """Read what a grasp gives the body over time, columns in any order; blank cells are missing.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        The column of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t, where
+        their names are not recognised.
+    axis : {"x", "y", "z"}
+        Along which a machine's force or stress acts.
+    sign : {1, -1}
+        What multiplies the file's values: -1 where a positive one pulls the body the other way.
+    area_m2 : float, optional
+        The undeformed area that an engineering stress multiplies.
+    symmetry : int
+        The body is one of so many equal parts of what was measured.
+    timed : bool
+        Whether there must be times; else rows count as seconds where there are none.
+
+    Returns
+    -------
+    t_s : (S,) array
+    values : (S, 6) array
+        fx, fy, fz [N], tx, ty, tz [N m]; NaN where missing.
+
+    Raises
+    ------
+    InputError
+        If a column names no unit or one of something else, is unknown or repeated, a cell is not a
+        number, or time does not increase; the line is named.
+    """
+    wanted = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
+    table = read_columns(path, wanted, columns, blank_allowed=True, timed=timed)
+    factor = sign * (area_m2 or 1.0) / symmetry
+    return _unrounded(table.t_s), factor * _components(table, (*FORCES, *TORQUES), axis)
+
+
+def read_displacement(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    length_m: float | None = None,
+    timed: bool = True,
+) -> PoseSequence:
+    """Read shifts from the undeformed place over time, such as those of a test bench's crosshead.
+
+    A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement or
+    strain, in any order; along the other axes nothing moves.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        The column of x, y, z, or of a machine's displacement or strain, and of t, where their names
+        are not recognised.
+    axis : {"x", "y", "z"}
+        Along which a machine's displacement or strain is.
+    sign : {1, -1}
+        What multiplies the file's values: -1 where positive ones go against the axis.
+    length_m : float, optional
+        The undeformed length that an engineering strain multiplies.
+    timed : bool
+        Whether there must be times; else rows count as seconds where there are none.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
+        does not increase; the line is named.
+    """
+    table = _shifts(path, columns, length_m, timed)
+    shifts_m = sign * (length_m or 1.0) * np.nan_to_num(_components(table, SHIFTS, axis))
+    return PoseSequence(table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)))
+
+
+def displaced_axes(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    length_m: float | None = None,
+) -> str:
+    """Return along which axes a file tells shifts, such as "z"; see `read_displacement`."""
+    shifts = _components(_shifts(path, columns, length_m, timed=False), SHIFTS, axis)
+    told = np.isfinite(shifts).any(axis=0)
+    return "".join(each for each, there in zip("xyz", told, strict=True) if there)
+
+
+def _shifts(
+    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
+) -> Columns:
+    wanted = (*SHIFTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    return read_columns(path, wanted, columns, timed=timed)
+
+
+def _components(table: Columns, wanted: Sequence[Quantity], axis: str) -> Array:
+    """(T, n) components, of which the first three are along axes; NaN where missing.
+
+    What has no axis in its name, as of a machine, is along that given.
+    """
+    places = {quantity.key: k for k, quantity in enumerate(wanted)}
+    values = np.full((len(table.t_s), len(wanted)), np.nan)
+    for key, column in table.values.items():
+        values[:, places.get(key, "xyz".index(axis))] = column
+    return values
+
+
+def _unrounded(t_s: Array) -> Array:
+    return unrounded_s(t_s) if len(t_s) > 2 else t_s
+
+
+# Of an instrument ---------------------------------------------------------------------------------
+
+
+def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Array, list[str]]:
+    """Read times (S,) and what an instrument said then (S, m); NaN where a cell is blank.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : sequence of str
+        Those of its numbers; all besides t_s by default. Their names are given back.
+
+    Raises
+    ------
+    InputError
+        If a column is missing or repeated, a cell is not a number, or time does not increase; the
+        line is named.
+    """
+    grid = read_grid(path, decode(read_bytes(path), path))
+    wanted = list(columns) or [name for name in grid.columns if name != "t_s"]
+    for name in ("t_s", *wanted):
+        if (count := grid.columns.count(name)) != 1:
+            there = f"{count} columns are called" if count else "there is no column"
+            hint = "" if count else hint_at(name, grid.columns)
+            raise InputError(
+                f"{there} {name!r}; expected one among {listed(grid.columns)}{hint}",
+                path,
+                f"line {grid.names_line}",
+            )
+    t_s = times_of(grid, grid.columns.index("t_s"))
+    values = numbers(grid, [grid.columns.index(name) for name in wanted], True)
+    return _unrounded(t_s), np.asarray(values), wanted
+
+
+def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_]:
+    """Return which samples at `at_s` (S,) of a file lie within an experiment's times `t_s` (T,).
+
+    Of a static experiment one is enough.
+
+    Raises
+    ------
+    InputError
+        If fewer than three do: clocks or units differ.
+    """
+    inside = (at_s >= t_s[0] - TIME_TOLERANCE_S) & (at_s <= t_s[-1] + TIME_TOLERANCE_S)
+    fewest = 1 if static else FEWEST
+    if inside.sum() >= fewest:
+        return inside
+    span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (at_s, t_s)]
+    ratio = np.ptp(at_s) / max(np.ptp(t_s), TIME_TOLERANCE_S)
+    hint = (
+        f"{name} seems to be in milliseconds"
+        if 300 < ratio < 3000
+        else "both need one clock, in seconds; subtract where they began"
+    )
+    raise InputError(
+        f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(inside.sum())} samples "
+        f"are in common; expected {fewest} at least. {hint}"
+    )
