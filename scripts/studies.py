@@ -8,7 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from collocation_sysid.plan import Limits, PlannedRun, RunStore, Starts, plan_comparison, run_all
+from collocation_sysid.plan import (
+    PlannedRun,
+    RunOptions,
+    RunStore,
+    Starts,
+    plan_comparison,
+    run_all,
+)
 from collocation_sysid.plan.table import Row, Yardstick, run_row
 from collocation_sysid.problem import Problem
 
@@ -77,7 +84,7 @@ def run_variants(
     """
     store, limits = (
         RunStore(folder / "runs"),
-        Limits(workers=workers, time_limit_s=time_s + GRACE_S),
+        RunOptions(workers=workers, time_limit_s=time_s + GRACE_S),
     )
     planned: dict[str, list[PlannedRun]] = {}
     for variant in variants:

@@ -15,11 +15,15 @@ from wrenches_small import wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
-from collocation_sysid.plan.design import Criterion, DesignOptions, Limits, Motion, designing
+from collocation_sysid.plan.design import Criterion, DesignOptions, HandMotion, Limits, designing
 from collocation_sysid.plan.design.criterion import Errors, both_sides, draws_about
 from collocation_sysid.plan.design.designing import Judge, design
 from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
-from collocation_sysid.plan.design.information import LinearRecording, Recording, shared_information
+from collocation_sysid.plan.design.information import (
+    FutureRecording,
+    LinearRecording,
+    shared_information,
+)
 from collocation_sysid.plan.design.motion import angular_motion
 from collocation_sysid.plan.design.search import search
 from collocation_sysid.plan.progress import DesignProgress
@@ -52,12 +56,12 @@ angular_acceleration_deg_s2 = 3000.0
 """
 
 
-def drawn_motions(count: int = 12, waves: int = 1) -> list[Motion]:
+def drawn_motions(count: int = 12, waves: int = 1) -> list[HandMotion]:
     """Motions of coefficients up to far beyond the usual, within the limits."""
     bounds, rng = LIMITS.about(np.array([0.05, 0.05, 0.1])), np.random.default_rng(0)
-    size = Motion.size(waves)
+    size = HandMotion.size(waves)
     drawn = [rng.normal(size=size) * rng.choice([1.0, 5.0]) for _ in range(count)]
-    return [bounds.within(Motion.of(u, 0.3, 10.0, bounds.reach)) for u in drawn]
+    return [bounds.within(HandMotion.of(u, 0.3, 10.0, bounds.reach)) for u in drawn]
 
 
 def problem(**changes) -> Problem:
@@ -112,7 +116,7 @@ def test_small_turns_have_the_series_of_the_same_formula():
 # Limits -------------------------------------------------------------------------------------------
 
 
-def peaks(motion: Motion) -> dict[str, float]:
+def peaks(motion: HandMotion) -> dict[str, float]:
     """Largest values over the limits on a grid five times finer, by the limits' names."""
     fine = np.linspace(0, motion.duration_s, 5 * len(motion.grid_s))
     position, velocity, acceleration = motion.derivatives(fine)
@@ -308,7 +312,7 @@ def test_what_is_not_to_be_designed_is_refused():
     )  # fmt: skip
     for experiment, message in cases:
         with pytest.raises(InputError, match=message):
-            Recording(Problem([experiment], AT), experiment, 0.1)
+            FutureRecording(Problem([experiment], AT), experiment, 0.1)
     static = replace(hung_cube(4), kind="static")
     with pytest.raises(InputError, match="every experiment is static"):
         design(Problem([static], AT), LIMITS, 0.1)
@@ -320,7 +324,7 @@ def test_what_is_not_to_be_designed_is_refused():
 
 
 def test_the_poses_turn_the_body_about_its_hand():
-    recording = Recording(problem(), hung_cube(8), 0.2)
+    recording = FutureRecording(problem(), hung_cube(8), 0.2)
     coordinates = np.zeros((len(recording.pose_times_s), 6))
     coordinates[:, 4] = np.linspace(0, 1, len(coordinates))
     poses = recording.carried(coordinates)
@@ -328,7 +332,7 @@ def test_the_poses_turn_the_body_about_its_hand():
 
 
 def test_a_small_motion_tells_what_it_does_to_first_order():
-    recording = Recording(problem(), hung_cube(8), 0.25)
+    recording = FutureRecording(problem(), hung_cube(8), 0.25)
     motion = replace(drawn_motions(1)[0], duration_s=0.25, active_s=0.22, rise_s=0.08)
     small = motion.scaled(0.1, 0.1)
     linear = LinearRecording.of(recording, AT.guess_q).information(small)
@@ -341,7 +345,7 @@ def test_a_small_motion_tells_what_it_does_to_first_order():
 
 def test_a_sensor_measures_at_its_own_rate_over_the_new_time():
     sensing = wristed_cube(8)
-    recording = Recording(Problem([sensing], AT), sensing, 0.2)
+    recording = FutureRecording(Problem([sensing], AT), sensing, 0.2)
     (before,), (grasp,) = sensing.grasps, recording.experiment(still_poses(recording)).grasps
     assert before.wrench is not None
     assert grasp.wrench is not None
@@ -350,7 +354,7 @@ def test_a_sensor_measures_at_its_own_rate_over_the_new_time():
     assert grasp.wrench.names == before.wrench.names
 
 
-def still_poses(recording: Recording) -> PoseSequence:
+def still_poses(recording: FutureRecording) -> PoseSequence:
     return recording.carried(np.zeros((len(recording.pose_times_s), 6)))
 
 
@@ -379,7 +383,7 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
     blind = replace(sensing, grasps=(replace(grasp, wrench=None),))
     q, told = AT.guess_q, []
     for experiment in (sensing, blind):
-        recording = Recording(Problem([experiment], AT), experiment, 0.08)
+        recording = FutureRecording(Problem([experiment], AT), experiment, 0.08)
         told.append(recording.told(recording.experiment(still_poses(recording)), q).information)
     assert np.linalg.eigvalsh(told[0] - told[1]).min() > -1e-6 * np.trace(told[0])
     assert told[0][0, 0] > 1.01 * told[1][0, 0]
@@ -388,7 +392,7 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
 
 
 def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
-    recording = Recording(problem(), hung_cube(8), 0.08)
+    recording = FutureRecording(problem(), hung_cube(8), 0.08)
     judge = Judge(recording, LIMITS, Criterion(), [AT.guess_q], np.zeros((4, 4)))
     monkeypatch.setattr(designing, "MOST_GIGABYTES", 0.5 * LinearRecording.gigabytes(recording))
     assert judge.first_guess(FEW, print).at is None
@@ -396,13 +400,13 @@ def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
 
 def test_a_motion_is_judged_over_all_draws():
     judge = Judge(
-        Recording(problem(), hung_cube(8), 0.08),
+        FutureRecording(problem(), hung_cube(8), 0.08),
         LIMITS,
         Criterion(over="worst"),
         draws_about(AT, 1.5, 1, 0),
         np.zeros((4, 4)),
     )
-    at = np.random.default_rng(0).normal(size=Motion.size(1))
+    at = np.random.default_rng(0).normal(size=HandMotion.size(1))
     alone = [replace(judge, draws=[q]).value(at, np.inf) for q in judge.draws]
     assert judge.value(at, np.inf) == pytest.approx(max(alone))
     assert judge.value(at, alone[0] - 1) == pytest.approx(alone[0])  # beyond the bar at the first
@@ -444,8 +448,8 @@ def test_no_motion_in_view_and_none_that_can_be_simulated_are_told():
 
 
 def test_motions_that_break_a_rule_come_after_all_others():
-    recording = Recording(problem(), hung_cube(8), 0.05)
-    at = np.random.default_rng(0).normal(size=Motion.size(1))
+    recording = FutureRecording(problem(), hung_cube(8), 0.05)
+    at = np.random.default_rng(0).normal(size=HandMotion.size(1))
     near, far = (
         Limits.model_validate(
             LIMITS.model_dump() | {"markers_box_m": ((-1.0, -1, 0.02), (1.0, 1, top))}

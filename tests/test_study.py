@@ -17,8 +17,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.plan import (
-    Limits,
     PlannedRun,
+    RunOptions,
     RunStore,
     Starts,
     plan_comparison,
@@ -360,7 +360,7 @@ def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
 # Many runs ----------------------------------------------------------------------------------------
 
 
-def assert_all_runs_are_kept(folder: Path, limits: Limits) -> None:
+def assert_all_runs_are_kept(folder: Path, limits: RunOptions) -> None:
     store, seen = RunStore(folder), []
     runs = planned_runs(4)
     run_all(runs, store, limits, lambda record, slots: seen.append((record["key"], slots)))
@@ -371,17 +371,17 @@ def assert_all_runs_are_kept(folder: Path, limits: Limits) -> None:
 
 def test_runs_are_done_without_a_cluster(stand_in, without_distributed, tmp_path):
     stand_in("dies once")
-    assert_all_runs_are_kept(tmp_path / "runs", Limits(workers=3))
+    assert_all_runs_are_kept(tmp_path / "runs", RunOptions(workers=3))
 
 
 def test_runs_are_done_on_a_scheduler_by_its_address(stand_in, a_scheduler, tmp_path):
     stand_in("dies once")
-    assert_all_runs_are_kept(tmp_path / "runs", Limits(scheduler=a_scheduler))
+    assert_all_runs_are_kept(tmp_path / "runs", RunOptions(scheduler=a_scheduler))
 
 
 def test_a_scheduler_without_the_library_names_the_extra(without_distributed, tmp_path):
     with pytest.raises(InputError, match=r"pip install 'collocation-sysid\[cluster\]'"):
-        run_all(planned_runs(1), RunStore(tmp_path), Limits(scheduler="tcp://127.0.0.1:1"))
+        run_all(planned_runs(1), RunStore(tmp_path), RunOptions(scheduler="tcp://127.0.0.1:1"))
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
@@ -390,7 +390,7 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
     with pytest.raises(
         InputError, match=r"found 'tcp://127\.0\.0\.1:1', where no scheduler answers"
     ):
-        run_all(planned_runs(1), RunStore(tmp_path), Limits(scheduler="tcp://127.0.0.1:1"))
+        run_all(planned_runs(1), RunStore(tmp_path), RunOptions(scheduler="tcp://127.0.0.1:1"))
 
 
 @pytest.mark.parametrize("clustered", [True, False])
@@ -403,7 +403,7 @@ def test_an_interrupted_study_keeps_what_is_finished(stand_in, tmp_path, request
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_all(runs, store, Limits(None if clustered else 1, address), interrupt)
+        run_all(runs, store, RunOptions(None if clustered else 1, address), interrupt)
     assert sum(store.load(run.key) is not None for run in runs) == 1
 
 
@@ -438,7 +438,7 @@ def test_half_a_file_is_no_run(tmp_path):
 )
 def test_limits_that_cannot_be_are_refused(options, where):
     with pytest.raises(InputError, match=f"^{where}: "):
-        Limits(**options)
+        RunOptions(**options)
 
 
 # Numbers ------------------------------------------------------------------------------------------

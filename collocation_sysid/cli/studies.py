@@ -15,8 +15,8 @@ from rich.text import Text
 from ..errors import InputError
 from ..folders import require_possible, run_name
 from ..plan import (
-    Limits,
     PlannedRun,
+    RunOptions,
     RunStore,
     Starts,
     plan_comparison,
@@ -45,7 +45,7 @@ class Many(OfProblem, Told):
         Only list the runs.
     """
 
-    limits: Limits
+    limits: RunOptions
     out: Out = None
     dry_run: bool = False
 

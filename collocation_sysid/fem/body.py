@@ -34,7 +34,7 @@ from .mesh import TetMesh
 from .model import Model, Theta
 from .node_force import NodeForce, PlacedForce
 from .pattern import Joined, SymmetricPattern
-from .regions import Part, Region, parts_of
+from .regions import BodyPart, Region, parts_of
 from .selection import Selection
 from .stress import Stresses
 
@@ -115,7 +115,7 @@ class Body(Discretisation):
 
     Attributes
     ----------
-    parts : tuple of Part
+    parts : tuple of BodyPart
         What no region claims, then the regions.
     constants : dict of name to Constant
         What θ holds, in its order.
@@ -170,7 +170,7 @@ class Body(Discretisation):
         """Names of what is kept and follows from the rest."""
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
-    def _lumped(self, part: Part) -> Array:
+    def _lumped(self, part: BodyPart) -> Array:
         """(n,) lumped volume of a part."""
         shares = self.mesh.volumes_m3[part.cells, None] * self.element.mass_shares
         volume = np.zeros(len(self.nodes_m))

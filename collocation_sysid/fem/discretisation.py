@@ -19,7 +19,7 @@ from .mesh import Nodes, TetMesh
 from .model import Model, Theta
 from .node_force import NodeForce
 from .pattern import SymmetricPattern, element_destinations, in_ascending_order
-from .regions import Part
+from .regions import BodyPart
 from .selection import Selection
 
 
@@ -34,7 +34,7 @@ class Discretisation(Model):
 
     def __init__(
         self,
-        parts: tuple[Part, ...],
+        parts: tuple[BodyPart, ...],
         forces: tuple[NodeForce, ...],
         mesh: TetMesh,
         element: str,

@@ -31,7 +31,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from .elements import Element
-from .kernel import Outputs, Pieces, Point, PointKernel, Term
+from .kernel import Derivative, Outputs, Pieces, PointKernel, QuadraturePoint
 from .materials import Damping, Material
 from .mean_dilatation import averaging_kernel
 
@@ -82,7 +82,7 @@ class Law:
         return {c.name: own[k] for k, c in enumerate(self.damping.constants)}
 
 
-def kernel_of(name: str, point: Point, outputs: Outputs) -> PointKernel:
+def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
     """The kernel of derivatives of scalars of a point."""
     if point.stretches:
         return averaging_kernel(name, point, outputs)
@@ -97,11 +97,11 @@ def kernel_of(name: str, point: Point, outputs: Outputs) -> PointKernel:
     return PointKernel(last.pieces, tuple(point.fields), last.contractions)
 
 
-def _energy(point: Point, law: Law) -> ca.SX:
+def _energy(point: QuadraturePoint, law: Law) -> ca.SX:
     return point.volume * law.psi(point.felt, point.theta)
 
 
-def _potential(point: Point, law: Law) -> ca.SX:
+def _potential(point: QuadraturePoint, law: Law) -> ca.SX:
     """Θ of one point, whose slope by x is an internal force but for the sign."""
     energy = _energy(point, law)
     damped = energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
@@ -110,7 +110,7 @@ def _potential(point: Point, law: Law) -> ca.SX:
     return damped + point.theta[-1] * energy + carried_energy(point)
 
 
-def carried_energy(point: Point) -> ca.SX:
+def carried_energy(point: QuadraturePoint) -> ca.SX:
     """½ V H : FᵀF, whose slope by F is V F H."""
     F = point.felt
     return point.volume * ca.trace(symmetric(point.carried[:6]) @ F.T @ F) / 2
@@ -130,17 +130,17 @@ def six_of(matrix: ca.SX) -> ca.SX:
     return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
 
 
-def first_piola(point: Point, law: Law) -> ca.SX:
+def first_piola(point: QuadraturePoint, law: Law) -> ca.SX:
     """P (9,) = ∂ψ/∂F."""
     return ca.gradient(law.psi(point.felt, point.theta), point.gradients["x"])
 
 
-def second_piola(point: Point, law: Law) -> ca.SX:
+def second_piola(point: QuadraturePoint, law: Law) -> ca.SX:
     """S (6,) = F⁻¹ P."""
     return six_of(ca.inv_minor(point.felt) @ ca.reshape(first_piola(point, law), 3, 3))
 
 
-def _damping(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
+def _damping(point: QuadraturePoint, law: Law) -> tuple[ca.SX, ca.SX] | None:
     """V P_v of one point, and its slope by F."""
     found = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.theta)
     return None if found is None else (point.volume * found[0], point.volume * found[1])
@@ -148,29 +148,29 @@ def _damping(point: Point, law: Law) -> tuple[ca.SX, ca.SX] | None:
 
 def energy_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic energy Ψ of the point [J]."""
-    point = Point.of(element, law.constants, "x")
-    return kernel_of("energy", point, {"energy": (Term(_energy(point, law), ()),)})
+    point = QuadraturePoint.of(element, law.constants, "x")
+    return kernel_of("energy", point, {"energy": (Derivative(_energy(point, law), ()),)})
 
 
 def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
-    point = Point.of(element, law.constants, "x", "v", carried=law.carried)
-    force = (Term(-_potential(point, law), ("x",)),)
+    point = QuadraturePoint.of(element, law.constants, "x", "v", carried=law.carried)
+    force = (Derivative(-_potential(point, law), ("x",)),)
     if found := _damping(point, law):
         stress = -found[0]
-        force += (Term(ca.dot(stress, point.felt_rate) / 2, ("v",), known=stress),)
+        force += (Derivative(ca.dot(stress, point.felt_rate) / 2, ("v",), known=stress),)
     return kernel_of("force", point, {"force": force})
 
 
 def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
-    point = Point.of(element, law.constants, "x", "v", carried=law.carried)
+    point = QuadraturePoint.of(element, law.constants, "x", "v", carried=law.carried)
     potential = -_potential(point, law)
     outputs: Outputs = {
-        "force": (Term(potential, ("x",)),),
-        "by_position": (Term(potential, ("x", "x")),),
-        "by_velocity": (Term(potential, ("x", "v")),),
-        "by_theta": (Term(potential, ("x", "theta")),),
+        "force": (Derivative(potential, ("x",)),),
+        "by_position": (Derivative(potential, ("x", "x")),),
+        "by_velocity": (Derivative(potential, ("x", "v")),),
+        "by_theta": (Derivative(potential, ("x", "theta")),),
     }
     if found := _damping(point, law):
         stress, slope = -found[0], -found[1]
@@ -178,11 +178,11 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
         lost = ca.dot(stress, point.felt_rate) / 2
         by_rate = ca.jacobian(stress, point.gradients["v"])
         by_theta = ca.jacobian(stress, point.theta)
-        outputs["force"] += (Term(lost, ("v",), known=stress),)
-        outputs["by_position"] += (Term(lost, ("v", "x"), "symmetric", slope),)
-        outputs["by_velocity"] += (Term(lost, ("v", "v"), known=by_rate),)
-        outputs["by_theta"] += (Term(lost, ("v", "theta"), known=by_theta),)
-        outputs["by_position_skew"] = (Term(lost, ("v", "x"), "skew", slope),)
+        outputs["force"] += (Derivative(lost, ("v",), known=stress),)
+        outputs["by_position"] += (Derivative(lost, ("v", "x"), "symmetric", slope),)
+        outputs["by_velocity"] += (Derivative(lost, ("v", "v"), known=by_rate),)
+        outputs["by_theta"] += (Derivative(lost, ("v", "theta"), known=by_theta),)
+        outputs["by_position_skew"] = (Derivative(lost, ("v", "x"), "skew", slope),)
     return kernel_of("linearisation", point, outputs)
 
 
@@ -192,20 +192,20 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
     ∂²φ/∂v² vanishes. ∂²φ/∂x∂v is symmetric where the force follows from a potential (Rayleigh:
     −γ_r D_wK).
     """
-    point = Point.of(element, law.constants, "x", "v", "w", carried=2 * law.carried)
+    point = QuadraturePoint.of(element, law.constants, "x", "v", "w", carried=2 * law.carried)
     power = -point.along_w(_potential(point, law))
     if law.memory:
         power += ca.dot(point.carried[6:], second_piola(point, law))
     if found := _damping(point, law):
         power -= ca.dot(found[0], point.felt_weight)
-    mixed = Term(power, ("x", "v"), "symmetric" if found else "whole")
+    mixed = Derivative(power, ("x", "v"), "symmetric" if found else "whole")
     outputs: Outputs = {
-        "position_position": (Term(power, ("x", "x")),),
+        "position_position": (Derivative(power, ("x", "x")),),
         "position_velocity": (mixed,),
-        "position_theta": (Term(power, ("x", "theta")),),
-        "velocity_theta": (Term(power, ("v", "theta")),),
-        "theta_theta": (Term(power, ("theta", "theta")),),
-        "gradient_theta": (Term(power, ("theta",)),),
+        "position_theta": (Derivative(power, ("x", "theta")),),
+        "velocity_theta": (Derivative(power, ("v", "theta")),),
+        "theta_theta": (Derivative(power, ("theta", "theta")),),
+        "gradient_theta": (Derivative(power, ("theta",)),),
     }
     if found:
         outputs["position_velocity_skew"] = (replace(mixed, part="skew"),)

@@ -1,9 +1,9 @@
 """Kernels: what the quadrature points of an element contribute, as CasADi functions.
 
 Up to the last product with the shape gradients a kernel knows only F, Ḟ and the like, the symbols
-of a `Point`: 9 or 9 × 9 numbers whatever the element, its *pieces*. How they meet the shape
-gradients is told by a `Contraction`, which an evaluator may do in loops: written out for ten nodes
-it is most of the instructions.
+of a `QuadraturePoint`: 9 or 9 × 9 numbers whatever the element, its *pieces*. How they meet the
+shape gradients is told by a `Contraction`, which an evaluator may do in loops: written out for ten
+nodes it is most of the instructions.
 
 Most kernels are one sum over the points. In others a point needs to know of the whole element, such
 as its volume. They have earlier `Phase`s, each a sum over the points of its own, and a coupling:
@@ -186,13 +186,13 @@ By = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Term:
+class Derivative:
     """A derivative of a scalar, as a summand of an output.
 
     Attributes
     ----------
     scalar : SX
-        In the symbols of a `Point`.
+        In the symbols of a `QuadraturePoint`.
     by : By
     part : {"whole", "symmetric", "skew"}
         Of a second derivative by fields; one that is taken whole is known to be symmetric.
@@ -225,13 +225,13 @@ class Term:
 
 
 # The terms of each output.
-Outputs = dict[str, tuple[Term, ...]]
-# For each output its contraction, and its piece in the symbols of a `Point`.
+Outputs = dict[str, tuple[Derivative, ...]]
+# For each output its contraction, and its piece in the symbols of a `QuadraturePoint`.
 Pieces = dict[str, tuple[Contraction, ca.SX]]
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class QuadraturePoint:
     """Symbols of one quadrature point.
 
     Attributes
@@ -259,7 +259,9 @@ class Point:
     carried: ca.SX
 
     @classmethod
-    def of(cls, element: Element, constants: int, *fields: str, carried: int = 0) -> Point:
+    def of(
+        cls, element: Element, constants: int, *fields: str, carried: int = 0
+    ) -> QuadraturePoint:
         """A point of an element, with θ of so many constants, that carries so many numbers."""
         stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
         return cls(

@@ -33,11 +33,11 @@ from functools import cached_property
 
 import casadi as ca
 
-from .kernel import By, Outputs, Pieces, Point, PointKernel, Term, mirrored
+from .kernel import By, Derivative, Outputs, Pieces, PointKernel, QuadraturePoint, mirrored
 
 
-def averaging_kernel(name: str, point: Point, outputs: Outputs) -> PointKernel:
-    """The kernel of derivatives of scalars that depend on `Point.stretches`."""
+def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
+    """The kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`."""
     shape = _Shape.of(point)
     chains = _chains(shape, outputs)
     order = max(len(term.by) for terms in outputs.values() for term in terms)
@@ -70,13 +70,13 @@ def averaging_kernel(name: str, point: Point, outputs: Outputs) -> PointKernel:
 class _Shape:
     """What stretches a point: V and s as symbols of sums, σ, and n of σ."""
 
-    point: Point
+    point: QuadraturePoint
     volume: ca.SX
     volumes: ca.SX
     own_volumes: ca.SX
 
     @classmethod
-    def of(cls, point: Point) -> _Shape:
+    def of(cls, point: QuadraturePoint) -> _Shape:
         F, *rates = point.gradients.values()
         own = point.volume * ca.det(ca.reshape(F, 3, 3))
         for rate in rates:
@@ -256,7 +256,7 @@ def _of_pair(
     chain: _Chain,
     blocks: dict[str, slice],
     size: int,
-    term: Term,
+    term: Derivative,
     by_s: ca.SX,
     second: ca.SX,
 ) -> ca.SX:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from .regions import Part
+from .regions import BodyPart
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class PointLayout:
 
     Attributes
     ----------
-    parts : tuple of Part
+    parts : tuple of BodyPart
     first : (parts,) where the constants of each part's laws of memory begin in θ
     points : int
         Quadrature points of an element.
@@ -93,7 +93,7 @@ class PointLayout:
         Length of θ.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[BodyPart, ...]
     first: Sequence[int]
     points: int
     constants: int

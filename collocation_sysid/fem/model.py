@@ -14,7 +14,7 @@ from ..errors import InputError, hint_at
 from .constants import DENSITY, MASS, Constant
 from .moduli import Source, elastic_names, source_of
 from .node_force import NodeForce
-from .regions import Part
+from .regions import BodyPart
 
 Theta = Sequence[float] | Array
 
@@ -24,7 +24,7 @@ class Model:
 
     Parameters
     ----------
-    parts : tuple of Part
+    parts : tuple of BodyPart
     forces : tuple of NodeForce
         Of users.
 
@@ -39,7 +39,7 @@ class Model:
         If two constants have one name.
     """
 
-    def __init__(self, parts: tuple[Part, ...], forces: tuple[NodeForce, ...] = ()) -> None:
+    def __init__(self, parts: tuple[BodyPart, ...], forces: tuple[NodeForce, ...] = ()) -> None:
         self.parts, self.forces = parts, forces
         self.constants: dict[str, Constant] = {
             part.full_name(c.name): c for part in parts for c in part.constants

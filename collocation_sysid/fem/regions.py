@@ -46,7 +46,7 @@ class Region:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BodyPart:
     """A region as the body evaluates it.
 
     Attributes
@@ -113,7 +113,7 @@ def parts_of(
     mass_kg: float | None,
     regions: Sequence[Region],
     prony: Sequence[str | Prony] = (),
-) -> tuple[Part, ...]:
+) -> tuple[BodyPart, ...]:
     """The parts of a body: what no region claims, where there is any, then the regions.
 
     Raises
@@ -127,7 +127,7 @@ def parts_of(
         np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
     )
     branches = as_branches(prony)
-    whole = Part("", rest, as_material(material), as_damping(damping), own[0], branches)
+    whole = BodyPart("", rest, as_material(material), as_damping(damping), own[0], branches)
     parts = [whole] if rest.size else []
     for region, cells, density in zip(regions, claimed, own[1:], strict=True):
         try:
@@ -137,7 +137,7 @@ def parts_of(
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
         has_own = region.density_kg_m3 is not None
-        part = Part(region.name, cells, law, drag, density, memory, own_density=has_own)
+        part = BodyPart(region.name, cells, law, drag, density, memory, own_density=has_own)
         parts.append(part)
     mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
     return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)

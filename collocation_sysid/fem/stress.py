@@ -21,32 +21,32 @@ from ..arrays import Array, Index
 from .discretisation import Discretisation
 from .elements import Element
 from .expressions import Law, carried_energy, first_piola, second_piola, six_of
-from .kernel import Pieces, Point, PointKernel
+from .kernel import Pieces, PointKernel, QuadraturePoint
 from .kernels import COMPILING, Batch, Evaluator
 from .pattern import dofs_of
 
 
-def _kernel(name: str, point: Point, pieces: Pieces) -> PointKernel:
+def _kernel(name: str, point: QuadraturePoint, pieces: Pieces) -> PointKernel:
     last = point.phase(name, pieces)
     return PointKernel(last.pieces, tuple(point.fields), last.contractions)
 
 
 def stress_kernel(element: Element, law: Law) -> PointKernel:
     """S."""
-    point = Point.of(element, law.constants, "x")
+    point = QuadraturePoint.of(element, law.constants, "x")
     return _kernel("stress", point, {"stress": ("none", second_piola(point, law))})
 
 
 def stress_by_theta_kernel(element: Element, law: Law) -> PointKernel:
     """∂S/∂θ by the material's constants, column after column."""
-    point = Point.of(element, law.constants, "x")
+    point = QuadraturePoint.of(element, law.constants, "x")
     by_theta = ca.jacobian(second_piola(point, law), point.theta)[:, : len(law.material.constants)]
     return _kernel("stress_by_theta", point, {"stress_by_theta": ("none", ca.vec(by_theta))})
 
 
 def stress_along_kernel(element: Element, law: Law) -> PointKernel:
     """∂S/∂x v: dS = F⁻¹ (dP − dF S)."""
-    point = Point.of(element, law.constants, "x", "v")
+    point = QuadraturePoint.of(element, law.constants, "x", "v")
     F, first, rate = point.gradients["x"], first_piola(point, law), point.gradients["v"]
     inverse = ca.inv_minor(point.felt)
     stress = inverse @ ca.reshape(first, 3, 3)
@@ -56,21 +56,21 @@ def stress_along_kernel(element: Element, law: Law) -> PointKernel:
 
 def pulled_kernel(element: Element, law: Law) -> PointKernel:
     """(∂S/∂x)ᵀ σ of what the points carry."""
-    point = Point.of(element, law.constants, "x", carried=6)
+    point = QuadraturePoint.of(element, law.constants, "x", carried=6)
     slope = ca.gradient(ca.dot(point.carried, second_piola(point, law)), point.gradients["x"])
     return _kernel("pulled", point, {"pulled": ("nodes", slope)})
 
 
 def carried_force_kernel(element: Element, law: Law) -> PointKernel:
     """f_H of what the points carry."""
-    point = Point.of(element, law.constants, "x", carried=6)
+    point = QuadraturePoint.of(element, law.constants, "x", carried=6)
     slope = -ca.gradient(carried_energy(point), point.gradients["x"])
     return _kernel("carried_force", point, {"carried_force": ("nodes", slope)})
 
 
 def against_kernel(element: Element, law: Law) -> PointKernel:
     """(∂f_H/∂H)ᵀ v."""
-    point = Point.of(element, law.constants, "x", "v", carried=6)
+    point = QuadraturePoint.of(element, law.constants, "x", "v", carried=6)
     power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
     by_carried = ca.gradient(power, point.carried)
     return _kernel("against", _bare(point), {"against": ("none", by_carried)})
@@ -78,20 +78,20 @@ def against_kernel(element: Element, law: Law) -> PointKernel:
 
 def stress_slope_kernel(element: Element, law: Law) -> PointKernel:
     """(∂S/∂x)ᵀ, column after column."""
-    point = Point.of(element, law.constants, "x")
+    point = QuadraturePoint.of(element, law.constants, "x")
     slope = ca.jacobian(second_piola(point, law), point.gradients["x"]).T
     return _kernel("stress_slope", point, {"stress_slope": ("nodes", slope)})
 
 
 def force_slope_kernel(element: Element, law: Law) -> PointKernel:
     """∂f_H/∂H, column after column."""
-    point = Point.of(element, law.constants, "x", carried=6)
+    point = QuadraturePoint.of(element, law.constants, "x", carried=6)
     force = -ca.gradient(carried_energy(point), point.gradients["x"])
     by_carried = ca.jacobian(force, point.carried)
     return _kernel("force_slope", _bare(point), {"force_slope": ("nodes", by_carried)})
 
 
-def _bare(point: Point) -> Point:
+def _bare(point: QuadraturePoint) -> QuadraturePoint:
     """The same, for what H has gone from."""
     return replace(point, stretches=(), carried=ca.SX(0, 1))
 

@@ -1,12 +1,12 @@
 """Many runs side by side: methods and starts compared, keys of the problem file swept."""
 
 from .process import RunStore
-from .scheduler import Limits, run_all
+from .scheduler import RunOptions, run_all
 from .study import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
 
 __all__ = [
-    "Limits",
     "PlannedRun",
+    "RunOptions",
     "RunStore",
     "Starts",
     "plan_comparison",

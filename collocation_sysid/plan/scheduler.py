@@ -22,7 +22,7 @@ from .study import PlannedRun
 
 
 @dataclass(frozen=True)
-class Limits:
+class RunOptions:
     """How the runs of a study are done.
 
     Attributes
@@ -75,7 +75,7 @@ class Pool:
 def run_all(
     planned: Sequence[PlannedRun],
     store: RunStore,
-    limits: Limits,
+    limits: RunOptions,
     done: Callable[[Record, int], None] = lambda record, slots: None,
 ) -> None:
     """Do the runs that are not in the store and put them there, each as soon as it has ended.
@@ -84,7 +84,7 @@ def run_all(
     ----------
     planned : sequence of PlannedRun, started in this order
     store : RunStore
-    limits : Limits
+    limits : RunOptions
     done : callable
         Called with every new record and the number of runs at once.
 
@@ -112,7 +112,7 @@ def run_all(
             raise
 
 
-def _record_of(future: Future, planned: PlannedRun, limits: Limits) -> Record:
+def _record_of(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
     """A run's record, also when the worker that watched it is lost."""
     try:
         return future.result()
@@ -128,7 +128,7 @@ def _record_of(future: Future, planned: PlannedRun, limits: Limits) -> Record:
 
 
 @contextmanager
-def _threads(limits: Limits) -> Iterator[Pool]:
+def _threads(limits: RunOptions) -> Iterator[Pool]:
     """Threads that wait for processes: all that one machine needs."""
     slots, stop = limits.workers or available_threads(), threading.Event()
     with ThreadPoolExecutor(slots) as executor:
@@ -140,7 +140,7 @@ def _threads(limits: Limits) -> Iterator[Pool]:
 
 
 @contextmanager
-def _cluster(limits: Limits) -> Iterator[Pool]:
+def _cluster(limits: RunOptions) -> Iterator[Pool]:
     """The workers of a scheduler that is there."""
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:

@@ -40,7 +40,7 @@ MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answ
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class StudyReport:
     """A study's numbers, finished or not.
 
     Attributes
@@ -115,17 +115,17 @@ def load_report(
     planned: Sequence[PlannedRun],
     store: RunStore,
     yardstick: Yardstick | None = None,
-) -> Report:
+) -> StudyReport:
     """Gather the records of planned runs."""
     loaded = {run.key: store.load(run.key) for run in planned}
     records = {key: record for key, record in loaded.items() if record is not None}
-    return Report(title, kind, tuple(planned), records, yardstick or Yardstick())
+    return StudyReport(title, kind, tuple(planned), records, yardstick or Yardstick())
 
 
 # In the terminal ---------------------------------------------------------------------------------
 
 
-def study_tables(report: Report, folder: Path) -> list[Shown]:
+def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     """The tables of a study within 80 columns, and what went wrong."""
     # What no line of the tables says.
     parts: list[Shown] = [*report.headline, ""] if report.kind == "models" else []
@@ -156,7 +156,7 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
 # Files --------------------------------------------------------------------------------------------
 
 
-def write_report(report: Report, folder: Path) -> None:
+def write_report(report: StudyReport, folder: Path) -> None:
     """Write ``runs.csv``, ``summary.csv``, ``summary.json``, ``summary.md`` and the plots."""
     rows = report.rows
     write_whole(folder / "runs.csv", as_csv(rows))
@@ -175,7 +175,7 @@ def write_report(report: Report, folder: Path) -> None:
             figure.savefig(draft, dpi=RESOLUTION_DPI)
 
 
-def report_json(report: Report) -> dict[str, Any]:
+def report_json(report: StudyReport) -> dict[str, Any]:
     """Content of summary.json."""
     rows = report.rows
     first = report.planned[0]
@@ -213,7 +213,7 @@ def as_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def report_section(report: Report) -> Section:
+def report_section(report: StudyReport) -> Section:
     """The views and the failures for a paper's appendix or an issue."""
     failures = (Items(tuple(report.failures)),) if report.failures else ()
     without = tuple(Section("Runs without an answer", (each,)) for each in failures)

@@ -22,7 +22,7 @@ from ..arrays import Array
 from ..fem.body import Body
 from ..fem.elements import Element
 from ..fem.expressions import kernel_of
-from ..fem.kernel import Point, PointKernel, Term
+from ..fem.kernel import Derivative, PointKernel, QuadraturePoint
 from ..fem.kernels import Batch, Evaluator
 from ..fem.materials import Material
 
@@ -76,10 +76,10 @@ class ElementFields:
 
 def field_kernel(element: Element, material: Material) -> PointKernel:
     """The fields at a quadrature point times its volume, see `expressions` for the inputs."""
-    point = Point.of(element, len(material.constants), "x")
+    point = QuadraturePoint.of(element, len(material.constants), "x")
     fields = ca.vertcat(*_point_fields(material, point.theta))
     felt = ca.substitute(fields, _F, ca.vec(point.felt))
-    return kernel_of("fields", point, {"fields": (Term(point.volume * felt, ()),)})
+    return kernel_of("fields", point, {"fields": (Derivative(point.volume * felt, ()),)})
 
 
 _F = ca.SX.sym("F", 9)

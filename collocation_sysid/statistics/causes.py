@@ -30,7 +30,7 @@ from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
 from ..recording.wrench import Frame, Wrench
 from .hypothesis import Hypothesis, Trial, clock, ranked
-from .modal import Comparison, doubts, gravity_mistakes
+from .modal import ModalComparison, doubts, gravity_mistakes
 from .plausible import against_the_load
 
 # Residuals up to so many standard deviations are noise: they need no cause.
@@ -87,12 +87,12 @@ def _refitted(solution: Solution, experiment: Experiment, budget: int | None) ->
     trial = Trial(_misfit(given, read), alone.left, BETTER, least=1.0, noise=NOISE)
     of = f"'{experiment.name}'"
     lags = [] if given.static else _best_lag(alone, given, read, of)
-    comparison = Comparison.of(given, solution.parameters)
+    comparison = ModalComparison.of(given, solution.parameters)
     turned = [] if comparison is None else _other_gravity(given, comparison)
     return [*trial.of([*lags, *_slip(given, read, of), *turned, *_other_layers(given, of)])]
 
 
-def _other_gravity(given: Experiment, comparison: Comparison) -> Iterator[Hypothesis]:
+def _other_gravity(given: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
     """Of gravity's directions the one that suits the body's modes best."""
     others = gravity_mistakes(comparison.given)
     nearest = min(others, key=lambda each: comparison.misfit_m(each.without), default=None)

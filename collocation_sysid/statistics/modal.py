@@ -51,13 +51,13 @@ def doubts(
     """
     if experiment.static or not experiment.markers.names:
         return ranked(against_the_load(experiment))
-    comparison = Comparison.of(experiment, constants)
+    comparison = ModalComparison.of(experiment, constants)
     tried = () if comparison is None else comparison.doubts()
     return ranked([*tried, *exchanges(experiment, huber), *steps(experiment)])
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ModalComparison:
     """Descriptions of one experiment against its tracks.
 
     Attributes
@@ -75,7 +75,7 @@ class Comparison:
     floor_m: float
 
     @classmethod
-    def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Comparison | None:
+    def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> ModalComparison | None:
         """That of an experiment, see `doubts`; None where the body has no modes to tell by.
 
         Nor where tendons or pressures drive it, which is beyond a sway under gravity.

@@ -3,6 +3,6 @@
 from .criterion import Criterion
 from .designing import Design, DesignOptions, design
 from .limits import Limits
-from .motion import Motion
+from .motion import HandMotion
 
-__all__ = ["Criterion", "Design", "DesignOptions", "Limits", "Motion", "design"]
+__all__ = ["Criterion", "Design", "DesignOptions", "HandMotion", "Limits", "design"]

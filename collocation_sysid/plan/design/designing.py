@@ -19,9 +19,9 @@ from ...recording import Experiment, PoseSequence
 from ...runs.solving import solve
 from ...statistics.linearised import linearised_fit
 from .criterion import Criterion, Errors, both_sides, draws_about
-from .information import LinearRecording, Recording, Told, shared_information
+from .information import FutureRecording, LinearRecording, SimulatedMotion, shared_information
 from .limits import REACHED, Bounds, Limits
-from .motion import Motion
+from .motion import HandMotion
 from .search import Best, Watch, search
 
 Say = Callable[[str], None]
@@ -92,8 +92,8 @@ class Design:
 
     Attributes
     ----------
-    recording : Recording
-    motion : Motion
+    recording : FutureRecording
+    motion : HandMotion
     experiment : Experiment
         What is to be recorded, with the simulated markers in place of measured ones.
     predicted : Trajectory
@@ -112,8 +112,8 @@ class Design:
     draws : number of θ
     """
 
-    recording: Recording
-    motion: Motion
+    recording: FutureRecording
+    motion: HandMotion
     experiment: Experiment
     predicted: Trajectory
     criterion: Criterion
@@ -147,14 +147,14 @@ class Judge:
 
     Attributes
     ----------
-    recording : Recording
+    recording : FutureRecording
     limits : Limits
     criterion : Criterion
     draws : list of (nq,) q, the middle of the prior first
     known : (nq, nq) information of the recordings there are
     """
 
-    recording: Recording
+    recording: FutureRecording
     limits: Limits
     criterion: Criterion
     draws: list[Array]
@@ -171,10 +171,10 @@ class Judge:
         recording = self.recording
         return ThetaMap(recording.problem.parameters, recording.template.body)
 
-    def motion(self, coefficients: Array) -> Motion:
+    def motion(self, coefficients: Array) -> HandMotion:
         """The motion of any coefficients, within the limits."""
         recording = self.recording
-        free = Motion.of(
+        free = HandMotion.of(
             coefficients,
             float(recording.since_start_s[-1]),
             recording.highest_hz(self.limits),
@@ -210,7 +210,7 @@ class Judge:
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
-        size = Motion.size(options.waves)
+        size = HandMotion.size(options.waves)
         return search(value, size, count, options.seed, told)
 
     def value(self, coefficients: Array, bar: float) -> float:
@@ -278,7 +278,7 @@ def design(
         raise InputError(
             f"found {duration_s:g}; expected a number of seconds above 0", None, "--duration"
         )
-    recording = Recording(problem, _chosen(problem, experiment), duration_s)
+    recording = FutureRecording(problem, _chosen(problem, experiment), duration_s)
     recording.bounds(limits)
     recording.highest_hz(limits)
     if not problem.parameters.free:
@@ -295,7 +295,7 @@ def design(
     first = judge.first_guess(options, say)
     say("seeking a motion")
     tried = 1 if first.interrupted else options.evaluations
-    best = search(judge.value, Motion.size(options.waves), tried, options.seed, watch, first.at)
+    best = search(judge.value, HandMotion.size(options.waves), tried, options.seed, watch, first.at)
     best.interrupted |= first.interrupted
     if best.at is None or best.value >= FORBIDDEN:
         raise InputError(_no_motion(best), problem.path)
@@ -345,7 +345,7 @@ def _before(judge: Judge, add: bool) -> Bars | None:
     return _bars(judge, told)
 
 
-def _bars(judge: Judge, told: list[Told]) -> Bars:
+def _bars(judge: Judge, told: list[SimulatedMotion]) -> Bars:
     pairs = zip(told, judge.draws, strict=True)
     return Bars.of([judge.errors(each.information, q) for each, q in pairs])
 

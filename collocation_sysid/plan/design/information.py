@@ -33,7 +33,7 @@ from ...recording import Experiment, PoseSequence
 from ...recording.wrench import Wrench
 from ...statistics.linearised import LinearisedFit, least_squares, linearised_fit
 from .limits import Bounds, Limits
-from .motion import Motion
+from .motion import HandMotion
 
 # Newton's last step over the body's size: what is left of it is ten thousand times less.
 TOLERANCE = 1e-5
@@ -53,7 +53,7 @@ def shared_information(fit: LinearisedFit) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class SimulatedMotion:
     """A motion as it was simulated at one q.
 
     Attributes
@@ -67,7 +67,7 @@ class Told:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class FutureRecording:
     """The recording to come: all of it but the motion.
 
     Attributes
@@ -163,7 +163,7 @@ class Recording:
         count = POSES_PER_SAMPLE * (self.samples - 1) + 1
         return np.linspace(0.0, self.since_start_s[-1], count)
 
-    def poses(self, motion: Motion) -> PoseSequence:
+    def poses(self, motion: HandMotion) -> PoseSequence:
         """The poses of a motion."""
         return self.carried(motion.derivatives(self.pose_times_s)[0])
 
@@ -187,7 +187,7 @@ class Recording:
             markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
         )
 
-    def told(self, experiment: Experiment, q: Array) -> Told:
+    def told(self, experiment: Experiment, q: Array) -> SimulatedMotion:
         """What the experiment tells at q.
 
         Raises
@@ -197,7 +197,7 @@ class Recording:
         """
         fit, x = self.fit(experiment, q)
         positions = x[:: self.problem.first_substeps].reshape(len(experiment.t_s), -1, 3)
-        return Told(shared_information(fit), experiment.markers.observe(positions))
+        return SimulatedMotion(shared_information(fit), experiment.markers.observe(positions))
 
     def program(self, experiment: Experiment) -> Collocation:
         """The equations of motion of one experiment."""
@@ -253,27 +253,27 @@ class LinearRecording:
 
     Attributes
     ----------
-    recording : Recording
+    recording : FutureRecording
     rest : LinearisedFit
         Without any motion.
     answers : (6, frequencies, 3M, p) their transforms, to a pulse of height one
     length : int, of the transforms
     """
 
-    recording: Recording
+    recording: FutureRecording
     rest: LinearisedFit
     answers: Array
     length: int
 
     @staticmethod
-    def gigabytes(recording: Recording) -> float:
+    def gigabytes(recording: FutureRecording) -> float:
         """Memory that the answers take."""
         (segment,) = recording.program(recording.template).segments
         markers = 3 * len(recording.template.markers.names)
         return 6 * 16e-9 * recording.samples * markers * len(segment.places)
 
     @classmethod
-    def of(cls, recording: Recording, q: Array) -> LinearRecording:
+    def of(cls, recording: FutureRecording, q: Array) -> LinearRecording:
         """Seven simulations.
 
         Raises
@@ -292,7 +292,7 @@ class LinearRecording:
             answers.append(np.fft.rfft(change, length, axis=0))
         return cls(recording, still, np.array(answers), length)
 
-    def information(self, motion: Motion) -> Array:
+    def information(self, motion: HandMotion) -> Array:
         """(nq, nq) of the shared parameters, see `shared_information`."""
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]
@@ -305,7 +305,7 @@ class LinearRecording:
         return shared_information(replace(self.rest, blocks=(replace(rest, slope=slope),)))
 
 
-def _pulse(recording: Recording, heights: Array) -> PoseSequence:
+def _pulse(recording: FutureRecording, heights: Array) -> PoseSequence:
     """Poses with a pulse of each coordinate, of these heights (6,)."""
     t_s = recording.pose_times_s
     since = t_s / recording.template.timestep_s - CENTRE

@@ -14,7 +14,7 @@ from ...errors import InputError
 from ...problem.explaining import explain
 from ...problem.reading import parse_toml, read_text
 from ...section import Section, Vector
-from .motion import Motion, angular_motion
+from .motion import HandMotion, angular_motion
 
 # Peaks are sought on a grid; between its points they may be this much larger.
 WITHIN = 1 - 6e-3
@@ -171,7 +171,7 @@ class Bounds:
             np.array([limits.acceleration_m_s2, np.radians(growth)]),
         )
 
-    def shares(self, motion: Motion) -> dict[str, float]:
+    def shares(self, motion: HandMotion) -> dict[str, float]:
         """Largest values of a motion as shares of what is allowed, by the limits' names."""
         course = motion.derivatives(motion.grid_s)
         return self._of_shift(*course) | self._of_turn(*course)
@@ -192,7 +192,7 @@ class Bounds:
         pairs = zip(names, largest, strict=True)
         return {name: np.degrees(peak) / getattr(limits, name) for name, peak in pairs}
 
-    def within(self, motion: Motion) -> Motion:
+    def within(self, motion: HandMotion) -> HandMotion:
         """The motion with its shifts, and its turns, made so small that every limit is kept.
 
         What keeps to all of them is left as it is. Peaks of shifts are proportional to their

@@ -37,7 +37,7 @@ PER_WAVE = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class HandMotion:
     """Shift and rotation vector of a hand over time, from rest to rest.
 
     Attributes
@@ -67,7 +67,7 @@ class Motion:
         duration_s: float,
         highest_hz: float,
         reach: tuple[Array, Array, Array],
-    ) -> Motion:
+    ) -> HandMotion:
         """The motion of coefficients without bounds, all of which are about as large as one.
 
         Parameters
@@ -106,7 +106,7 @@ class Motion:
         """Number of coefficients of a motion with so many waves of each coordinate."""
         return OWN + PER_WAVE * 6 * waves
 
-    def scaled(self, shift: float = 1.0, turn: float = 1.0) -> Motion:
+    def scaled(self, shift: float = 1.0, turn: float = 1.0) -> HandMotion:
         """The same motion with shifts and rotation vectors so many times as large."""
         factors = np.repeat([shift, turn], 3)[:, None]
         return replace(self, amplitude=factors * self.amplitude)
