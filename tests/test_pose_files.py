@@ -66,6 +66,14 @@ def assert_same_poses(found, expected):
     np.testing.assert_allclose(turn.magnitude(), 0.0, atol=1e-7)
 
 
+def test_columns_may_be_called_and_measured_as_robots_write_them(file):
+    text = NAMED.replace("t_s,x_m,y_m,z_m", "Time (ms),X [mm],Y [mm],Z / m").replace(
+        "0.1,0.5,", "100,500,"
+    )
+    exported = "Controller;KR 6\n\n" + text.replace(",", ";").replace("0.", "0,")
+    assert_same_poses(read_poses(file(exported)), read_poses(file(NAMED)))
+
+
 def test_a_numbered_quaternion_needs_its_order(file):
     message = refusal(file(NUMBERED))
     assert "q0, q1, q2, q3" in message

@@ -68,7 +68,7 @@ def test_spreadsheet_habits_are_tolerated(file):
         "t_s,x_m,y_m,z_m,qx,qy,qz",
         "t_s,x_m,y_m,z_m,qx,qy,qz,qw,grip",
         "t_s,x_m,y_m,z_m,qx,qy,qz,qz",
-        "time,x_m,y_m,z_m,qx,qy,qz,qw",
+        "clock,x_m,y_m,z_m,qx,qy,qz,qw",
     ],
 )
 def test_wrong_pose_columns_list_found_and_expected(file, header):

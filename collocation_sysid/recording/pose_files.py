@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..errors import InputError
+from .formats.columns import TIME, column_of, name_and_unit, times_of
 from .formats.plain import read_grid
 from .formats.text import Grid, Row, decode, is_number, listed, numbers, read_bytes
-from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
+from .formats.units import METRES_PER_UNIT, refuse_unknown_unit, si_factor
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
 POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -27,12 +29,12 @@ def read_poses(
 ) -> PoseSequence:
     """Read grasp poses, which map undeformed to current positions.
 
-    A CSV has the columns t_s, x_m, y_m, z_m (or _cm, _mm, _in; or x, y, z and `length_unit`) and a
-    quaternion, in any order: qx, qy, qz, qw, or q0 … q3 or q1 … q4 and its order in `quaternion`.
-    A CSV without column names holds t, x, y, z and a quaternion; `quaternion` and `length_unit`
-    say the rest. A CSV with m00, m01 … m33 beside t_s holds 4x4 matrices row by row, a NumPy
-    archive (.npz) has them as `matrices` (T, 4, 4) beside `t_s` (T,); both in metres unless
-    `length_unit` is given.
+    A CSV has the columns t_s, x_m, y_m, z_m (or in other units, also as "Time (ms)" and "X [mm]";
+    or x, y, z and `length_unit`) and a quaternion, in any order: qx, qy, qz, qw, or q0 … q3 or
+    q1 … q4 and its order in `quaternion`. A CSV without column names holds t, x, y, z and a
+    quaternion; `quaternion` and `length_unit` say the rest. A CSV with m00, m01 … m33 beside t_s
+    holds 4x4 matrices row by row, a NumPy archive (.npz) has them as `matrices` (T, 4, 4) beside
+    `t_s` (T,); both in metres unless `length_unit` is given.
 
     Parameters
     ----------
@@ -58,17 +60,20 @@ def read_poses(
         return _from_matrices(
             path, t_s, matrices, length_unit, [f"index {k}" for k in range(len(t_s))]
         )
-    table = _with_names(read_grid(path, decode(content, path)))
-    lines = [f"line {line}" for line in table.lines]
-    if sorted(table.columns) == sorted(("t_s", *_MATRIX_COLUMNS)):
-        matrices = _columns(table, _MATRIX_COLUMNS).reshape(-1, 4, 4)
-        return _from_matrices(path, _columns(table, ["t_s"])[:, 0], matrices, length_unit, lines)
-    axes, unit = _axes(table, length_unit)
-    components = _components(table, quaternion, axes)
-    t_s = _columns(table, ["t_s"])[:, 0]
-    positions_m = _columns(table, axes) * METRES_PER_UNIT[unit]
-    quaternions = _columns(table, components)
-    return _sequence(path, t_s, positions_m, quaternions, lines)
+    grid = _with_names(read_grid(path, decode(content, path)))
+    lines = [f"line {line}" for line in grid.lines]
+    time = column_of(grid, TIME)
+    if time is None:
+        raise _other_columns(grid)
+    t_s = times_of(grid, *time)
+    others = [k for k in range(len(grid.columns)) if k != time[0]]
+    if sorted(grid.columns[k] for k in others) == sorted(_MATRIX_COLUMNS):
+        matrices = _columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(-1, 4, 4)
+        return _from_matrices(path, t_s, matrices, length_unit, lines)
+    axes, metres = _axes(grid, length_unit)
+    components = _components(grid, quaternion, [k for k in others if k not in axes])
+    positions_m = _columns(grid, axes) * metres
+    return _sequence(path, t_s, positions_m, _columns(grid, components), lines)
 
 
 def _sequence(
@@ -86,8 +91,8 @@ def _sequence(
 # Columns ------------------------------------------------------------------------------------------
 
 
-def _columns(table: Grid, names: list[str] | tuple[str, ...]) -> Array:
-    return numbers(table, [table.columns.index(name) for name in names], blank_allowed=False)
+def _columns(grid: Grid, places: Iterable[int]) -> Array:
+    return numbers(grid, list(places), blank_allowed=False)
 
 
 def _with_names(table: Grid) -> Grid:
@@ -98,66 +103,66 @@ def _with_names(table: Grid) -> Grid:
     return Grid(table.path, names, [Row(1, table.columns), *table.rows])
 
 
-def _other_columns(table: Grid) -> InputError:
-    return InputError(
-        f"the columns are {listed(table.columns)}; expected {listed(POSE_COLUMNS)}, each once "
+def _other_columns(grid: Grid) -> InputError:
+    return _refused(
+        grid,
+        f"the columns are {listed(grid.columns)}; expected {listed(POSE_COLUMNS)}, each once "
         "(or t_s and m00, m01 … m33)",
-        table.path,
-        "line 1",
     )
 
 
-def _axes(table: Grid, given: str | None) -> tuple[list[str], str]:
-    """The columns of the position, and its unit."""
-    for unit in METRES_PER_UNIT:
-        axes = [f"{axis}_{unit}" for axis in "xyz"]
-        if all(axis in table.columns for axis in axes):
-            if given not in (None, unit):
-                raise InputError(
-                    f"length_unit is '{given}', but the columns are {listed(axes)}; expected the "
-                    "same unit, or no length_unit",
-                    table.path,
-                    "line 1",
-                )
-            return axes, unit
-    if not all(axis in table.columns for axis in "xyz"):
-        raise _other_columns(table)
-    if given is None:
-        raise InputError(
-            "the columns x, y, z name no unit; expected length_unit, one of "
+def _refused(grid: Grid, message: str) -> InputError:
+    return InputError(message, grid.path, f"line {grid.names_line}")
+
+
+def _axes(grid: Grid, given: str | None) -> tuple[list[int], Array]:
+    """The columns of the position, and what their units are in metres."""
+    parts = [name_and_unit(column) for column in grid.columns]
+    axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
+    stated = [parts[k][1] for k in axes]
+    metres = [si_factor(unit or given or "m", "length") for unit in stated]
+    if len(axes) != 3 or None in metres:
+        raise _other_columns(grid)
+    named = listed(grid.columns[k] for k in axes)
+    if given is None and None in stated:
+        raise _refused(
+            grid,
+            f"the columns {named} name no unit; expected length_unit, one of "
             f"{listed(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m",
-            table.path,
-            "line 1",
         )
-    return ["x", "y", "z"], given
+    if given and any(
+        unit and si_factor(unit, "length") != METRES_PER_UNIT[given] for unit in stated
+    ):
+        raise _refused(
+            grid,
+            f"length_unit is '{given}', but the columns are {named}; expected the same unit, or no "
+            "length_unit",
+        )
+    return axes, np.array(metres, dtype=np.float64)
 
 
-def _components(table: Grid, given: str | None, axes: list[str]) -> list[str]:
+def _components(grid: Grid, given: str | None, others: list[int]) -> list[int]:
     """The columns of the quaternion in the order x, y, z, w."""
-    others = [column for column in table.columns if column not in ("t_s", *axes)]
-    if "t_s" not in table.columns or len(table.columns) != 8:
-        raise _other_columns(table)
-    if sorted(others) == ["qw", "qx", "qy", "qz"]:
-        order = "".join(column[1] for column in others)
+    place = {grid.columns[k]: k for k in others}
+    if sorted(place) == ["qw", "qx", "qy", "qz"]:
+        order = "".join(name[1] for name in place)
         if given not in (None, order):
-            raise InputError(
-                f"quaternion is '{given}', but the columns are {listed(others)}; expected the same "
+            raise _refused(
+                grid,
+                f"quaternion is '{given}', but the columns are {listed(place)}; expected the same "
                 "order, or no quaternion",
-                table.path,
-                "line 1",
             )
-        return ["qx", "qy", "qz", "qw"]
-    numbered = sorted(others)
-    if numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
-        raise _other_columns(table)
+        return [place[f"q{axis}"] for axis in "xyzw"]
+    numbered = sorted(place)
+    if len(others) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
+        raise _other_columns(grid)
     if given is None:
-        raise InputError(
+        raise _refused(
+            grid,
             f"the columns {listed(numbered)} do not say which is the scalar; expected quaternion "
             "= 'xyzw' or 'wxyz', or columns qx, qy, qz, qw",
-            table.path,
-            "line 1",
         )
-    return [numbered[given.index(axis)] for axis in "xyzw"]
+    return [place[numbered[given.index(axis)]] for axis in "xyzw"]
 
 
 # Matrices -----------------------------------------------------------------------------------------

@@ -179,13 +179,13 @@ def _found(
     recognised = {
         quantity.key: column
         for quantity in (TIME, *sought)
-        if quantity.key not in chosen and (column := _recognised(grid, quantity)) is not None
+        if quantity.key not in chosen and (column := column_of(grid, quantity)) is not None
     }
     return chosen | recognised
 
 
 def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
-    bare, stated = _name_and_unit(name)
+    bare, stated = name_and_unit(name)
     there = name if name in grid.columns else bare
     if grid.columns.count(there) != 1:
         found = "is there twice" if there in grid.columns else "is not there"
@@ -194,7 +194,7 @@ def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
             f"columns.{quantity.key} is {name!r}, which {found}; the columns are "
             f"{listed(grid.columns)}{hint_at(name, grid.columns)}",
         )
-    unit = _name_and_unit(there)[1] or stated
+    unit = name_and_unit(there)[1] or stated
     if quantity in (STRAIN, STRESS) and _words(there) & _DEFORMED:
         raise _refused(
             grid,
@@ -207,10 +207,10 @@ def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
     return grid.columns.index(there), factor
 
 
-def _recognised(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
+def column_of(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
     """The one column that is called so and has such a unit; None if nothing is called so."""
     units = {
-        k: _name_and_unit(column)[1]
+        k: name_and_unit(column)[1]
         for k, column in enumerate(grid.columns)
         if _is_called(column, quantity)
     }
@@ -229,12 +229,12 @@ def _recognised(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
 
 
 def _is_called(column: str, quantity: Quantity) -> bool:
-    name, _ = _name_and_unit(column)
+    name, _ = name_and_unit(column)
     called = _words(name) & set(quantity.words.split())
     return name.lower() == quantity.key or bool(called and not _words(name) & _DEFORMED)
 
 
-def _name_and_unit(column: str) -> tuple[str, str | None]:
+def name_and_unit(column: str) -> tuple[str, str | None]:
     """The parts of a column's name: ("Load", "kN") of "Load (kN)"."""
     parts = _NAMED.fullmatch(column)
     if parts is None:
@@ -256,7 +256,7 @@ def _refused(grid: Grid, message: str) -> InputError:
 def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> None:
     known = {quantity.key for quantity in KNOWN}
     for column in grid.columns:
-        if _name_and_unit(column)[0].lower() not in known:
+        if name_and_unit(column)[0].lower() not in known:
             hint = hint_at(column, [quantity.column for quantity in wanted])
             raise _other_columns(grid, wanted, all_of, f": {column} is none of them{hint}")
 
