@@ -112,6 +112,24 @@ def test_links_between_pages_lead_somewhere():
                 assert (page.parent / target).exists(), f"{name_of(page)}: {target}"
 
 
+def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to():
+    glossary = ROOT / "docs" / "glossary.md"
+    rows = re.findall(
+        r"^\| (.+?) \| .+ \| \[.+?\]\((.+?)\) \|$", glossary.read_text(), re.MULTILINE
+    )
+    words = [word for word, _ in rows]
+    assert words == sorted(words, key=lambda word: word.lower().replace("γ", "gamma"))
+
+    def alike(text: str) -> str:
+        return re.sub(r"[\s–-]+", " ", text.lower())
+
+    for word, target in rows:
+        page = alike((glossary.parent / target).read_text())
+        assert any(name in page for name in alike(word).split(", ")), f"{word}: not on {target}"
+    for page in (ROOT / "README.md", ROOT / "docs" / "index.md"):
+        assert "glossary.md" in page.read_text()
+
+
 def test_the_front_page_shows_the_answer_that_the_readme_shows():
     (shown,) = blocks(ROOT / "docs" / "index.md", "console")
     lines = (ROOT / "README.md").read_text().splitlines()
