@@ -28,7 +28,7 @@ def point_at(collocation: Collocation, p: np.ndarray) -> Point:
     (segment,) = collocation.segments
     q, phi = np.split(p, [collocation.nq])
     setting = segment.setting(q, phi)
-    x = march(segment.corrected(phi), setting.dynamics)
+    x = march(segment.experiment, setting.dynamics)
     return Horizon(collocation, [segment.grid_rows]).evaluate(p, [x])
 
 

@@ -46,7 +46,7 @@ def marched(collocation: Collocation, p: np.ndarray) -> Part:
     """The experiment simulated at p."""
     (segment,) = collocation.segments
     (part,) = collocation.parts_at(p, [np.zeros((0, segment.dofs))])
-    x = march(segment.corrected(part.phi), part.setting.dynamics)
+    x = march(segment.experiment, part.setting.dynamics)
     return Part(segment, part.q, part.phi, x)
 
 

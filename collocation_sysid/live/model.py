@@ -78,15 +78,10 @@ class Model:
         still = replace(collocation, experiments=[_still(experiment, collocation)])
         return cls(experiment, still)
 
-    def at_start(self, poses: Poses, phi: Array) -> Experiment:
-        """The experiment that begins with its grasps at these poses, as φ has it."""
+    def at_start(self, poses: Poses) -> Experiment:
+        """The experiment that begins with its grasps at these poses."""
         still = self.segment.experiment
-        corrected = self.segment.corrected(phi)
-        held = _held_at(still, poses)
-        if self.segment.nuisance.moves_grasps:
-            motion = self.segment.nuisance.in_grasp(phi)
-            held = [replace(grasp, poses=grasp.poses.after(motion)) for grasp in held]
-        return replace(corrected, grasps=held)
+        return replace(still, grasps=_held_at(still, poses))
 
     def placed(self, tracks_m: Array, x: Array) -> Model:
         """The same with unknown places where markers (M, 3) lie on the start x (3n,)."""

@@ -266,8 +266,10 @@ class LiveSweep:
         return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _start(self, poses: Poses) -> Array:
-        experiment = self.model.at_start(poses, self.phi)
-        return start_state(experiment, self.setting.theta, self.model.newton)[0]
+        goals_m = np.full(self.segment.dofs, np.nan)
+        goals_m[self.grasped] = self.model.goals(self.carried, [poses])[0][0]
+        experiment = self.model.at_start(poses)
+        return start_state(experiment, self.forces, self.model.newton, goals_m=goals_m)[0]
 
     def _linearised(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
         """Rows where they are guessed to be, on from the rows before as they are."""

@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import SimulationError
 from ..fem.kernels import side_by_side
+from ..model.forces import Forces
 from ..program.collocation import Collocation, Part
 from ..program.marching import march, march_on
 from ..program.newton import NewtonOptions, Solver
@@ -25,7 +26,8 @@ def placed_at_guess(collocation: Collocation) -> Collocation:
     for segment in collocation.segments:
         experiment, theta = segment.experiment, segment.constants.theta(p[: segment.nq])
         try:
-            x, _ = start_state(experiment, theta, Solver(experiment))
+            first = Forces.of(experiment, experiment.t_s[:1], theta)
+            x, _ = start_state(experiment, first, Solver(experiment))
         except SimulationError:
             x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
         positions.append(x[None])
@@ -98,7 +100,7 @@ def continued(
 ) -> tuple[Array, SimulationError | None]:
     """A part's trajectory up to so many rows, as far as it goes, see `marched`."""
     return march_on(
-        part.segment.corrected(part.phi),
+        part.segment.experiment,
         part.setting.dynamics.first_rows(rows),
         part.x if len(part.x) else None,
         options,
@@ -127,7 +129,8 @@ def carried_rigidly(segment: Segment, theta: Array) -> Array:
     """(N, 3n) start shape carried rigidly, held nodes where their grasps are."""
     experiment, t_s = segment.experiment, segment.dynamics.t_s
     try:
-        x0, _ = start_state(experiment, theta, Solver(experiment))
+        first = Forces.of(experiment, t_s[:1], theta)
+        x0, _ = start_state(experiment, first, Solver(experiment))
     except SimulationError:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
     rotations, translations = experiment.rigid_motion(t_s)

@@ -164,7 +164,7 @@ def tried(
     dynamics, x = part.setting.dynamics, part.x
     if dynamics.static:
         settled, failure = march_on(
-            segment.corrected(part.phi),
+            segment.experiment,
             dynamics.first_rows(len(x)),
             options=SETTLED,
             stopwatch=solver.stopwatch,

@@ -66,6 +66,7 @@ class Dynamics:
     first_row : int
     mass : Mass of every dof in each row: the mean over its evaluations
     forces : Forces at each row's evaluation
+    goals_m : (N, 3n) where dofs are held, NaN while free
     taken : (N, 3n) bool
         Held dofs that are free at other times: while one is held, the grasp takes what force
         there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
@@ -87,6 +88,7 @@ class Dynamics:
     first_row: int
     mass: Mass
     forces: Forces
+    goals_m: Array
     taken: NDArray[np.bool_]
     evaluated_s: Array
     start_velocity_m_s: Array
@@ -110,6 +112,9 @@ class Dynamics:
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps
         forces = Forces.of(experiment, evaluated_s)
+        goals = experiment.grasped(t_s)[1].reshape(rows, -1)
+        taken = ~np.isnan(goals)
+        taken[:, experiment.held_dofs] = False
         return cls(
             body=experiment.body,
             tables=tables,
@@ -117,7 +122,8 @@ class Dynamics:
             first_row=first_row,
             mass=_of_rows(tables, forces.mass),
             forces=forces,
-            taken=_taken(experiment, t_s),
+            goals_m=goals,
+            taken=taken,
             evaluated_s=evaluated_s,
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
@@ -158,6 +164,7 @@ class Dynamics:
             t_s=self.t_s[:rows],
             mass=self.mass.rows(slice(rows)),
             forces=self.forces.rows(slice(rows)),
+            goals_m=self.goals_m[:rows],
             taken=self.taken[:rows],
             evaluated_s=self.evaluated_s[:rows],
         )
@@ -322,12 +329,6 @@ def _mean(tables: Tables, at_evaluations: Array) -> Array:
     total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))
     mean = _combine(tables.w, at_evaluations) / np.where(total == 0, 1.0, total)
     return np.where(total == 0, at_evaluations, mean)
-
-
-def _taken(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
-    held = experiment.held(t_s).reshape(len(t_s), -1)
-    held[:, experiment.held_dofs] = False
-    return held
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,13 +73,14 @@ def march_on(
         Why it stopped.
     """
     solvers = Solvers(experiment, options, stopwatch)
-    held, held_positions = experiment.grasped(dynamics.t_s)
+    held = ~np.isnan(dynamics.goals_m)
     x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
     if known is None:
         try:
-            first_near = None if near is None else near[0]
-            x[0], v0 = start_state(experiment, dynamics.theta, solvers.holding(held[0]), first_near)
+            at_start, beside = dynamics.forces.rows(slice(1)), None if near is None else near[0]
+            solver, goals_m = solvers.holding(held[0]), dynamics.goals_m[0]
+            x[0], v0 = start_state(experiment, at_start, solver, beside, goals_m)
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
@@ -99,7 +100,7 @@ def march_on(
         carried = memory.ahead(intervals[t - 1]) if memory else None
         row = RowEquations(dynamics, x, forces, t, carried)
         solver = solvers.holding(held[t])
-        goal = held_positions[t].ravel()[solver.held]
+        goal = dynamics.goals_m[t, solver.held]
         if not dynamics.static:
             guess = extrapolated(x[:t], dynamics.step_s * v0)
         elif near is None:

@@ -78,7 +78,7 @@ class _Stepper:
         """The experiment's start."""
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
-        x, v = start_state(self.experiment, self.theta, solver)
+        x, v = start_state(self.experiment, self._forces(time_s), solver)
         memory = None
         if self.body.remembers:
             loaded_s = self.experiment.loaded_since_s

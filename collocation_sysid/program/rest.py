@@ -33,13 +33,22 @@ def rest_state(
     SimulationError
         If no stable equilibrium is found.
     """
-    solver = solver or Solver(experiment)
     at_s = float(experiment.t_s[0] if time_s is None else time_s)
-    body = experiment.body
+    goals_m = experiment.grasped([at_s])[1].ravel()
     forces = Forces.of(experiment, at_s, theta)
-    still = np.zeros((1, body.pattern.size))
-    shape = experiment.rigid_positions([at_s])[0]
-    carried = start_carried(body, theta, experiment.loaded_since_s)
+    return _at_rest(experiment, forces, goals_m, at_s, start, solver or Solver(experiment))
+
+
+def _at_rest(
+    experiment: Experiment,
+    forces: Forces,
+    goals_m: Array,
+    at_s: float,
+    start: Array | None,
+    solver: Solver,
+) -> Array:
+    still, shape = np.zeros((1, len(goals_m))), experiment.rigid_positions([at_s])[0]
+    carried = start_carried(experiment.body, forces.theta, experiment.loaded_since_s)
 
     def solve(x: Array, share: float) -> Array:
         loaded = forces.scaled(share)
@@ -52,8 +61,9 @@ def rest_state(
             at = loaded.linearise(state, still, carried=carried)
             return at.force[0], -at.by_position[0], NONE
 
-        goal = _on_the_way(experiment, shape, at_s, share).ravel()[solver.held]
-        return solver.newton(x, residual, linearise, keep_definite=True, goal=goal)
+        # Grasps that are off are there at the end: the way there may be any.
+        goal = goals_m if share == 1 else _on_the_way(experiment, shape, at_s, share).ravel()
+        return solver.newton(x, residual, linearise, keep_definite=True, goal=goal[solver.held])
 
     try:
         return followed(solve, shape.ravel(), solver.options.halvings, start)
@@ -74,9 +84,6 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
         start, nodes = carried[grasp.nodes], grasp.nodes
         place = np.ix_(nodes, grasp.columns)
         goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
-        if share == 1:
-            positions[place] = goal[:, grasp.columns]
-            continue
         turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
         part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
         middle, way = start.mean(axis=0), (goal - start).mean(axis=0)
@@ -85,14 +92,31 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
     return positions
 
 
+@one_blas_thread()
 def start_state(
-    experiment: Experiment, theta: Array, solver: Solver, near: Array | None = None
+    experiment: Experiment,
+    forces: Forces,
+    solver: Solver,
+    near: Array | None = None,
+    goals_m: Array | None = None,
 ) -> tuple[Array, Array]:
-    """x_0 and v_0, each (3n,), after the experiment's start rule; `near` is another x_0."""
+    """x_0 and v_0, each (3n,), after the experiment's start rule.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    forces : Forces
+        At the start.
+    solver : Solver
+    near : (3n,) another x_0, where an equilibrium is looked for first
+    goals_m : (3n,) where dofs are held, NaN while free; as the experiment states by default
+    """
     velocity = experiment.start_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
     if experiment.start == "equilibrium":
-        return rest_state(experiment, theta, start=near, solver=solver), v0
+        at_s = float(experiment.t_s[0])
+        goals_m = experiment.grasped([at_s])[1].ravel() if goals_m is None else goals_m
+        return _at_rest(experiment, forces, goals_m, at_s, near, solver), v0
     if experiment.start_positions_m is not None:
         return experiment.start_positions_m.ravel().copy(), v0
     return experiment.rigid_positions(experiment.t_s[:1]).ravel(), v0

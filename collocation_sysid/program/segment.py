@@ -346,8 +346,8 @@ class Segment:
         lower = np.full((self.grid_rows, self.dofs), -np.inf)
         upper = np.full((self.grid_rows, self.dofs), np.inf)
         if not self.grasps_have_rows:
-            goals = self._goals(self.grasping.at(np.zeros(self.nuisance.size)))
-            lower[:, self.held_dofs] = upper[:, self.held_dofs] = goals[:, self.held_dofs]
+            lower[:, self.held_dofs] = self.dynamics.goals_m[:, self.held_dofs]
+            upper[:, self.held_dofs] = lower[:, self.held_dofs]
         start = self.start_positions()
         if start is not None:
             lower[0] = upper[0] = start
@@ -365,6 +365,8 @@ class Segment:
         p = np.concatenate([q, phi[self.nuisance.moving]])
         u, by_p = self.inputs.at(p)
         dynamics, held = self.dynamics.at(u), self.grasping.at(phi)
+        if held.moves:
+            dynamics = replace(dynamics, goals_m=self._goals(held))
         return Setting(self.inputs, p, self.nq, by_p, dynamics, held)
 
     @cached_property
@@ -410,7 +412,7 @@ class Segment:
 
     def _rows(self, x: Array, residual: Array, setting: Setting) -> Array:
         rows = residual / self.force_n
-        goals = self._goals(setting.held)
+        goals = setting.dynamics.goals_m
         grasped = ~np.isnan(goals)
         rows[grasped] = (x[grasped] - goals[grasped]) / self.length_m
         return self.of_rows(rows)
