@@ -53,6 +53,33 @@ def test_every_method_finds_the_constant_of_a_users_force(method):
     assert found.parameters["drag_coefficient"] == pytest.approx(DRAG, rel=5e-3)
 
 
+def squeezed(x, v, at, squeeze_pa):
+    """A pressure that comes and goes, along the normal of the face as it is."""
+    return -squeeze_pa * ca.sin(40.0 * at.t_s) ** 2 * at.area_m2 * at.normal
+
+
+@pytest.mark.parametrize("method", ["reduced-space", "interior-point"])
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_users_pressure_on_faces_is_found(element, method):
+    low = cs.Box((-1, -1, -1), (1, 1, 0.051))
+    force = cs.NodeForce.of(squeezed, nodes=low, on="faces")
+    mesh = hung_cube(2, (1, 1, 2)).body.mesh
+    body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[force])
+    old = hung_cube(12)
+    markers = cs.Markers(old.t_s, np.zeros((13, 2, 3)), 1e-4, places_m=[[0, 0, 0], [0.1, 0.1, 0]])
+    top = cs.Box((-1, -1, 0.099), (1, 1, 1))
+    made = cs.Experiment(
+        body, old.t_s, [cs.Grasp(top, old.grasps[0].poses)], markers, nuisance=Nuisance.none()
+    )
+    truth = {**TRUTH, "squeeze_pa": 8.0}
+    made = with_markers(made, simulate(made, truth, "midpoint").markers_m)
+    unknown = {"mu_pa": cs.Unknown(200.0), "squeeze_pa": cs.Unknown(5.0)}
+    problem = cs.Problem([made], cs.Parameters.of({**truth, **unknown}), method=METHODS[method]())
+    found = cs.solve(problem).parameters
+    assert found["squeeze_pa"] == pytest.approx(8.0, rel=1e-3)
+    assert found["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-3)
+
+
 def test_newmarks_rule_moves_it_alike():
     at = {**TRUTH, "drag_coefficient": DRAG}
     experiment = in_fluid()
@@ -113,6 +140,9 @@ FORCE = """density_kg_m3 = 30.0
 file = "mine.py"
 function = "{}"
 """
+FACES = """on = "faces"
+nodes = { box_m = [[-1, -1, -1], [1, 1, 0.001]] }
+"""
 PARAMETER = "gamma_m_1_s = {"
 
 
@@ -150,6 +180,19 @@ def test_what_is_no_force_is_one_message(tiny, function, said):
     write("mine.py", MINE)(tiny)
     with pytest.raises(InputError, match=said):
         cs.Problem.read(tiny / "problem.toml", allow_code=True)
+
+
+def test_a_force_on_faces_in_a_file_that_no_face_has_is_one_message(tiny):
+    both(
+        replace_text("density_kg_m3 = 30.0\n", FORCE.format("drag") + FACES),
+        replace_text(PARAMETER, f"drag_coefficient = {{ guess = 25.0 }}\n{PARAMETER}"),
+    )(tiny)
+    write("mine.py", MINE)(tiny)
+    assert run_command("check", "problem.toml", "--allow-code").code == 0
+    replace_text("[-1, -1, -1]", "[0.05, 0.05, -1]")(tiny)
+    done = run_command("check", "problem.toml", "--allow-code")
+    assert done.code == 2
+    assert "force 'drag' is on faces, but none of the surface has all" in " ".join(done.err.split())
 
 
 def test_a_force_is_not_run_unless_it_is_allowed(tiny):

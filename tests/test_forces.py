@@ -11,15 +11,17 @@ from checks import assert_derivative
 from problems_small import GUESS, driven_bar, hung_cube, nodes_where
 from test_density import parameters, with_core
 
+from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.node_force import NodeForce
+from collocation_sysid.fem.selection import Box
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.segment import Segment
-from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
+from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
 
 # Of a tendon whose tension grows and a pressure that stays.
 BAR = driven_bar()
@@ -66,7 +68,28 @@ def cube_in_air() -> Collocation:
     return Collocation([replace(old, body=body)], Parameters((*GUESS.items, *known.items)))
 
 
+def breath(x, v, at, breath_pa, brake_pa_s_m):
+    """A pressure that grows in time and with the place, and what brakes along the normal."""
+    pressure_pa = breath_pa * (1 + 10 * at.t_s) * (1 + ca.sumsqr(x - at.rest_m) / 1e-6)
+    along = ca.dot(v, at.normal)
+    return -at.area_m2 * (pressure_pa + brake_pa_s_m * along) * at.normal
+
+
+def breathed(element: str) -> Collocation:
+    """A hung cube with a force of a user on some of its faces."""
+    old = hung_cube(8, (1, 1, 2))
+    force = NodeForce.of(breath, nodes=Box((-1, -1, -1), (1, 1, 0.051)), on="faces")
+    body = Body(old.body.mesh, density_kg_m3=30.0, element=element, forces=[force])
+    markers = Markers(old.t_s, np.zeros((9, 1, 3)), 1e-3, places_m=[[0.1, 0.1, 0.0]])
+    grasp = replace(old.grasps[0], nodes=nodes_where(body, 2, 0.1), selection=None)
+    known = Parameters.of({"breath_pa": Unknown(3.0), "brake_pa_s_m": Unknown(2.0)})
+    experiment = replace(old, body=body, grasps=[grasp], markers=markers)
+    return Collocation([experiment], Parameters((*GUESS.items, *known.items)))
+
+
 CASES = {
+    "of a user, on faces": lambda: breathed("tet4"),
+    "of a user, on quadratic faces": lambda: breathed("tet10"),
     "of a user": cube_in_air,
     "tendon and pressure": lambda: Collocation([BAR], GUESS),
     "weight and loads": lambda: Collocation([joined_cube()], parameters()),
@@ -240,3 +263,32 @@ def test_without_any_nothing_is_added():
     alone = Forces.on(body, theta)
     np.testing.assert_array_equal(alone.total(x, 0 * x), body.force(x, 0 * x, theta))
     assert alone.linearise(x, 0 * x).by_theta.shape[2] == len(theta)
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_pressure_on_all_faces_is_what_grows_the_volume_inside(element, rng):
+    """It has no resultant, and its work is what it grows; a tetrahedron of flat faces is exact."""
+    mesh = hung_cube(2).body.mesh
+    force = NodeForce.of(lambda x, v, at, inner_pa: inner_pa * at.area_m2 * at.normal, on="faces")
+    body = Body(mesh, density_kg_m3=30.0, element=element, forces=[force])
+    theta = np.array([1e-9, 1e-9, 0.0, 0.0, 7.0])
+    x = body.nodes_m + rng.normal(scale=2e-3, size=body.nodes_m.shape)
+    total = Forces.on(body, theta).total(x.reshape(1, -1), np.zeros((1, x.size))).reshape(-1, 3)
+    np.testing.assert_allclose(total.sum(axis=0), 0.0, atol=1e-12)
+    if element == "tet4":
+        grown = np.einsum("ij,ij->", total, x)  # 3 p V, V being of third degree
+        assert grown == pytest.approx(21.0 * volumes(x, mesh.tetrahedra).sum(), rel=1e-9)
+
+
+def test_a_force_on_faces_that_are_not_there_is_refused():
+    inside = Box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06))
+    force = NodeForce.of(breath, nodes=inside, on="faces")
+    with pytest.raises(InputError, match="'breath' is on faces, but none of the surface"):
+        Forces.on(Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1))
+    with pytest.raises(InputError, match="on 'edges'; expected one of nodes, faces"):
+        NodeForce.of(breath, on="edges")  # pyright: ignore[reportArgumentType]
+
+
+def volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    a, b, c, d = np.moveaxis(points_m[tetrahedra], 1, 0)
+    return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6

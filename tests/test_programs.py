@@ -102,9 +102,13 @@ def whirled(x, v, at, whirl_n_m3):
     return whirl_n_m3 * at.volume_m3 * ca.vertcat(at.rest_m[1] - x[1], x[0] - at.rest_m[0], 0)
 
 
-def in_field(law: Callable, scheme: str = "midpoint", **memory) -> Collocation:
+def breathing(x, v, at, breath_pa):
+    return -breath_pa * (1 + 10 * at.t_s + ca.dot(v, at.normal)) * at.area_m2 * at.normal
+
+
+def in_field(law: Callable, scheme: str = "midpoint", on="nodes", **memory) -> Collocation:
     """With a force of a user."""
-    force, cube = cs.NodeForce.of(law), hung_cube(5, (1, 1, 2))
+    force, cube = cs.NodeForce.of(law, on=on), hung_cube(5, (1, 1, 2))
     body = cs.Body(
         cube.body.mesh, density_kg_m3=30.0, forces=[force], prony=["prony_1"] if memory else []
     )
@@ -290,6 +294,8 @@ PROGRAMS: dict[str, Make] = {
     "a user's drag": lambda: in_field(smooth_drag),
     "a user's drag, bdf2": lambda: in_field(smooth_drag, "bdf2"),
     "a user's whirl": lambda: in_field(whirled),
+    "a user's pressure": lambda: in_field(breathing, on="faces"),
+    "a user's pressure, bdf2": lambda: in_field(breathing, "bdf2", on="faces"),
     "a user's drag, memory": lambda: in_field(
         smooth_drag, **{"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)}
     ),

@@ -1,20 +1,22 @@
-"""A force on the nodes of a body that a user declares: f(x, v, at, constants) in CasADi operations.
+"""A force on nodes or faces of a body that a user declares: f(x, v, at, constants) in CasADi.
 
 Air drag, a foundation, a magnet: what acts at a point and depends on where that is, how fast it
-moves and on time. Its constants stand in θ behind those of the body's parts, and are estimated like
-them.
+moves and on time; or, at the middle of a face, on its area and normal as they are now, as a
+pressure. Its constants stand in θ behind those of the body's parts, and are estimated like them.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
@@ -26,19 +28,22 @@ from .pattern import SymmetricPattern, dofs_of
 from .selection import Indices, Selection
 
 Law = Callable[..., ca.SX]
+On = Literal["nodes", "faces"]
 # A slope is symmetric when its skew part is this small beside it.
 SYMMETRIC = 1e-9
 
 
 class AtNode(NamedTuple):
-    """What a law may know of its node, beside where it is and how it moves.
+    """What a law may know of its node or face, beside where it is and how it moves.
 
     Attributes
     ----------
     t_s : time
     rest_m : (3,) place on the undeformed body
-    area_m2, volume_m3 : its share of the undeformed body's surface and volume
-    normal : (3,) outward, undeformed, of length one; zero inside
+    area_m2, volume_m3 : of a node, its share of the undeformed body's surface and volume
+        The area of a face is that which it has now, and its volume zero.
+    normal : (3,) outward, of length one; of a node undeformed, and zero inside
+        That of a face is as it is now.
     """
 
     t_s: ca.SX
@@ -50,11 +55,13 @@ class AtNode(NamedTuple):
 
 # Of the numbers of an `AtNode`, in its order.
 DATA = 9
+# The corners of a triangle for trying laws.
+TRIANGLE_M = (0.1, 0.2, 0.3, 0.2, 0.2, 0.3, 0.1, 0.3, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
 class NodeForce:
-    """A force on every node of a body, or on some.
+    """A force on every node of a body, on every face of its surface, or on some.
 
     Attributes
     ----------
@@ -62,15 +69,20 @@ class NodeForce:
         For messages.
     law : callable
         ``law(x, v, at, **constants) -> (3,)`` force [N] on a node at x [m] with velocity v [m/s],
-        ``at`` being an `AtNode`. Its derivative by v must be symmetric.
+        ``at`` being an `AtNode`; or on a face, whose middle is at x. Its derivative by v must be
+        symmetric.
     constants : tuple of Constant
     nodes : Selection, (k,) int array or None
+    on : {"nodes", "faces"}
+        On faces of the surface, all of whose nodes are chosen; quadratic ones are as if folded
+        along their middles.
     """
 
     name: str
     law: Law
     constants: tuple[Constant, ...]
     nodes: Selection | Index | None = None
+    on: On = "nodes"
 
     @classmethod
     def of(
@@ -79,6 +91,7 @@ class NodeForce:
         *constants: Constant,
         nodes: Selection | ArrayLike | None = None,
         name: str | None = None,
+        on: On = "nodes",
     ) -> NodeForce:
         """A force by a law; its arguments after x, v and at name the constants, with their units.
 
@@ -90,6 +103,7 @@ class NodeForce:
         nodes : Selection or (k,) int array, optional
             All by default.
         name : str, optional
+        on : {"nodes", "faces"}
 
         Raises
         ------
@@ -105,22 +119,41 @@ class NodeForce:
             )
         known = tuple(told.get(a) or constant_named(a) for a in arguments)
         chosen = nodes if nodes is None or isinstance(nodes, Selection) else np.asarray(nodes)
-        found = cls(name, law, known, chosen)
+        if on not in get_args(On):
+            raise InputError(
+                f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
+            )
+        found = cls(name, law, known, chosen, on)
         found._check()
         return found
 
     def expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """The force (3,) of u = (x, v, constants) and the data of an `AtNode`."""
-        x, v, values = ca.vertsplit(u, [0, 3, 6, 6 + len(self.constants)])
+        """Forces (3k,) on k nodes of u = (x, v, constants), and the data of an `AtNode`."""
+        dofs = (u.numel() - len(self.constants)) // 2
+        x, v, values = ca.vertsplit(u, [0, dofs, 2 * dofs, u.numel()])
         at = AtNode(data[0], data[1:4], data[4], data[5], data[6:9])
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
+        if self.on == "nodes":
+            return self._valued(x, v, at, named)
+        places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
+        area = area_vector(places)
+        size = ca.norm_2(area)
+        at = at._replace(area_m2=size, normal=area / size)
+        force = self._valued(middle(x), middle(v), at, named)
+        return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3)
+
+    def _valued(self, x: ca.SX, v: ca.SX, at: AtNode, named: dict[str, ca.SX]) -> ca.SX:
         found = self.law(x, v, at, **named)
         return ca.SX(ca.vertcat(*found) if isinstance(found, (list, tuple)) else found)
 
+    def inputs(self, dofs: int) -> int:
+        """Length of u for so many dofs."""
+        return 2 * dofs + len(self.constants)
+
     @property
-    def inputs(self) -> int:
-        """Length of u."""
-        return 6 + len(self.constants)
+    def _dofs(self) -> int:
+        """Those of a node, or of the simplest face."""
+        return 3 if self.on == "nodes" else 9
 
     @cached_property
     def turns(self) -> bool:
@@ -130,7 +163,7 @@ class NodeForce:
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """u, data, and the force."""
-        u, data = ca.SX.sym("u", self.inputs), ca.SX.sym("data", DATA)
+        u, data = ca.SX.sym("u", self.inputs(self._dofs)), ca.SX.sym("data", DATA)
         return u, data, self.expression(u, data)
 
     @cached_property
@@ -142,18 +175,22 @@ class NodeForce:
     @cached_property
     def _skew(self) -> tuple[float, float]:
         """How far the derivatives by x and by v are from symmetric, at some points."""
-        rng, found = np.random.default_rng(0), np.zeros(2)
+        rng, found, dofs = np.random.default_rng(0), np.zeros(2), self._dofs
         for _ in range(3):
-            some = [rng.uniform(0.5, 1.0, size) for size in (self.inputs, DATA)]
+            some = [rng.uniform(0.5, 1.0, size) for size in (self.inputs(dofs), DATA)]
             values = self._slopes(*some)[1].full()
-            for k, part in enumerate((values[:, :3], values[:, 3:6])):
+            for k, part in enumerate((values[:, :dofs], values[:, dofs : 2 * dofs])):
                 size = np.abs(part).max() or 1.0
                 found[k] = max(found[k], np.abs(part - part.T).max() / size)
         return float(found[0]), float(found[1])
 
     def _check(self) -> None:
+        dofs = self._dofs
         try:
-            shape = self._symbols[2].shape
+            u, data, _ = self._symbols
+            at = AtNode(data[0], data[1:4], data[4], data[5], data[6:9])
+            named = {c.name: u[2 * dofs + k] for k, c in enumerate(self.constants)}
+            shape = self._valued(u[:3], u[dofs : dofs + 3], at, named).shape
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
@@ -161,7 +198,8 @@ class NodeForce:
             ) from error
         if shape != (3, 1):
             raise InputError(f"force {self.name!r} has the shape {shape}; expected (3, 1)")
-        still = np.concatenate([[0.1, 0.2, 0.3], np.zeros(3), np.ones(len(self.constants))])
+        ones = np.ones(len(self.constants))
+        still = np.concatenate([TRIANGLE_M[:dofs], np.zeros(dofs), ones])
         if not all(np.isfinite(e.full()).all() for e in self._slopes(still, np.ones(DATA))):
             raise InputError(
                 f"force {self.name!r} or its slope is not finite where the node is at rest; "
@@ -183,15 +221,15 @@ class NodeForce:
 
 @dataclass(frozen=True, eq=False)
 class PlacedForce:
-    """A `NodeForce` on the nodes of a body.
+    """A `NodeForce` on the nodes, or the faces, of a body.
 
     Attributes
     ----------
     force : NodeForce
-    nodes : (k,)
-    data : (8, k) what an `AtNode` has behind the time
+    nodes : (i, k) of each node or face
+    data : (8, i) what an `AtNode` has behind the time
     columns : (c,) places of its constants in θ
-    couplings : SymmetricPattern of the nodes' own dofs
+    couplings : SymmetricPattern of the dofs of each
     """
 
     force: NodeForce
@@ -200,6 +238,27 @@ class PlacedForce:
     columns: Index
     couplings: SymmetricPattern
 
+    @cached_property
+    def dofs(self) -> Index:
+        """(i, 3k)."""
+        return dofs_of(self.nodes)
+
+    @cached_property
+    def onto_dofs(self) -> sp.csr_array:
+        """What sums (i, 3k) into (3n,)."""
+        return _summing(self.dofs, self.couplings.size)
+
+    @cached_property
+    def onto_couplings(self) -> tuple[sp.csr_array, Array]:
+        """What sums lower triangles (i, m), column after column, into the couplings' entries.
+
+        And the sign (i, m) of skew ones there, whose dofs may be in another order.
+        """
+        columns, rows = np.triu_indices(self.dofs.shape[1])
+        row, column = self.dofs[:, rows], self.dofs[:, columns]
+        places = self.couplings.position(row.ravel(), column.ravel()).reshape(row.shape)
+        return _summing(places, self.couplings.entries), np.where(row < column, -1.0, 1.0)
+
     @classmethod
     def on(
         cls, force: NodeForce, mesh: Nodes, chosen: Index, volume_m3: Array, columns: Index
@@ -207,13 +266,41 @@ class PlacedForce:
         """A force on chosen nodes of a mesh whose nodes have these volumes (n,)."""
         count = len(mesh.points_m)
         area, normal = _surface_of(mesh)
-        data = np.vstack([mesh.points_m.T, area, volume_m3, normal.T])[:, chosen]
-        dofs = dofs_of(chosen[:, None])
-        rows, places = np.tril_indices(3)
-        couplings = SymmetricPattern.of_entries(
-            dofs[:, rows].ravel(), dofs[:, places].ravel(), count
-        )
-        return cls(force, chosen, data, columns, couplings)
+        data = np.vstack([mesh.points_m.T, area, volume_m3, normal.T])
+        if force.on == "nodes":
+            nodes, data = chosen[:, None], data[:, chosen]
+        else:
+            faces = mesh.on_faces(mesh.mesh.surface)
+            nodes = faces[np.isin(faces, chosen).all(axis=1)]
+            if not len(nodes):
+                raise InputError(
+                    f"force {force.name!r} is on faces, but none of the surface has all of its "
+                    "nodes among those chosen"
+                )
+            data = data[:, nodes[:, -3:]].mean(axis=2)
+            data[3:] = 0.0
+        return cls(force, nodes, data, columns, SymmetricPattern.of_cells(nodes, count))
+
+
+def middle(values: ca.SX) -> ca.SX:
+    """Of a face, as what acts there is shared: that of its last three nodes (3k,)."""
+    return ca.sum2(ca.reshape(values, 3, values.numel() // 3)[:, -3:]) / 3
+
+
+def area_vector(places: Sequence[ca.SX]) -> ca.SX:
+    """Of a face with corners a, b, c, and nodes on ab, bc, ca if any, its normal times its area."""
+    corners, middles = places[:3], places[3:]
+    pairs = zip(corners, middles, strict=True) if middles else ((corner,) for corner in corners)
+    ring = [place - places[0] for pair in pairs for place in pair]
+    beside = pairwise(ring)
+    return sum((ca.cross(a, b) for a, b in beside), start=ca.SX.zeros(3)) / 2
+
+
+def _summing(places: Index, size: int) -> sp.csr_array:
+    """What sums values at places (i, k) into (size,)."""
+    flat = places.ravel()
+    entries = np.ones(flat.size), (flat, np.arange(flat.size))
+    return sp.csr_array(entries, shape=(size, flat.size))
 
 
 def _surface_of(mesh: Nodes) -> tuple[Array, Array]:

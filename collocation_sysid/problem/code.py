@@ -49,7 +49,7 @@ def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool)
     if isinstance(found, NodeForce):
         return found if nodes is None else replace(found, nodes=nodes)
     try:
-        return NodeForce.of(found, nodes=nodes, name=section.function)
+        return NodeForce.of(found, nodes=nodes, name=section.function, on=section.on)
     except InputError as error:
         raise error.located(file) from error
 

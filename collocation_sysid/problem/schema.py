@@ -52,10 +52,13 @@ class NodeForceSection(CodeSection):
         Name of the function of the force in it.
     nodes : Nodes, optional
         Selection of nodes; all by default.
+    on : str
+        What it acts on: these nodes, or faces of the surface that have all of theirs among them.
     """
 
     function: Text
     nodes: Nodes | None = None
+    on: Literal["nodes", "faces"] = "nodes"
 
 
 Material = Annotated[MaterialName | CodeSection, ByForm(str)]
