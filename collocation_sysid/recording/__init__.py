@@ -1,66 +1,33 @@
 """What is done to a body and measured on it: grasps, markers, files, and the experiment."""
 
-from .alignment import Aligned, align
-from .clock import sample_interval_s
-from .experiment import Experiment
-from .gauge import Gauge, Look
-from .grasp import Grasp, held_dofs, held_nodes
-from .loads import Force, PointMass
-from .markers import Markers, Placement, place_markers
-from .nuisance import Nuisance, NuisanceRow
-from .pose_files import read_poses
-from .poses import PoseSequence
-from .pressure import Pressure
-from .readers import MarkerTable, read_markers
-from .rigid import RigidFit, TemplateFit, align_to_template, fit_poses
-from .tables import (
-    displaced_axes,
-    read_displacement,
-    read_forces,
-    read_pressure,
-    read_tension,
-    read_wrench,
-)
-from .tendon import Tendon
-from .wrench import Wrench
-from .writers import write_gauge_csv, write_markers_csv, write_poses_csv, write_wrench_csv
-
-__all__ = [
-    "Aligned",
-    "Experiment",
-    "Force",
-    "Gauge",
-    "Grasp",
-    "Look",
-    "MarkerTable",
-    "Markers",
-    "Nuisance",
-    "NuisanceRow",
-    "Placement",
-    "PointMass",
-    "PoseSequence",
-    "Pressure",
-    "RigidFit",
-    "TemplateFit",
-    "Tendon",
-    "Wrench",
-    "align",
-    "align_to_template",
-    "displaced_axes",
-    "fit_poses",
-    "held_dofs",
-    "held_nodes",
-    "place_markers",
-    "read_displacement",
-    "read_forces",
-    "read_markers",
-    "read_poses",
-    "read_pressure",
-    "read_tension",
-    "read_wrench",
-    "sample_interval_s",
-    "write_gauge_csv",
-    "write_markers_csv",
-    "write_poses_csv",
-    "write_wrench_csv",
-]
+from .alignment import align as align
+from .clock import sample_interval_s as sample_interval_s
+from .experiment import Experiment as Experiment
+from .gauge import Gauge as Gauge
+from .gauge import Look as Look
+from .grasp import Grasp as Grasp
+from .grasp import held_dofs as held_dofs
+from .grasp import held_nodes as held_nodes
+from .loads import Force as Force
+from .loads import PointMass as PointMass
+from .markers import Markers as Markers
+from .markers import Placement as Placement
+from .markers import place_markers as place_markers
+from .nuisance import Nuisance as Nuisance
+from .nuisance import NuisanceRow as NuisanceRow
+from .pose_files import read_poses as read_poses
+from .poses import PoseSequence as PoseSequence
+from .pressure import Pressure as Pressure
+from .readers import MarkerTable as MarkerTable
+from .readers import read_markers as read_markers
+from .rigid import align_to_template as align_to_template
+from .rigid import fit_poses as fit_poses
+from .tables import displaced_axes as displaced_axes
+from .tables import read_displacement as read_displacement
+from .tables import read_wrench as read_wrench
+from .tendon import Tendon as Tendon
+from .wrench import Wrench as Wrench
+from .writers import write_gauge_csv as write_gauge_csv
+from .writers import write_markers_csv as write_markers_csv
+from .writers import write_poses_csv as write_poses_csv
+from .writers import write_wrench_csv as write_wrench_csv

@@ -59,9 +59,7 @@ class Placement:
             )
         weights = read_only_floats(self.weights, nodes.shape, "weights of the placement")
         distance = read_only_floats(self.distance_m, (len(nodes),), "distance_m of the placement")
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "distance_m", distance)
+        vars(self).update(nodes=nodes, weights=weights, distance_m=distance)
 
 
 def place_markers(

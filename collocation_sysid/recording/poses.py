@@ -6,11 +6,11 @@ motion is smooth (splines with continuous accelerations), linear, or held (zero-
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import read_only_floats
+from ..stated import key, stated
+from .arrays import floats, read_only_floats
 from .clock import TIME_TOLERANCE_S, first_time_fault
 
 Interpolation = Literal["smooth", "linear", "hold"]
@@ -38,7 +39,7 @@ LONGEST_STEP_S = 1.0
 STILL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@stated
 class PoseSequence:
     """Rigid motion x(t) = R(t) X + p(t) from undeformed to current positions.
 
@@ -63,30 +64,21 @@ class PoseSequence:
         of unit norm; the first bad row is named, counting from 1.
     """
 
-    t_s: Array
-    positions_m: Array
-    quaternions_xyzw: Array
-    interpolation: Interpolation = "smooth"
+    t_s: Array = key(converter=floats((None,), "t_s of the poses", finite=False))
+    positions_m: Array = key(converter=np.asarray)
+    quaternions_xyzw: Array = key(converter=np.asarray)
+    interpolation: Interpolation = key(Interpolation, default="smooth")
 
     def __post_init__(self) -> None:
-        t_s = read_only_floats(self.t_s, (None,), "t_s of the poses", finite=False)
-        m = len(t_s)
-        if m == 0:
+        t_s, m = self.t_s, len(self.t_s)
+        if not m:
             raise InputError("a pose sequence needs at least one pose")
-        positions = read_only_floats(self.positions_m, (m, 3), "positions_m", finite=False)
-        quaternions = read_only_floats(
-            self.quaternions_xyzw, (m, 4), "quaternions_xyzw", finite=False
-        )
-        if self.interpolation not in get_args(Interpolation):
-            expected = ", ".join(get_args(Interpolation))
-            raise InputError(
-                f"interpolation of poses is {self.interpolation!r}; expected one of {expected}"
-            )
-        if fault := first_pose_fault(t_s, positions, quaternions):
+        positions_m = read_only_floats(self.positions_m, (m, 3), "positions_m", False)
+        quaternions = read_only_floats(self.quaternions_xyzw, (m, 4), "quaternions_xyzw", False)
+        if fault := first_pose_fault(t_s, positions_m, quaternions):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
-        object.__setattr__(self, "t_s", t_s)
-        object.__setattr__(self, "positions_m", positions)
-        object.__setattr__(self, "quaternions_xyzw", _unit_and_continuous(quaternions))
+        continuous = _unit_and_continuous(quaternions)
+        vars(self).update(positions_m=positions_m, quaternions_xyzw=continuous)
 
     @classmethod
     def fixed(cls, t0_s: float = 0.0) -> PoseSequence:

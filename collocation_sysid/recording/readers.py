@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, hint_at
-from .arrays import read_only_floats, read_only_tracks
+from ..stated import key, stated
+from .arrays import floats, read_only_tracks
 from .clock import first_time_fault
 from .formats import Choose, RawTracks, c3d, motive, plain, qualisys, trc
 from .formats.text import decode, listed, read_bytes
@@ -27,7 +27,7 @@ _TEXT_FORMATS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@stated
 class MarkerTable:
     """Marker tracks as measured, before they are tied to a body.
 
@@ -43,22 +43,17 @@ class MarkerTable:
         What was missing or assumed in the file, a sentence each.
     """
 
-    t_s: Array
-    names: tuple[str, ...]
-    positions_m: Array
-    notes: tuple[str, ...] = ()
+    t_s: Array = key(converter=floats((None,), "t_s of the markers"))
+    names: tuple[str, ...] = key(converter=tuple[str, ...])
+    positions_m: Array = key(converter=np.asarray)
+    notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
 
     def __post_init__(self) -> None:
-        names = tuple(self.names)
-        t_s = read_only_floats(self.t_s, (None,), "t_s of the markers")
-        if fault := first_time_fault(t_s):
+        if fault := first_time_fault(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
-        shape = (len(t_s), len(names), 3)
-        positions = read_only_tracks(self.positions_m, shape, "marker positions")
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "t_s", t_s)
-        object.__setattr__(self, "positions_m", positions)
-        object.__setattr__(self, "notes", tuple(self.notes))
+        shape = (len(self.t_s), len(self.names), 3)
+        tracks = read_only_tracks(self.positions_m, shape, "marker positions")
+        vars(self)["positions_m"] = tracks
 
 
 def read_markers(

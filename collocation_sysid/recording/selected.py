@@ -50,18 +50,15 @@ class NodesSection(Section):
 Nodes = Annotated[Text | NodesSection, ByForm(str)]
 
 
+KINDS: dict[str, Any] = {"box_m": Box, "ball_m": Ball, "indices": Indices, "name": Named}
+
+
 def selection(section: NodesSection | str) -> Selection:
     """What a table selects, or the name of a point array."""
     if isinstance(section, str):
         return Named(section)
-    if section.box_m is not None:
-        return Box(*section.box_m)
-    if section.ball_m is not None:
-        return Ball(*section.ball_m)
-    if section.indices is not None:
-        return Indices(section.indices)
-    assert section.name is not None  # by the schema
-    return Named(section.name)
+    ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)
+    return kind(*value) if kind in (Box, Ball) else kind(value)
 
 
 def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:

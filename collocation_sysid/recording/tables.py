@@ -189,7 +189,7 @@ def displaced_axes(
 ) -> str:
     """Return along which axes a file tells shifts, such as "z"; see `read_displacement`."""
     shifts = _components(_shifts(path, columns, length_m, timed=False), SHIFTS, axis)
-    told = np.isfinite(shifts).any(axis=0)
+    told = np.asarray(np.isfinite(shifts).any(axis=0))
     return "".join(each for each, there in zip("xyz", told, strict=True) if there)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from . import Choose, RawTracks
-from .text import Row, grid, header_number, numbers, refuse_other_count, separated_rows
+from .text import Header, Row, grid, numbers, separated_rows
 from .units import stated_unit
 
 BEGINNING = "Format Version"
@@ -34,7 +34,8 @@ def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
     """Read a Motive CSV file."""
     rows = separated_rows(text, path, ",")
     first = rows[0]
-    header = dict(zip(first.cells[::2], first.cells[1::2], strict=False))
+    pairs = zip(first.cells[::2], first.cells[1::2], strict=False)
+    header = Header(path, {key: (text, first.line) for key, text in pairs})
     top = next((k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None)
     if top is None or top < 4 or not "".join(rows[top].cells[1:2]).startswith("Time"):
         raise InputError(
@@ -48,24 +49,17 @@ def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
     chosen = [labels[k] for k in choose(labels, [n for n in labels if n.startswith("Unlabeled")])]
     titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
     table = grid(path, titles, rows[top + 1 :])
-    exported = header.get("Total Exported Frames", "")
-    refuse_other_count(
-        header_number(exported, "Total Exported Frames", path, first.line),
-        len(table.rows),
-        "Total Exported Frames",
-        "frames",
-        path,
-        first.line,
-    )
+    header.compare("Total Exported Frames", len(table.rows), "frames")
     cells = [column for label in chosen for column in columns[label].places]
-    rate_key = next((key for key in _RATES if header.get(key)), _RATES[0])
+    rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
+    (unit, _) = header.stated.get("Length Units", ("", 0))
     return RawTracks(
         labels=chosen,
         coordinates=numbers(table, cells, blank_allowed=True).reshape(-1, len(chosen), 3),
-        unit=stated_unit(header.get("Length Units", ""), path, "line 1, Length Units"),
+        unit=stated_unit(unit, path, "line 1, Length Units"),
         unit_key="Length Units",
         t_s=numbers(table, [1], blank_allowed=False)[:, 0],
-        rate_hz=header_number(header.get(rate_key, ""), rate_key, path, first.line),
+        rate_hz=header.number(rate_key),
         rate_key=rate_key,
         lines=table.lines,
         notes=tuple(

@@ -7,19 +7,12 @@ The file does not state its unit of length.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from ...errors import InputError
 from . import Choose, RawTracks
-from .text import (
-    Row,
-    grid,
-    header_number,
-    numbers,
-    refuse_other_count,
-    tab_rows,
-    tracks,
-)
+from .text import Header, Row, framed, tab_rows
 
 BEGINNING = "NO_OF_"
 _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
@@ -29,40 +22,21 @@ def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
     """Read a Qualisys TSV file."""
     rows = tab_rows(text)
     count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
-    header = {row.cells[0]: row for row in rows[:count]}
-    if "MARKER_NAMES" not in header:
+    above = {row.cells[0]: row for row in rows[:count]}
+    if "MARKER_NAMES" not in above:
         raise InputError(
             "the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data", path
         )
-    labels = [cell for cell in header["MARKER_NAMES"].cells[1:] if cell]
-
-    def number(key: str) -> float | None:
-        row = header.get(key)
-        return row and header_number("".join(row.cells[1:2]), key, path, row.line)
-
-    def compare(key: str, found: int, what: str) -> None:
-        if key in header:
-            refuse_other_count(number(key), found, key, what, path, header[key].line)
-
-    compare("NO_OF_MARKERS", len(labels), "marker names")
+    labels = [cell for cell in above["MARKER_NAMES"].cells[1:] if cell]
+    stated = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
+    header = Header(path, stated)
+    header.compare("NO_OF_MARKERS", len(labels), "marker names")
     frames = rows[count:]
     leading = _leading_columns(path, frames, 3 * len(labels))
     if frames and _names_columns(frames[0]):
         del frames[0]
-    chosen = choose(labels)
-    titles = [f"{label} {axis}" for label in labels for axis in "XYZ"]
-    table = grid(path, [*leading, *titles], frames)
-    compare("NO_OF_FRAMES", len(frames), "frames")
-    timed = "Time" in leading
-    return RawTracks(
-        labels=[labels[k] for k in chosen],
-        coordinates=tracks(table, [len(leading) + 3 * k for k in chosen]),
-        unit_key="a Qualisys TSV (QTM writes mm)",
-        t_s=numbers(table, [leading.index("Time")], blank_allowed=False)[:, 0] if timed else None,
-        rate_hz=number("FREQUENCY"),
-        rate_key="FREQUENCY",
-        lines=table.lines,
-    )
+    raw = framed(header, "NO_OF_FRAMES", "FREQUENCY", leading, labels, frames, choose)
+    return replace(raw, unit_key="a Qualisys TSV (QTM writes mm)")
 
 
 def _names_columns(row: Row) -> bool:

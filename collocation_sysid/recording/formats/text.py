@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError, excerpt
 from ...files import require_regular
+from . import Choose, RawTracks
 
 # Nothing measured is larger, and products of two such numbers are still numbers.
 LARGEST = 1e100
@@ -184,12 +185,6 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
     return values
 
 
-def tracks(grid: Grid, first_columns: Sequence[int]) -> Array:
-    """Coordinates (rows, M, 3) of markers whose x stands in `first_columns`, y and z after it."""
-    columns = [first + axis for first in first_columns for axis in range(3)]
-    return numbers(grid, columns, blank_allowed=True).reshape(-1, len(first_columns), 3)
-
-
 def is_number(cell: str) -> bool:
     """Whether a cell is a plain number."""
     return _NUMBER.fullmatch(cell) is not None
@@ -202,35 +197,86 @@ def written_number(text: str) -> float:
     return float(text)
 
 
-def header_number(text: str, key: str, path: str | Path, line: int) -> float | None:
-    """The number that a header states; None where it is blank.
+@dataclass(frozen=True)
+class Header:
+    """What a file states above its frames.
 
-    Raises
-    ------
-    InputError
-        If it is no number above 0.
+    Attributes
+    ----------
+    path : str or Path
+    stated : mapping of a key to its text and line
     """
-    if not text:
-        return None
-    try:
-        value = written_number(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise InputError(f"{key} is '{text}'; expected a number above 0", path, f"line {line}")
-    return value
+
+    path: str | Path
+    stated: Mapping[str, tuple[str, int]]
+
+    def number(self, key: str) -> float | None:
+        """The number that a key states; None where it is blank.
+
+        Raises
+        ------
+        InputError
+            If it is no number above 0.
+        """
+        text, line = self.stated.get(key, ("", 0))
+        if not text:
+            return None
+        try:
+            value = written_number(text)
+        except ValueError:
+            value = math.nan
+        if not 0 < value < math.inf:
+            message = f"{key} is '{text}'; expected a number above 0"
+            raise InputError(message, self.path, f"line {line}")
+        return value
+
+    def compare(self, key: str, count: int, what: str, line: int | None = None) -> None:
+        """Raise an `InputError` if it states another count than there is."""
+        stated = self.number(key)
+        if stated is not None and stated != count:
+            raise InputError(
+                f"{key} is {stated:g}, but {count} {what} are there; is the file cut short?",
+                self.path,
+                f"line {line or self.stated[key][1]}",
+            )
 
 
-def refuse_other_count(
-    stated: float | None, found: int, key: str, what: str, path: str | Path, line: int
-) -> None:
-    """Raise an `InputError` if a header states another count than there is."""
-    if stated is not None and stated != found:
-        raise InputError(
-            f"{key} is {stated:g}, but {found} {what} are there; is the file cut short?",
-            path,
-            f"line {line}",
-        )
+def framed(
+    header: Header,
+    counted: str,
+    rate: str,
+    leading: Sequence[str],
+    labels: Sequence[str],
+    frames: list[Row],
+    choose: Choose,
+) -> RawTracks:
+    """Tracks of a table of frames: some columns, then x, y and z of each marker.
+
+    Parameters
+    ----------
+    header : Header
+    counted, rate : str
+        Keys of the number of frames, and of their rate.
+    leading : sequence of str
+        Columns before those of the markers.
+    labels : sequence of str
+    frames : list of Row
+    choose : Choose
+    """
+    chosen = choose(labels)
+    titles = [f"{label} {axis}" for label in labels for axis in "XYZ"]
+    table = grid(header.path, [*leading, *titles], frames)
+    header.compare(counted, len(frames), "frames")
+    columns = [len(leading) + 3 * k + axis for k in chosen for axis in range(3)]
+    timed = "Time" in leading
+    return RawTracks(
+        labels=[labels[k] for k in chosen],
+        coordinates=numbers(table, columns, blank_allowed=True).reshape(-1, len(chosen), 3),
+        t_s=numbers(table, [leading.index("Time")], blank_allowed=False)[:, 0] if timed else None,
+        rate_hz=header.number(rate),
+        rate_key=rate,
+        lines=table.lines,
+    )
 
 
 def listed(names: Iterable[str]) -> str:

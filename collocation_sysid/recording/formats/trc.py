@@ -6,19 +6,12 @@ Units …); line 4 Frame#, Time and the marker names, line 5 X1, Y1, Z1 …; the
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ...errors import InputError
 from . import Choose, RawTracks
-from .text import (
-    grid,
-    header_number,
-    listed,
-    numbers,
-    refuse_other_count,
-    tab_rows,
-    tracks,
-)
+from .text import Header, framed, listed, tab_rows
 from .units import stated_unit
 
 BEGINNING = "PathFileType"
@@ -31,19 +24,15 @@ def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
     if len(rows) < 5:
         raise InputError("ends within the header of a TRC file", path, f"line {rows[-1].line}")
     _, keys, values, names, axes, *frames = rows
-    header = dict(zip(keys.cells, values.cells, strict=False))
-    missing = [key for key in _KEYS if key not in header]
-    if missing:
+    stated = zip(values.cells, [values.line] * len(keys.cells), strict=False)
+    header = Header(path, dict(zip(keys.cells, stated, strict=False)))
+    if missing := [key for key in _KEYS if key not in header.stated]:
         raise InputError(
             f"the header lacks {listed(missing)}; found {listed(filter(None, keys.cells))}",
             path,
             f"line {keys.line}",
         )
-
-    def number(key: str) -> float | None:
-        return header_number(header[key], key, path, values.line)
-
-    unit = stated_unit(header["Units"], path, f"line {values.line}")
+    unit = stated_unit(header.stated["Units"][0], path, f"line {values.line}")
     labels = [cell for cell in names.cells[2:] if cell]
     if names.cells[0] != "Frame#" or axes.cells[0]:
         raise InputError(
@@ -52,20 +41,7 @@ def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
             path,
             f"line {names.line}",
         )
-    refuse_other_count(
-        number("NumMarkers"), len(labels), "NumMarkers", "marker names", path, names.line
-    )
-    chosen = choose(labels)
-    titles = [f"{label} {axis}" for label in labels for axis in "XYZ"]
-    table = grid(path, ["Frame#", "Time", *titles], frames)
-    refuse_other_count(number("NumFrames"), len(frames), "NumFrames", "frames", path, values.line)
-    return RawTracks(
-        labels=[labels[k] for k in chosen],
-        coordinates=tracks(table, [2 + 3 * k for k in chosen]),
-        unit=unit,
-        unit_key="Units",
-        t_s=numbers(table, [1], blank_allowed=False)[:, 0],
-        rate_hz=number("DataRate"),
-        rate_key="DataRate",
-        lines=table.lines,
-    )
+    header.compare("NumMarkers", len(labels), "marker names", names.line)
+    leading = ["Frame#", "Time"]
+    raw = framed(header, "NumFrames", "DataRate", leading, labels, frames, choose)
+    return replace(raw, unit=unit, unit_key="Units")
