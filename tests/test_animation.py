@@ -89,8 +89,8 @@ def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
 
 def test_fitted_and_rolled_out_stand_side_by_side(run):
     _, (swing, nod) = read_run(run)
-    assert [name for name, *_ in Film(swing).panels] == ["fitted", "rolled out"]
-    assert [name for name, *_ in Film(nod).panels] == ["rolled out"]
+    assert [name for name, *_ in Film(swing).panels] == ["fitted", "simulated"]
+    assert [name for name, *_ in Film(nod).panels] == ["simulated"]
 
 
 def test_the_film_says_how_far_the_markers_are_off(run):
@@ -165,7 +165,7 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
     outer = np.unique(swing.surface)
     for name, positions in (
         ("fitted", swing.positions_m),
-        ("rolled out", swing.rolled_out_positions_m),
+        ("simulated", swing.rolled_out_positions_m),
     ):
         shapes = np.frombuffer(b64decode(data["shapes"][name]), "<f4").reshape(9, -1, 3)
         np.testing.assert_allclose(shapes, positions[:, outer], atol=1e-6)

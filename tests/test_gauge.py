@@ -280,7 +280,7 @@ def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
             readings_picture(arrays["reading_cell"], ["cell"]),
         )
     shown = [[len(axes.lines) for axes in figure.axes] for figure in drawn]
-    assert shown == [[3, 3, 3], [3]]  # measured, fitted, rolled out
+    assert shown == [[3, 3, 3], [3]]  # measured, fitted, simulated
 
 
 def blank_cell(folder: Path) -> None:

@@ -272,7 +272,7 @@ def test_curves_tell_where_the_horizon_grows():
 
 @cache
 def replay(make=hung_cube) -> Replay:
-    """An experiment seen as it is rolled out, with the same for a fit."""
+    """An experiment seen as it is simulated, with the same for a fit."""
     experiment = measured(make())
     x = simulate(experiment, TRUTH, "midpoint")
     seen = (x.positions_m, x.markers_m)

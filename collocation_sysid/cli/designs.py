@@ -34,11 +34,11 @@ class Design(OfProblem, Told):
     criterion : str
         worst: the largest error bar; A: their mean square; D: their ellipsoid.
     for_ : A,B,…
-        Parameters and moduli that count; else all.
+        Parameters and moduli that count; all by default.
     over : str
         mean or worst over the draws of the prior.
     add : bool
-        Complete the recordings there are; they are fitted first.
+        Complement the problem's recordings, which are fitted first.
     film : bool
         Film the motion.
     """

@@ -65,7 +65,7 @@ def solve(options: Solve) -> None:
     --scheduler shares the experiments among the workers of a cluster.
 
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
-    --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods tells them.
+    --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods lists them.
     """
     from ..result.terminal import Progress, summary
 
@@ -150,7 +150,7 @@ class Check(OfProblem, Told):
     "check problem.toml --set transcription.scheme=backward-euler",
 )
 def check(options: Check) -> None:
-    """Tell what is wrong with a problem before solving it.
+    """Say what is wrong with a problem before solving it.
 
     Bodies, recordings and grasps are shown at once; derivatives, costs and the simulation at the
     guess follow, of the first samples where the whole takes more than some ten seconds.

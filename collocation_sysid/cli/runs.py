@@ -28,7 +28,7 @@ class Refine(OfRun, Told):
     Attributes
     ----------
     levels : int
-        2, or 3 to observe the orders: much longer.
+        2, or 3 to observe the orders of convergence, which takes much longer.
     """
 
     levels: int = 2
@@ -155,7 +155,7 @@ class Report:
 def report(options: Report) -> None:
     """Write one HTML page about a run or a study, or a Markdown file.
 
-    Everything it found; of a page the pictures are inside, in Markdown they are links.
+    It holds everything that was found, and its pictures; Markdown links to them.
     """
     from ..result.report import as_file, comparison_report, run_report
 
@@ -190,7 +190,7 @@ class Animate(OfRun):
 
 @command(commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4")
 def animate(options: Animate) -> None:
-    """Film a run: the body as fitted beside the body as rolled out."""
+    """Film a run: the body as fitted beside its forward simulation."""
     from rich.progress import Progress
 
     from ..result.animation import animate as film

@@ -30,7 +30,7 @@ class Estimating:
     budget_ms : float
         Time a frame may take; 80 % of a sample by default.
     window_s : float
-        Frames that are passed again.
+        How far back frames are gone over again.
     """
 
     budget_ms: float | None = None
@@ -70,8 +70,8 @@ def live(options: Live) -> None:
 
     A frame is a line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z,
     w]}, "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m, y_m,
-    z_m, qx, qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is no frame is told and left
-    out, and the exit code is 2 then. An empty datagram ends.
+    z_m, qx, qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is no frame is reported
+    and left out, and the exit code is then 2. An empty datagram ends it.
     """
     from ..live.frames import FrameReader
     from ..live.sources import as_json, as_text, collected_before, datagrams

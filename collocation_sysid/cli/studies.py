@@ -63,13 +63,13 @@ class Compare(Many):
     prony : 0,1,…
         Numbers of branches of memory.
     region : NAME
-        Region that has them; by default all the body does.
+        Region that these are for; by default the whole body.
     with_ : FILE
         Another problem of the same recordings.
     truth : FILE|NAME=VALUE
         True parameters: a TOML file, or values.
     within : float
-        Relative error of a success.
+        Relative error up to which a run is a success.
     """
 
     methods: str | None = None

@@ -37,7 +37,7 @@ class Methods:
     Attributes
     ----------
     name : str
-        Tell this method's options.
+        The method whose options are listed.
     """
 
     name: Annotated[str | None, typer.Argument()] = None

@@ -92,7 +92,7 @@ class Starts:
     starts : int
         Starts; the first is the file's guess.
     spread : float
-        Starts are within this factor.
+        Starts lie within this factor of the guess.
     seed : int
         Seed of the starts.
 

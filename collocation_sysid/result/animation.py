@@ -1,4 +1,4 @@
-"""A run as a film: the body as fitted beside the body as rolled out, with measured markers."""
+"""A run as a film: the body as fitted beside its forward simulation, with measured markers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ HEAD_MM, FOOT_MM, LINE_MM = 12.0, 12.0, 5.0
 MOST_FRAMES = 3000
 # Of a static experiment, however long it took.
 STATES_A_SECOND = 8
-NAMES = ("fitted", "rolled out")
+NAMES = ("fitted", "simulated")
 
 Progress = Callable[[float], None]
 

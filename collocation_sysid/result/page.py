@@ -33,7 +33,7 @@ class Colouring:
     Attributes
     ----------
     name : str
-    values : mapping of trajectory ("fitted", "rolled out") to (T, F)
+    values : mapping of trajectory ("fitted", "simulated") to (T, F)
     low, high : float
         Where the colours begin and end.
     ends : (str, str)
@@ -64,7 +64,7 @@ class Colouring:
 def write_page(
     replay: Replay, file: str | Path, headline: str = "", colouring: Colouring | None = None
 ) -> Path:
-    """Write an experiment, as fitted and as rolled out, as a stand-alone web page.
+    """Write an experiment, as fitted and as simulated forward, as a stand-alone web page.
 
     The page draws on a plain canvas, in any browser and without a network. Of long trajectories
     every second, third, … sample is kept.
@@ -92,7 +92,7 @@ def write_page(
 
 
 def _trajectories(replay: Replay) -> dict[str, Array]:
-    named = {"fitted": replay.positions_m, "rolled out": replay.rolled_out_positions_m}
+    named = {"fitted": replay.positions_m, "simulated": replay.rolled_out_positions_m}
     return {name: x for name, x in named.items() if x is not None}
 
 

@@ -129,7 +129,7 @@ def replays(finished: Answer) -> list[Replay]:
 
 
 def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
-    """(S, 19) of each sensor: time, and the wrench as measured, fitted and rolled out."""
+    """(S, 19) of each sensor: time, and the wrench as measured, fitted and simulated."""
     sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
     rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
     found = []
@@ -142,7 +142,7 @@ def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
 
 
 def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
-    """(S, 1 + 3m) of each reading of one's own: time, as measured, fitted and rolled out."""
+    """(S, 1 + 3m) of each reading of one's own: time, as measured, fitted and simulated."""
     rollout, fit = finished.rollouts[experiment.name], finished.solution.readings
     rolled = rollout.readings if isinstance(rollout, Rollout) else {}
     both = fit.get(experiment.name, {}), rolled

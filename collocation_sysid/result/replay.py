@@ -122,7 +122,7 @@ class Replay:
         wrenches: Sequence[Array] = (),
         readings: Mapping[str, Array] | None = None,
     ) -> Replay:
-        """Gather an experiment with (positions, markers) as fitted, and as rolled out.
+        """Gather an experiment with (positions, markers) as fitted, and as simulated.
 
         Its markers are at `places_m` (M, 3), where they were estimated.
         """
@@ -155,7 +155,7 @@ class Replay:
 
     @property
     def shapes_m(self) -> Array | None:
-        """(T, n, 3) positions to show where there is room for one: fitted, else rolled out."""
+        """(T, n, 3) positions to show where there is room for one: fitted, else simulated."""
         return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
 
     def arrays(self, prefix: str = "") -> dict[str, Array]:

@@ -43,7 +43,7 @@ def export_page(
         By default the first.
     field : str, optional
         Which of the frames' point or cell data colours the body as fitted; by default the strain
-        of the body as fitted and as rolled out.
+        of the body as fitted and as simulated forward.
 
     Raises
     ------

@@ -45,7 +45,7 @@ class DesignOptions(Options):
     pairs : int
         Pairs of draws from the prior, about the guesses.
     spread : float
-        By what factor guesses may be wrong, without a prior.
+        Factor by which guesses without a prior may be wrong.
     waves : int
         Waves of each of the six coordinates.
     seed : int

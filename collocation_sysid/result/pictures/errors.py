@@ -16,7 +16,7 @@ FAR_APART = 15.0
 def error_over_time(
     t_s: Array, measured_m: Array, fitted_m: Array | None, rolled_out_m: Array | None = None
 ) -> Figure:
-    """Draw the root mean square distance of the markers over time, fitted and rolled out.
+    """Draw the root mean square distance of the markers over time, fitted and simulated.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The two models of every measurement, fitted and rolled out, and how they are drawn."""
+"""The two models of every measurement, fitted and simulated, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ def models(
     """
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
-        ("rolled out", rolled_out_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
+        ("simulated", rolled_out_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
     )
     return [(label, model, style) for label, model, style in named if model is not None]

@@ -1,4 +1,4 @@
-"""What an instrument said over time, as of a wrench: measured, fitted, and rolled out."""
+"""What an instrument said over time, as of a wrench: measured, fitted, and simulated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def readings_picture(said: Array, names: Sequence[str], units: Sequence[str] = (
     Parameters
     ----------
     said : (S, 1 + 3m)
-        Time [s], and m numbers as measured, fitted and rolled out, NaN where there are none.
+        Time [s], and m numbers as measured, fitted and simulated, NaN where there are none.
     names, units : (m,)
     """
     t_s, measured, fitted, rolled_out = np.split(

@@ -1,4 +1,4 @@
-"""Coordinates of markers over time: measured, fitted, rolled out, and what is left."""
+"""Coordinates of markers over time: measured, fitted, simulated, and what is left."""
 
 from __future__ import annotations
 
