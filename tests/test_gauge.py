@@ -273,7 +273,7 @@ def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
     sizes = result["fit"]["experiments"]["swing"]["reading_rms"]
     assert sizes.keys() == {"chip", "cell"}
     assert f"chip of 'swing': {sizes['chip']:.2g} RMS (sigma 0.02)" in done.out
-    assert "estimated beside them of 'swing': bias of chip" in " ".join(done.out.split())
+    assert "also estimated for 'swing': bias of chip" in " ".join(done.out.split())
     with np.load(worn / "found" / "trajectory.npz") as arrays:
         drawn = (
             readings_picture(arrays["reading_chip"], "xyz"),

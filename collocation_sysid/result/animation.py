@@ -181,7 +181,7 @@ class Film:
             (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
         )
         there = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
-        # A roll-out may leave the picture where it goes astray; the fit and the markers may not.
+        # A forward simulation that goes astray may leave the picture; fit and markers may not.
         outer = there[0][1][:, np.unique(replay.surface)]
         outer = outer[np.isfinite(outer).all(axis=(1, 2))]
         camera = Camera.facing(outer, replay.up)

@@ -48,7 +48,7 @@ class Answer:
         What is likely described wrongly, likeliest first.
     refinement : Refinement or None
         What the discretisation does: solved again where that was asked for, else what the step
-        does, to first order, from roll-outs with a finer one; None where these are missing.
+        does, to first order, from finer forward simulations; None where these are missing.
     missing : str
         What Ctrl-C left out after there was an answer.
     """

@@ -24,7 +24,7 @@ from ..statistics.estimates import Estimate
 from ..statistics.linearised import Derived, LinearisedFit
 from ..statistics.numerical import Refinement, changes_towards, numerical_errors
 
-# Grid steps over those of a roll-out that tells the step's error, with room for rounding.
+# Grid steps over those of a forward simulation that tells the step's error, with room for rounding.
 LEAST_FINER = 1.99
 
 
@@ -146,8 +146,8 @@ def step_error(
 ) -> Refinement | None:
     """What the step does to every parameter and modulus, to first order.
 
-    From a Gauss–Newton step towards the roll-outs; None where these are missing or no finer, and
-    where all is static.
+    From a Gauss–Newton step towards the forward simulations; None where these are missing or no
+    finer, and where all is static.
     """
     apart: list[Array] = []
     collocation = solution.collocation
@@ -176,7 +176,7 @@ def step_error(
 def _of_gauges(
     solution: Solution, segment: Segment, trajectory: Trajectory, share: float
 ) -> list[Array]:
-    """A share of the way of the readings of one's own to a roll-out, of each (S, G, 3)."""
+    """A share of the way of one's own readings to a forward simulation, of each (S, G, 3)."""
     if not segment.gauges:
         return []
     (part,) = (p for p in solution.collocation.parts(solution.z) if p.segment is segment)
@@ -197,7 +197,7 @@ def _gauged(segment: Segment, x: Array, reactions: tuple[Grid, Forced], phi: Arr
 
 
 def _share(problem: Problem, segment: Segment) -> float | None:
-    """Of the way to a roll-out, the part that half the step would go; None if it is no finer."""
+    """Of the way to a forward simulation, what half the step would go; None if it is no finer."""
     experiment, options = segment.experiment, problem.rollout
     if experiment.static:
         return 1.0
@@ -211,6 +211,6 @@ def _share(problem: Problem, segment: Segment) -> float | None:
 
 
 def _step_s(problem: Problem, segment: Segment) -> float:
-    """Of the roll-outs: a quarter of the samples' distance at most, and half the grid's."""
+    """Of forward simulations: a quarter of the samples' distance at most, and half the grid's."""
     count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or segment.experiment.timestep_s / count

@@ -37,7 +37,7 @@ MISFIT, GROSS_MISFIT = 1.5, 3.0
 MARKER_MISFIT = 2.0
 # Autocorrelation that matters, and from which on hardly any of the residuals is noise.
 PERSISTENT, NO_NOISE = 0.2, 0.9
-# What a roll-out misses more than the fit, over the fit's own RMS or that of the noise.
+# What a forward simulation misses more than the fit, over the fit's own RMS or that of the noise.
 ROLLOUT, GROSS_ROLLOUT = 0.35, 2.0
 # A prediction this many times worse than the fit.
 PREDICTION, GROSS_PREDICTION = 3.0, 10.0

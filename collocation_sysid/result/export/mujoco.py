@@ -260,7 +260,7 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
 
 
 def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
-    """The recording: how far nodes move besides rigidly, in MuJoCo and in our roll-out."""
+    """The recording: how far nodes move besides rigidly, in MuJoCo and in our simulation."""
     e, free = body.experiment, ~_grasped(body)
     data = mujoco.MjData(model)
     model.eq_active0[:] = 0
