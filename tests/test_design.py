@@ -16,12 +16,14 @@ from wrenches_small import wristed_cube
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.plan.design import Criterion, DesignOptions, HandMotion, Limits, designing
-from collocation_sysid.plan.design.criterion import Errors, both_sides, draws_about
 from collocation_sysid.plan.design.designing import Judge, design
 from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
 from collocation_sysid.plan.design.information import (
+    Errors,
     FutureRecording,
     LinearRecording,
+    both_sides,
+    draws_about,
     shared_information,
 )
 from collocation_sysid.plan.design.motion import angular_motion

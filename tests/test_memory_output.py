@@ -18,9 +18,8 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.viscoelastic_rows import Overstress
 from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.estimates import Estimate, memory_notes
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.notes import memory_notes
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
 NOISE_M = 2e-4

@@ -17,8 +17,7 @@ from results_small import ROLLOUT, a_result, value
 from collocation_sysid.result.remedies import REMEDIES
 from collocation_sysid.result.report.run_page import verdict
 from collocation_sysid.runs.result import Result, SimulatedExperiment
-from collocation_sysid.statistics.concern import Concern
-from collocation_sysid.statistics.trust import Trust
+from collocation_sysid.statistics.trust import Concern, Trust
 from collocation_sysid.tree import as_json
 
 pytestmark = pytest.mark.long

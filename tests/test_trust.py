@@ -20,9 +20,10 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.result.record import result
 from collocation_sysid.result.remedies import REMEDIES
 from collocation_sysid.result.terminal import summary
-from collocation_sysid.statistics.concern import SENTENCES, Concern
 from collocation_sysid.statistics.hypothesis import Hypothesis
 from collocation_sysid.statistics.trust import (
+    SENTENCES,
+    Concern,
     Trust,
     fit_concerns,
     noise_rms_m,

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..folders import require_possible, run_name
 from ..plan.design import Criterion, DesignOptions, Limits
 from ..plan.design import design as designed
-from ..plan.design.criterion import Kind, Over
+from ..plan.design.information import Kind, Over
 from ..result.writers import require_replaceable
 from ..tree import as_json
 from .common import EXIT_INTERRUPTED, errors, show

@@ -31,10 +31,9 @@ from .discretisation import Discretisation
 from .materials import Damping, Energy, Material, Prony
 from .memory import Past
 from .mesh import TetMesh
-from .model import Model, Theta
 from .node_force import NodeForce, PlacedForce
 from .pattern import Joined, SymmetricPattern
-from .regions import BodyPart, Region, parts_of
+from .regions import BodyPart, Model, Region, Theta, parts_of
 from .selection import Selection
 from .stress import Stresses
 

@@ -16,10 +16,9 @@ from .expressions import KERNELS, Law, energy_kernel
 from .kernels import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .memory import Past, PointLayout
 from .mesh import Nodes, TetMesh
-from .model import Model, Theta
 from .node_force import NodeForce
 from .pattern import SymmetricPattern, element_destinations, in_ascending_order
-from .regions import BodyPart
+from .regions import BodyPart, Model, Theta
 from .selection import Selection
 
 

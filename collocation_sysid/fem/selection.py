@@ -16,10 +16,35 @@ from .mesh import Nodes, TetMesh
 
 # Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
 ROUND_OFF = 1e-9
+OF_CELLS = "cells, by their centres"
+
+
+class _Within:
+    """A selection by where points are."""
+
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        hint = self._nearest(nodes.points_m)
+        return _chosen(self._holds(nodes.points_m), nodes.mesh, str(self), "nodes" + hint)
+
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Return the selected cells, sorted."""
+        return _chosen(self._holds(mesh.centres_m), mesh, str(self), OF_CELLS)
+
+    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
+        """Return the selected rows of `mesh.surface`, sorted."""
+        return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
+
+    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def _nearest(self, points_m: np.ndarray) -> str:
+        """What to say where nothing is near enough."""
+        return ""
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(_Within):
     """The nodes in an axis-aligned box, faces included; bounds may be infinite.
 
     Parameters
@@ -42,18 +67,6 @@ class Box:
         object.__setattr__(self, "low_m", low)
         object.__setattr__(self, "high_m", high)
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
-        return _chosen(self._holds(nodes.points_m), nodes, str(self))
-
-    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected cells, sorted."""
-        return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
-
-    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected rows of `mesh.surface`, sorted."""
-        return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
-
     def _holds(self, points_m: np.ndarray) -> np.ndarray:
         slack = _round_off_m(points_m)
         above = points_m >= np.subtract(self.low_m, slack)
@@ -66,7 +79,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Ball:
+class Ball(_Within):
     """The nodes at most `radius_m` away from `center_m`, both in metres."""
 
     center_m: Sequence[float]
@@ -77,20 +90,9 @@ class Ball:
         if not _is_number(self.radius_m) or not self.radius_m > 0:
             raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
-        nearest = (
-            f"; the nearest node is {self._distance_m(nodes.points_m).min():.4g} m from its centre"
-        )
-        return _chosen(self._holds(nodes.points_m), nodes, str(self), nearest)
-
-    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected cells, sorted."""
-        return _chosen_cells(self._holds(mesh.centres_m), mesh, str(self))
-
-    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected rows of `mesh.surface`, sorted."""
-        return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
+    def _nearest(self, points_m: np.ndarray) -> str:
+        least_m = self._distance_m(points_m).min()
+        return f"; the nearest node is {least_m:.4g} m from its centre"
 
     def _distance_m(self, points_m: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points_m - np.array(self.center_m), axis=1)
@@ -136,7 +138,7 @@ class Indices:
                 "corner; leave it out (a node on an edge is selected when both of its ends are)"
             )
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, wanted))
-        return _chosen(chosen, nodes, "an empty list of indices")
+        return _chosen(chosen, mesh, "an empty list of indices")
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected cells, sorted."""
@@ -148,7 +150,7 @@ class Indices:
                 f"numbered 0 to {count - 1}"
             )
         chosen = np.isin(np.arange(count), self.indices)
-        return _chosen_cells(chosen, mesh, "an empty list of indices")
+        return _chosen(chosen, mesh, "an empty list of indices", OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` whose corners are all among the nodes."""
@@ -172,12 +174,13 @@ class Named:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         what = f'point array "{self.name}"'
         mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
-        return _chosen(nodes.with_mid_nodes(mask), nodes, what)
+        return _chosen(nodes.with_mid_nodes(mask), nodes.mesh, what)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected cells, sorted."""
         what = f'cell array "{self.name}"'
-        return _chosen_cells(self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what), mesh, what)
+        mask = self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what)
+        return _chosen(mask, mesh, what, OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted.
@@ -226,15 +229,6 @@ class Named:
 Selection = Box | Ball | Indices | Named
 
 
-def _chosen_cells(mask: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
-    if not mask.any():
-        raise InputError(
-            f"{what} selects none of the {len(mask)} cells, by their centres; the body spans "
-            f"{_span(mesh.bounds_m)}"
-        )
-    return np.flatnonzero(mask).astype(np.int64)
-
-
 def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
     """Rows of the surface (F, 3) that faces (k, 3), in any orientation, are; −1 where none."""
     there = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
@@ -243,21 +237,16 @@ def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
 
 def _chosen_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
-    mask = chosen_nodes[mesh.surface].all(axis=1)
-    if not mask.any():
-        raise InputError(
-            f"{what} holds no face of the boundary with all its corners; the body spans "
-            f"{_span(mesh.bounds_m)}"
-        )
-    return np.flatnonzero(mask).astype(np.int64)
+    mask = np.asarray(chosen_nodes[mesh.surface].all(axis=1))
+    return _chosen(mask, mesh, what, missed="holds no face of the boundary with all its corners")
 
 
-def _chosen(mask: np.ndarray, nodes: Nodes, what: str, nearest: str = "") -> np.ndarray:
-    if not mask.any():
-        span = _span(nodes.mesh.bounds_m)  # no mid node lies beyond
-        raise InputError(
-            f"{what} selects none of the {len(mask)} nodes{nearest}; the body spans {span}"
-        )
+def _chosen(
+    mask: np.ndarray, mesh: TetMesh, what: str, of: str = "nodes", missed: str = ""
+) -> np.ndarray:
+    if not mask.any():  # no mid node lies beyond the corners
+        missed = missed or f"selects none of the {len(mask)} {of}"
+        raise InputError(f"{what} {missed}; the body spans {_span(mesh.bounds_m)}")
     return np.flatnonzero(mask).astype(np.int64)
 
 

@@ -21,91 +21,76 @@ from ..arrays import Array, Index
 from .discretisation import Discretisation
 from .elements import Element
 from .expressions import Law, carried_energy, first_piola, second_piola, six_of
-from .kernel import Pieces, PointKernel, QuadraturePoint
+from .kernel import Contraction, PointKernel, QuadraturePoint
 from .kernels import COMPILING, Batch, Evaluator
 from .pattern import dofs_of
 
-
-def _kernel(name: str, point: QuadraturePoint, pieces: Pieces) -> PointKernel:
-    last = point.phase(name, pieces)
-    return PointKernel(last.pieces, tuple(point.fields), last.contractions)
+Expression = Callable[[QuadraturePoint, Law], ca.SX]
 
 
-def stress_kernel(element: Element, law: Law) -> PointKernel:
-    """S."""
-    point = QuadraturePoint.of(element, law.constants, "x")
-    return _kernel("stress", point, {"stress": ("none", second_piola(point, law))})
-
-
-def stress_by_theta_kernel(element: Element, law: Law) -> PointKernel:
+def _stress_by_theta(point: QuadraturePoint, law: Law) -> ca.SX:
     """∂S/∂θ by the material's constants, column after column."""
-    point = QuadraturePoint.of(element, law.constants, "x")
-    by_theta = ca.jacobian(second_piola(point, law), point.theta)[:, : len(law.material.constants)]
-    return _kernel("stress_by_theta", point, {"stress_by_theta": ("none", ca.vec(by_theta))})
+    slope = ca.jacobian(second_piola(point, law), point.theta)
+    return ca.vec(slope[:, : len(law.material.constants)])
 
 
-def stress_along_kernel(element: Element, law: Law) -> PointKernel:
+def _stress_along(point: QuadraturePoint, law: Law) -> ca.SX:
     """∂S/∂x v: dS = F⁻¹ (dP − dF S)."""
-    point = QuadraturePoint.of(element, law.constants, "x", "v")
     F, first, rate = point.gradients["x"], first_piola(point, law), point.gradients["v"]
     inverse = ca.inv_minor(point.felt)
     stress = inverse @ ca.reshape(first, 3, 3)
     change = ca.reshape(ca.jtimes(first, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
-    return _kernel("stress_along", point, {"stress_along": ("none", six_of(inverse @ change))})
+    return six_of(inverse @ change)
 
 
-def pulled_kernel(element: Element, law: Law) -> PointKernel:
+def _pulled(point: QuadraturePoint, law: Law) -> ca.SX:
     """(∂S/∂x)ᵀ σ of what the points carry."""
-    point = QuadraturePoint.of(element, law.constants, "x", carried=6)
-    slope = ca.gradient(ca.dot(point.carried, second_piola(point, law)), point.gradients["x"])
-    return _kernel("pulled", point, {"pulled": ("nodes", slope)})
+    return ca.gradient(ca.dot(point.carried, second_piola(point, law)), point.gradients["x"])
 
 
-def carried_force_kernel(element: Element, law: Law) -> PointKernel:
+def _carried_force(point: QuadraturePoint, law: Law) -> ca.SX:
     """f_H of what the points carry."""
-    point = QuadraturePoint.of(element, law.constants, "x", carried=6)
-    slope = -ca.gradient(carried_energy(point), point.gradients["x"])
-    return _kernel("carried_force", point, {"carried_force": ("nodes", slope)})
+    return -ca.gradient(carried_energy(point), point.gradients["x"])
 
 
-def against_kernel(element: Element, law: Law) -> PointKernel:
+def _against(point: QuadraturePoint, law: Law) -> ca.SX:
     """(∂f_H/∂H)ᵀ v."""
-    point = QuadraturePoint.of(element, law.constants, "x", "v", carried=6)
     power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
-    by_carried = ca.gradient(power, point.carried)
-    return _kernel("against", _bare(point), {"against": ("none", by_carried)})
+    return ca.gradient(power, point.carried)
 
 
-def stress_slope_kernel(element: Element, law: Law) -> PointKernel:
+def _stress_slope(point: QuadraturePoint, law: Law) -> ca.SX:
     """(∂S/∂x)ᵀ, column after column."""
-    point = QuadraturePoint.of(element, law.constants, "x")
-    slope = ca.jacobian(second_piola(point, law), point.gradients["x"]).T
-    return _kernel("stress_slope", point, {"stress_slope": ("nodes", slope)})
+    return ca.jacobian(second_piola(point, law), point.gradients["x"]).T
 
 
-def force_slope_kernel(element: Element, law: Law) -> PointKernel:
+def _force_slope(point: QuadraturePoint, law: Law) -> ca.SX:
     """∂f_H/∂H, column after column."""
-    point = QuadraturePoint.of(element, law.constants, "x", carried=6)
-    force = -ca.gradient(carried_energy(point), point.gradients["x"])
-    by_carried = ca.jacobian(force, point.carried)
-    return _kernel("force_slope", _bare(point), {"force_slope": ("nodes", by_carried)})
+    return ca.jacobian(_carried_force(point, law), point.carried)
 
 
-def _bare(point: QuadraturePoint) -> QuadraturePoint:
-    """The same, for what H has gone from."""
-    return replace(point, stretches=(), carried=ca.SX(0, 1))
-
-
-KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {
-    "stress": stress_kernel,
-    "stress_by_theta": stress_by_theta_kernel,
-    "stress_along": stress_along_kernel,
-    "pulled": pulled_kernel,
-    "carried_force": carried_force_kernel,
-    "against": against_kernel,
-    "stress_slope": stress_slope_kernel,
-    "force_slope": force_slope_kernel,
+# Of each: its expression, fields, how many numbers the points carry, and its contraction.
+KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
+    "stress": (second_piola, ("x",), 0, "none"),
+    "stress_by_theta": (_stress_by_theta, ("x",), 0, "none"),
+    "stress_along": (_stress_along, ("x", "v"), 0, "none"),
+    "pulled": (_pulled, ("x",), 6, "nodes"),
+    "carried_force": (_carried_force, ("x",), 6, "nodes"),
+    "against": (_against, ("x", "v"), 6, "none"),
+    "stress_slope": (_stress_slope, ("x",), 0, "nodes"),
+    "force_slope": (_force_slope, ("x",), 6, "nodes"),
 }
+
+
+def stress_kernel(name: str, element: Element, law: Law) -> PointKernel:
+    """That of a line of the table."""
+    expression, fields, carried, contraction = KERNELS[name]
+    point = QuadraturePoint.of(element, law.constants, *fields, carried=carried)
+    piece = expression(point, law)
+    if not ca.depends_on(piece, point.carried):  # H has gone from what is linear in it
+        point = replace(point, stretches=(), carried=ca.SX(0, 1))
+    last = point.phase(name, {name: (contraction, piece)})
+    return PointKernel(last.pieces, fields, last.contractions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,26 +176,23 @@ class Stresses:
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
         out = np.zeros((len(x), len(self.slope_entries.points)))
-        for number, part in enumerate(self.body.parts):
-            if part.prony:
-                self._run(name, number, [x], theta, out, add=True)
-        return out
+        return self._summed(name, [x], theta, out)
 
     def _of_points(
         self, name: str, fields: list[Array], theta: Array, out: Array | None = None
     ) -> Array:
-        if out is None:
-            out = np.zeros((len(fields[0]), self.width))
-        for number, part in enumerate(self.body.parts):
-            if part.prony:
-                self._run(name, number, fields, theta, out, add=True)
-        return out
+        out = np.zeros((len(fields[0]), self.width)) if out is None else out
+        return self._summed(name, fields, theta, out)
 
     def _of_nodes(self, name: str, fields: list[Array], theta: Array, carried: Array) -> Array:
-        out = np.zeros_like(fields[0])
+        return self._summed(name, fields, theta, np.zeros_like(fields[0]), carried)
+
+    def _summed(
+        self, name: str, fields: list[Array], theta: Array, out: Array, carried: Array | None = None
+    ) -> Array:
         for number, part in enumerate(self.body.parts):
             if part.prony:
-                self._run(name, number, fields, theta, out, add=True, carried=carried)
+                self._run(name, number, fields, theta, out, True, carried)
         return out
 
     def _run(
@@ -243,7 +225,7 @@ class Stresses:
         """Every point as an element of its own."""
         body = self.body
         part, places = body.parts[number], body.memory.of_part(number)
-        kernel = KERNELS[name](body.element, Law(part.material, part.damping))
+        kernel = stress_kernel(name, body.element, Law(part.material, part.damping))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)
         geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)

@@ -29,10 +29,9 @@ from ..pipeline import Run
 from ..problem import Problem
 from ..program.lapack import one_blas_thread
 from ..program.least_squares import LeastSquares
-from ..statistics.concern import concerned
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
-from ..statistics.trust import GROSS_MISFIT, Trust
+from ..statistics.trust import GROSS_MISFIT, Trust, concerned
 from .budget import Budget
 from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .intake import LONGEST, Intake

@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from ..statistics.concern import Concern, concerned
 from ..statistics.estimates import Estimate
-from ..statistics.trust import GROSS_MISFIT, HARDLY_TAME, MISFIT, PERSISTENT, WILD
+from ..statistics.trust import (
+    GROSS_MISFIT,
+    HARDLY_TAME,
+    MISFIT,
+    PERSISTENT,
+    WILD,
+    Concern,
+    concerned,
+)
 from .statistics import Scatter
 
 # Estimates this many standard errors from where all is linearised may still move.

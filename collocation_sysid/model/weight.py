@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from ..fem.body import Body, Curvature, Linearisation
-from ..fem.model import Theta
+from ..fem.regions import Theta
 from ..recording.experiment import Experiment
 from ..recording.loads import Force, PointMass
 from .force_term import ForceTerm, Places, States

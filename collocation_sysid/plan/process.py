@@ -1,7 +1,9 @@
-"""A run's process, seen from outside, and what became of it.
+"""Runs side by side, each in a process of its own, and what became of them.
 
-It is started, watched, killed when it is late, and tried again. Finished runs are on disk, one JSON
-file each, there whole or not at all.
+A process is started, watched, killed when it is late, and tried again (`execute`): a time limit or
+a segmentation fault costs that run alone. A worker only does that, be it a thread on this machine
+or a worker of a cluster through dask.distributed. Finished runs are on disk, one JSON file each,
+there whole or not at all.
 """
 
 from __future__ import annotations
@@ -9,18 +11,26 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import secrets
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from ..apart import killed_by
+from ..cluster import connected, distributed
+from ..errors import InputError
+from ..fem.kernels import available_threads
 from ..files import write_whole
 from ..tree import as_json
+from .study import PlannedRun
 
 COMMAND = (sys.executable, "-m", "collocation_sysid.plan.worker")
 # Runs side by side must not fight for cores, and compared times must mean the same.
@@ -181,3 +191,139 @@ class RunStore:
 
     def _file(self, key: str) -> Path:
         return self.folder / f"{key}.json"
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How the runs of a study are done.
+
+    Attributes
+    ----------
+    workers : int
+        Runs at once; as many as there are cores by default.
+    scheduler : ADDRESS
+        A dask.distributed scheduler to run on; its workers see the same files.
+    time_limit_s : --time-limit SECONDS
+        A run is ended after this, loading included; it counts as a failure.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
+    time_limit_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"found {self.workers}; expected 1 or more", None, "--workers")
+        if self.workers is not None and self.scheduler is not None:
+            raise InputError(
+                "the scheduler has workers of its own; leave out one of the two",
+                None,
+                "--workers and --scheduler",
+            )
+        if self.time_limit_s is not None and not self.time_limit_s > 0:
+            raise InputError(
+                f"found {self.time_limit_s:g}; expected a number of seconds above 0",
+                None,
+                "--time-limit",
+            )
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Where runs are done.
+
+    Attributes
+    ----------
+    submit : function of a planned run, gives the future of its record
+    slots : int, runs at once
+    stop : function that ends the runs that are going on
+    """
+
+    submit: Callable[[PlannedRun], Future]
+    slots: int
+    stop: Callable[[], Any]
+
+
+def run_all(
+    planned: Sequence[PlannedRun],
+    store: RunStore,
+    limits: RunOptions,
+    done: Callable[[Record, int], None] = lambda record, slots: None,
+) -> None:
+    """Do the runs that are not in the store and put them there, each as soon as it has ended.
+
+    Parameters
+    ----------
+    planned : sequence of PlannedRun, started in this order
+    store : RunStore
+    limits : RunOptions
+    done : callable
+        Called with every new record and the number of runs at once.
+
+    Raises
+    ------
+    InputError
+        If the scheduler cannot be had.
+    KeyboardInterrupt
+        After the runs that are going on were ended; finished ones are in the store.
+    """
+    if not planned:
+        return
+    with (_cluster if limits.scheduler else _threads)(limits) as pool:
+        futures = {pool.submit(run): run for run in planned}
+        try:
+            for future in as_completed(futures):
+                record = _record_of(future, futures[future], limits)
+                if record["outcome"] != STOPPED:
+                    store.save(record)
+                    done(record, pool.slots)
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            pool.stop()
+            raise
+
+
+def _record_of(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
+    """A run's record, also when the worker that watched it is lost."""
+    try:
+        return future.result()
+    except Exception as error:
+        return {
+            **planned.as_dict(),
+            "outcome": CRASHED,
+            "message": f"its worker was lost ({type(error).__name__}: {error})",
+            "attempts": 1,
+            "time_limit_s": limits.time_limit_s,
+            "wall_s": None,
+        }
+
+
+@contextmanager
+def _threads(limits: RunOptions) -> Iterator[Pool]:
+    """Threads that wait for processes: all that one machine needs."""
+    slots, stop = limits.workers or available_threads(), threading.Event()
+    with ThreadPoolExecutor(slots) as executor:
+
+        def submit(run: PlannedRun) -> Future:
+            return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
+
+        yield Pool(submit, slots, stop.set)
+
+
+@contextmanager
+def _cluster(limits: RunOptions) -> Iterator[Pool]:
+    """The workers of a scheduler that is there."""
+    flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
+    with connected(limits.scheduler) as client:
+        stop = distributed().Event(flag, client=client)
+        with client.get_executor(pure=False) as executor:
+
+            def submit(run: PlannedRun) -> Future:
+                return executor.submit(_on_worker, run.as_dict(), limits.time_limit_s, flag)
+
+            yield Pool(submit, max(1, sum(client.nthreads().values())), stop.set)
+
+
+def _on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
+    return execute(planned, time_limit_s, distributed().Event(flag).is_set)

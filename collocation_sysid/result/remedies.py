@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from ..statistics.concern import Concern
+from ..statistics.trust import Concern
 
 
 @dataclass(frozen=True)

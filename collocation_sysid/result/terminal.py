@@ -24,10 +24,10 @@ from ..runs.answer import Answer
 from ..runs.check import BodyFinding, Findings, Glance, Recording
 from ..runs.check.hold import hold_sentence
 from ..runs.forward_simulation import Rollout
-from ..statistics.concern import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import Refinement
 from ..statistics.scale import relative_sentence
+from ..statistics.trust import Concern
 from ..statistics.uncertainty import Place
 from .export.target import Comparison
 from .heartbeat import Heartbeat

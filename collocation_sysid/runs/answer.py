@@ -15,7 +15,6 @@ from ..fem.constants import unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
-from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.hypothesis import Hypothesis
@@ -23,7 +22,7 @@ from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
 from ..statistics.numerical import Refinement
 from ..statistics.profile import Profile
-from ..statistics.trust import Trust, cause_concerns, numerical_concerns
+from ..statistics.trust import Concern, Trust, cause_concerns, numerical_concerns
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout

@@ -13,11 +13,11 @@ from ..problem import Problem
 from ..program.stability import instabilities
 from ..recording.nuisance import TIME
 from ..recording.turning import TOO_FAST, fastest_turn
-from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.plausible import odd_material, oddities
 from ..statistics.scale import scale_concern
 from ..statistics.trust import (
+    Concern,
     clock_concerns,
     fit_concerns,
     marker_concerns,

@@ -36,14 +36,18 @@ from .distributions import student_ppf
 from .estimates import (
     UNDETERMINED,
     Estimate,
+    correlation_notes,
     correlation_of,
     derived_estimates,
+    memory_notes,
+    parameter_notes,
     relative_slopes,
+    scatter_notes,
+    size_notes,
     user_estimates,
 )
 from .linearised import Information, LinearisedFit, information, linearised_fit
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
-from .notes import correlation_notes, memory_notes, parameter_notes, scatter_notes, size_notes
 from .pose_noise import pose_noise_draws
 from .scatter import Scatter, recordings_of, scatter_of, single_fits
 

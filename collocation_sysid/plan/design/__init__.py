@@ -1,7 +1,7 @@
 """Motions of the grasp that make the error bars of the next recording small."""
 
-from .criterion import Criterion
 from .designing import Design, DesignOptions, design
+from .information import Criterion
 from .limits import Limits
 from .motion import HandMotion
 

@@ -18,8 +18,16 @@ from ...program.simulation import Trajectory, simulate, with_markers
 from ...recording import Experiment, PoseSequence
 from ...runs.solving import solve
 from ...statistics.linearised import linearised_fit
-from .criterion import Criterion, Errors, both_sides, draws_about
-from .information import FutureRecording, LinearRecording, SimulatedMotion, shared_information
+from .information import (
+    Criterion,
+    Errors,
+    FutureRecording,
+    LinearRecording,
+    SimulatedMotion,
+    both_sides,
+    draws_about,
+    shared_information,
+)
 from .limits import REACHED, Bounds, Limits
 from .motion import HandMotion
 from .search import Best, Watch, search

@@ -22,11 +22,10 @@ from ...program.stability import Instability, instabilities
 from ...program.viscoelastic_rows import Overstress
 from ...program.wrench_rows import WrenchRows
 from ...recording.turning import turning_warnings
-from ...statistics.concern import Concern, as_said
 from ...statistics.hypothesis import Hypothesis
 from ...statistics.numerical import MOST_SUBSTEPS
 from ...statistics.scale import scale_notes, stillness_notes
-from ...statistics.trust import stability_concerns
+from ...statistics.trust import Concern, as_said, stability_concerns
 from .cost import Cost, cost_notes, cost_warnings, costs
 from .derivatives import derivative_errors, shortened
 from .description import description_causes

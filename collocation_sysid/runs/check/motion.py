@@ -16,7 +16,7 @@ from ...program.modes import Modes, natural_modes
 from ...program.newton import Solver
 from ...program.rest import rest_state
 from ...recording.experiment import Experiment
-from ...statistics.concern import Concern, as_said
+from ...statistics.trust import Concern, as_said
 
 COUNT = 6
 # A scheme may add this share of the physical damping ratio, or this ratio where there is little.
