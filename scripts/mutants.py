@@ -18,6 +18,7 @@ import ast
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -183,10 +184,26 @@ class Ran:
         return mutant.function in functions if mutant.function else bool(functions)
 
 
-def tests_against(mutant: Mutant, table: list[Ran], budget_s: float) -> list[Ran]:
-    """The quickest tests that reach it, as many as the budget holds and at least one."""
+def importers(path: str, tree: Path) -> set[str]:
+    """Files of the package that import a file by its name."""
+    wanted = re.compile(
+        rf"^\s*from .*\b{Path(path).stem} import |import .*\b{Path(path).stem}\b", re.M
+    )
+    files = (tree / PACKAGE).rglob("*.py")
+    return {str(each.relative_to(tree)) for each in files if wanted.search(each.read_text("utf-8"))}
+
+
+def tests_against(mutant: Mutant, table: list[Ran], tree: Path, budget_s: float) -> list[Ran]:
+    """The quickest tests that reach it, as many as the budget holds and at least one.
+
+    Of what runs on import only, or once for all tests, they are those of the files that import it.
+    """
+    able = [each for each in table if each.reaches(mutant)]
+    if not able:
+        files = importers(mutant.path, tree)
+        able = [each for each in table if files & each.ran.keys()]
     chosen: list[Ran] = []
-    for each in sorted((each for each in table if each.reaches(mutant)), key=lambda each: each.s):
+    for each in sorted(able, key=lambda each: each.s):
         if chosen and sum(one.s for one in chosen) + each.s > budget_s:
             break
         chosen.append(each)
@@ -240,7 +257,7 @@ def run_pytest(
 
 def try_mutant(mutant: Mutant, tree: Path, table: list[Ran], budget_s: float) -> str:
     """Return "killed", "timeout", "survived", or "no test" if none runs it."""
-    against = tests_against(mutant, table, budget_s)
+    against = tests_against(mutant, table, tree, budget_s)
     if not against:
         return "no test"
     file = tree / mutant.path

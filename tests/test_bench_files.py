@@ -15,6 +15,7 @@ from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.beginning import SWUNG, YOUNG_PA
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
+from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.tables import read_pressure
 from collocation_sysid.statistics.modal import doubts
 
@@ -267,6 +268,25 @@ def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, w
         Problem.read(file)
     assert words in str(caught.value)
     assert "more to mend" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("unit", "dimension", "si"),
+    [
+        ("min", "time", 60),
+        ("inch", "length", 0.0254),
+        ("lbf", "force", 0.45359237 * 9.80665),
+        ("kgf", "force", 9.80665),
+        ("N mm", "torque", 1e-3),
+        ("psi", "pressure", 0.45359237 * 9.80665 / 0.0254**2),
+        ("bar", "pressure", 1e5),
+        ("hPa", "pressure", 1e2),
+        ("N/mm²", "pressure", 1e6),
+        ("%", "ratio", 1e-2),
+    ],
+)
+def test_units_are_what_they_are_defined_as(unit: str, dimension: str, si: float):
+    assert si_factor(unit, dimension) == pytest.approx(si, rel=1e-7)
 
 
 # New problems -------------------------------------------------------------------------------------

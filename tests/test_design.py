@@ -473,6 +473,11 @@ def test_the_search_finds_a_minimum_in_a_few_hundred_evaluations():
     assert len(found.history) == 600
 
 
+def test_the_search_has_one_dimension_too():
+    found = search(lambda u, _: float((u[0] - 0.5) ** 2), 1, 100, seed=1)
+    assert found.value < 1e-3
+
+
 # Command line -------------------------------------------------------------------------------------
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from problem_files import replace_cell, replace_text, run_command, settings
 
+from collocation_sysid.problem import Problem
 from collocation_sysid.result import writers
 from collocation_sysid.runs.check import ram as memory
 
@@ -140,6 +141,13 @@ def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pyt
     assert "reduced-space would take" in refused(
         "solve", "problem.toml", "--method", "reduced-space"
     )
+
+
+def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatch):
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "machine_memory_mb", lambda: None)
+    problem = Problem.read("problem.toml")
+    memory.require_memory(problem, problem.collocation(), problem.method)
 
 
 def test_limits_of_containers_count_as_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +56,20 @@ def draws(of: Problem, deviations: tuple[float, ...], count: int = DRAWS):
 def found(name: str, errors: str) -> list[tuple[Uncertainty, np.ndarray]]:
     fits = draws(PROBLEMS[name], ERRORS[errors])
     return [(uncertainty_of(fit, PARAMETERS, wrong[:4]), wrong[:4]) for fit, wrong in fits]
+
+
+def test_a_parameter_that_one_marker_tells_has_its_degrees_of_freedom_in_any_unit():
+    fit, _ = next(draws(PROBLEMS["three markers"], (1.0,)))
+    level = noise_level(fit, information(fit))
+    of_one = np.zeros((3, 1, 1))
+    of_one[0] = 7.0
+    level = replace(
+        level, freedoms=np.array([10.0, 1e3, 1e4]), shares=of_one, extra=np.zeros((1, 1))
+    )
+    for unit in (1e-6, 1.0, 1e6):
+        told = SimpleNamespace(prior=np.zeros((1, 1)), fit=SimpleNamespace(root=unit * np.eye(1)))
+        _, freedom = level.score_covariance("by-marker", told, 1)
+        assert freedom == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("errors", ERRORS)

@@ -111,3 +111,9 @@ def test_a_better_answer_on_the_way_is_pointed_out():
 def test_a_best_value_out_of_bounds_is_refused():
     with pytest.raises(InputError, match="not within its bounds"):
         profile(Solver(parabola(0.1)), "mu_pa", (0.5, 50.0), BOUNDS)
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1e4), (-1.0, 1e4), (2 * BEST, 1e4), (1.0, BEST / 2)])
+def test_bounds_that_are_not_positive_or_without_the_best_value_are_refused(bounds):
+    with pytest.raises(InputError, match="is not within its bounds"):
+        profile(Solver(parabola(0.1)), "mu_pa", (BEST, 50.0), bounds)
