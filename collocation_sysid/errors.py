@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -72,6 +73,15 @@ class InputError(ValueError):
     def located(self, source: str | Path | None = None, where: str | None = None) -> InputError:
         """Return the same error with file and key filled in where they were missing."""
         return InputError(self.message, self.source or source, self.where or where)
+
+
+@contextmanager
+def located(source: str | Path | None = None, where: str | None = None) -> Iterator[None]:
+    """Input errors of what is done within get file and key where they lack them."""
+    try:
+        yield
+    except InputError as error:
+        raise error.located(source, where) from error
 
 
 class SimulationError(RuntimeError):

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from .checked import Boundless, Finite
-from .errors import InputError
+from .errors import located
 from .stated import attributes, documented, keys_of
 
 Vector = tuple[Finite, Finite, Finite]
@@ -106,10 +106,8 @@ def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:
     for name, key in keys_of(kind):
         value = getattr(section, key.name)
         if value is not None and key.constant is None:
-            try:
+            with located(where=f"{where}.{key.name}"):
                 fields[name] = key.read(value) if key.read else value
-            except InputError as error:
-                raise error.located(None, f"{where}.{key.name}") from error
     return fields
 
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar, dataclass_transform, get_args
 from pydantic import TypeAdapter, ValidationError
 
 from .checked import expected
-from .errors import InputError
+from .errors import InputError, located
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -80,13 +80,11 @@ def stated(kind: type[T]) -> type[T]:
     check = kind.__dict__.get("__post_init__", lambda self: None)
 
     def convert(self: T) -> None:
-        try:
+        with located(where=getattr(self, "place", None)):
             for name, converter in converters.items():
                 if (value := getattr(self, name)) is not None:
                     object.__setattr__(self, name, converter(value))
             check(self)
-        except InputError as error:
-            raise error.located(where=getattr(self, "place", None)) from error
 
     setattr(kind, "__post_init__", convert)  # noqa: B010 (of a type of the user's)
     made: Any = dataclass(frozen=True, eq=False)(kind)

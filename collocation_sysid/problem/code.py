@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from ..errors import InputError, hint_at
+from ..errors import InputError, hint_at, located
 from ..fem.materials import Energy, Material
 from ..fem.node_force import NodeForce
 from ..files import reason
@@ -30,10 +30,8 @@ def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -
     file, found = load_function(section.file, section.function, folder, f"{key}.file", allowed)
     if isinstance(found, Material):
         return found
-    try:
+    with located(file):
         return Material.of(cast(Energy, found), section.function)
-    except InputError as error:
-        raise error.located(file) from error
 
 
 def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool) -> NodeForce:
@@ -48,10 +46,8 @@ def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool)
     nodes = None if section.nodes is None else selection(section.nodes)
     if isinstance(found, NodeForce):
         return found if nodes is None else replace(found, nodes=nodes)
-    try:
+    with located(file):
         return NodeForce.of(found, nodes=nodes, name=section.function, on=section.on)
-    except InputError as error:
-        raise error.located(file) from error
 
 
 def load_function(

@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, field, replace
 from pathlib import Path
 from typing import Literal
 
-from ..errors import InputError
+from ..errors import InputError, located
 from ..fem.body import Body
 from ..methods import METHODS, require_method
 from ..methods.solution import Method
@@ -126,10 +126,8 @@ class Problem:
 
         path = Path(path)
         contents = contents_of(path, overrides, allow_code, simulation, folder)
-        try:
+        with located(path):
             return cls(**contents)
-        except InputError as error:
-            raise error.located(path) from error
 
     @property
     def path(self) -> Path | None:
@@ -193,12 +191,10 @@ class Problem:
         self.parameters.fit(self.bodies)
         locals_of([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
-            try:
+            with located(where=f"experiment '{experiment.name}'"):
                 as_scheme(self.scheme, experiment.start_rule)
                 if self.rollout.timestep_s is not None:
                     require_steps(experiment, self.rollout.timestep_s)
-            except InputError as error:
-                raise error.located(where=f"experiment '{experiment.name}'") from error
         self.solver()
         free = [item.name for item in self.parameters.free]
         for name in self.uncertainty.profile:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import InputError, hint_at
+from ..errors import InputError, hint_at, located
 from ..fem.body import Body
 from ..files import require_regular
 from ..methods.scan import usual_constants
@@ -80,26 +80,18 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
     return file
 
 
+@dataclass
 class RecordingReader:
     """Reads one experiment's files; `notes` tells what was assumed."""
 
-    def __init__(
-        self,
-        section: ExperimentSection,
-        folder: Path,
-        body: Body,
-        parameters: Parameters,
-        simulation: bool,
-        row_of: Callable[[OwnRow], NuisanceRow],
-        expression_of: Callable[[ReadingSection, str], Callable[..., Any]],
-    ) -> None:
-        self.row_of, self.expression_of = row_of, expression_of
-        self.section = section
-        self.folder = folder
-        self.body = body
-        self.parameters = parameters
-        self.simulation = simulation
-        self.notes: list[str] = []
+    section: ExperimentSection
+    folder: Path
+    body: Body
+    parameters: Parameters
+    simulation: bool
+    row_of: Callable[[OwnRow], NuisanceRow]
+    expression_of: Callable[[ReadingSection, str], Callable[..., Any]]
+    notes: list[str] = field(default_factory=list)
 
     def read(self) -> Experiment:
         """Return the experiment.
@@ -170,10 +162,8 @@ class RecordingReader:
                 key,
             )
         _refuse_unknown(grasp.markers or (), self._recorded.names, key)
-        try:
+        with located(where=key):
             poses, notes = poses_from_markers(grasp, self._recorded, self.section.window_s)
-        except InputError as error:
-            raise error.located(None, key) from error
         self._note(*(f"{key}: {note}" for note in notes))
         return poses
 
@@ -191,10 +181,8 @@ class RecordingReader:
         table = read_recorded(self.section, file)
         self._note(*(f"{markers.file}: {note}" for note in table.notes))
         _refuse_unknown(markers.template_m or (), table.names, "markers.template_m")
-        try:
+        with located(where="markers.template_m"):
             table, notes = into_body_frame(markers, table)
-        except InputError as error:
-            raise error.located(None, "markers.template_m") from error
         self._note(*notes)
         return table
 
@@ -209,10 +197,8 @@ class RecordingReader:
             zero=self._zero(k, grasp),
             wrench=grasp.wrench and self._wrench(grasp.wrench, where, t_s),
         )
-        try:
+        with located(where=self._grasp_key(k, "nodes")):
             return made.on(self.body, t_s)
-        except InputError as error:
-            raise error.located(None, self._grasp_key(k, "nodes")) from error
 
     def _zero(self, k: int, grasp: GraspSection) -> str:
         """The axes of its displacement."""
@@ -244,7 +230,7 @@ class RecordingReader:
         for sigma in ("sigma_n", "sigma_nm"):
             if sigma in said:
                 said[sigma] /= section.symmetry
-        try:
+        with located(where=key):
             if self.simulation and not (self.folder / name).exists():
                 said.setdefault("sigma_nm", 1.0)
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **said)
@@ -255,8 +241,6 @@ class RecordingReader:
                 inside &= _among(at_s, t_s)
             self._note(f"{name}: {inside.sum()} of {len(at_s)} samples are used")
             return Wrench(at_s[inside], values[inside], **said)
-        except InputError as error:
-            raise error.located(None, key) from error
 
     def _reading(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
         """What is measured within the experiment's time; to be simulated without a file."""
@@ -270,7 +254,7 @@ class RecordingReader:
             if section.grasp > count:
                 message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
                 raise InputError(message, None, f"{key}.grasp")
-        try:
+        with located(where=key):
             if self.simulation and not (section.file and (self.folder / section.file).exists()):
                 return Gauge(t_s=t_s, values=None, **told)
             if section.file is None:
@@ -280,8 +264,6 @@ class RecordingReader:
             inside = within(at_s, t_s, section.file, self.section.kind == "static")
             self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
             return Gauge(t_s=at_s[inside], values=values[inside], **told)
-        except InputError as error:
-            raise error.located(None, key) from error
 
     def _made(self, word: str) -> tuple[Any, ...]:
         """What the tables of a kind state, on the body."""
@@ -293,15 +275,12 @@ class RecordingReader:
     def _one_made(self, kind: type, table: Section, where: str, name: str) -> Any:
         usual = {"name": name} if "name" in type(table).model_fields else {}
         said = usual | stated_in(table, kind, where)
-        for field, key in keys_of(kind):
+        for name, key in keys_of(kind):
             if key.constant and key.read and (named := getattr(table, key.name)):
                 file = existing_file(self.folder, named, f"{where}.{key.name}")
-                said[field], said[key.constant] = key.read(file)
-        try:
-            where = f"{where}.nodes" if "nodes" in said else where
+                said[name], said[key.constant] = key.read(file)
+        with located(where=f"{where}.nodes" if "nodes" in said else where):
             return kind(**said).on(self.body)
-        except InputError as error:
-            raise error.located(None, where) from error
 
     def _table(self, poses: list[PoseSequence]) -> MarkerTable:
         """The measured tracks; to simulate without them, zeros at the poses' times."""
@@ -425,13 +404,14 @@ class RecordingReader:
         if not self.section.marked:
             return build(Markers.none(t_s))
         spec, names = self.section.markers, table.names
+        sigma_m = spec.reference_sigma_m
         markers = Markers(
             t_s,
             table.positions_m,
             _sigma(spec, names),
             names,
             places_m=np.array([spec.reference_m.get(name, [np.nan] * 3) for name in names]),
-            places_sigma_m=_reference_sigma(spec, names),
+            places_sigma_m=None if sigma_m is None else _each(sigma_m, names, np.nan),
             on_surface=spec.places == "surface",
             attach=spec.attach,
             max_distance_m=spec.max_distance_m,
@@ -452,14 +432,10 @@ def _among(at_s: Array, t_s: Array) -> NDArray[np.bool_]:
     return found if found.any() else np.ones(len(at_s), dtype=bool)
 
 
-def _reference_sigma(spec: MarkersSection, names: Sequence[str]) -> Array | None:
-    """(M,) how well the places are known, NaN where that is not said."""
-    given = spec.reference_sigma_m
-    if given is None:
-        return None
-    if not isinstance(given, dict):
-        return np.full(len(names), given)
-    return np.array([given.get(name, np.nan) for name in names])
+def _each(values: Mapping[str, float] | float, names: Sequence[str], usual: float) -> Array:
+    """(M,) values of the markers, given for all or by name."""
+    by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
+    return np.array([by_name.get(name, usual) for name in names])
 
 
 def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> None:
@@ -473,15 +449,12 @@ def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> Non
 
 def _sigma(spec: MarkersSection, names: Sequence[str]) -> Array:
     """Standard deviations (M,) that give each marker its weight: σ/√w."""
-    weight = np.array([spec.weights.get(name, 1.0) for name in names])
-    if not isinstance(spec.sigma_m, dict):
-        return spec.sigma_m / np.sqrt(weight)
-    lacking = [name for name in names if name not in spec.sigma_m]
-    if lacking:
-        raise InputError(
-            f"no value for {lacking[0]!r}; expected one for every marker", None, "markers.sigma_m"
-        )
-    return np.array([spec.sigma_m[name] for name in names]) / np.sqrt(weight)
+    sigma_m = _each(spec.sigma_m, names, np.nan)
+    if np.isnan(sigma_m).any():
+        lacking = names[int(np.isnan(sigma_m).argmax())]
+        message = f"no value for {lacking!r}; expected one for every marker"
+        raise InputError(message, None, "markers.sigma_m")
+    return sigma_m / np.sqrt(_each(spec.weights, names, 1.0))
 
 
 def refuse_other_scale(experiment: Experiment, constants: Mapping[str, float]) -> None:

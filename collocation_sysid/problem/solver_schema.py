@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    PlainValidator,
-    WithJsonSchema,
-    create_model,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic_core.core_schema import no_info_plain_validator_function
 
 from ..checked import Positive
 from ..errors import InputError
@@ -101,10 +95,22 @@ def heading(method: str) -> str:
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
 
 
+@dataclass(frozen=True)
+class _Options:
+    """The type of a method's key."""
+
+    method: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return no_info_plain_validator_function(partial(_read, self.method))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return options_schema(self.method)
+
+
 def _table(method: str) -> tuple[Any, Any]:
     """Type and default of a method's key."""
-    checks = PlainValidator(partial(_read, method)), WithJsonSchema(options_schema(method))
-    return Annotated[Any, *checks], Field(default_factory=partial(_read, method, {}))
+    return Annotated[Any, _Options(method)], Field(default_factory=partial(_read, method, {}))
 
 
 if TYPE_CHECKING:
