@@ -10,7 +10,7 @@ from problems_small import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cu
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.curvature import exact_curvature
-from collocation_sysid.methods.horizon import Horizon, Point
+from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
@@ -24,7 +24,7 @@ def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) 
     return Collocation([noisy(experiment or hung_cube(), noise_m, seed=2)], GUESS, **changes)
 
 
-def point_at(collocation: Collocation, p: np.ndarray) -> Point:
+def point_at(collocation: Collocation, p: np.ndarray) -> Iterate:
     (segment,) = collocation.segments
     q, phi = np.split(p, [collocation.nq])
     setting = segment.setting(q, phi)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from collocation_sysid.program.entries import Entries
+from collocation_sysid.program.entries import OffBand
 
 SHAPE = (5, 7)
 
@@ -24,7 +24,7 @@ def test_values_of_all_groups_add_up_where_their_entries_are(rng, columns):
     smaller = sp.csc_array(sp.random_array((5, 4), density=0.5, rng=rng))
     smaller.sort_indices()
     groups = [group(rng, columns, 6), group(rng, columns, 9), group(rng, columns, 0)]
-    found = Entries.of((smaller.indptr, smaller.indices), SHAPE, groups)
+    found = OffBand.of((smaller.indptr, smaller.indices), SHAPE, groups)
     values, own = found.values(np.full(len(found.indices), np.nan), smaller.nnz)
     own[:] = smaller.data
     further = [rng.normal(size=len(rows)) for rows, _ in groups]
@@ -36,14 +36,14 @@ def test_values_of_all_groups_add_up_where_their_entries_are(rng, columns):
     for (rows, places), more in zip(groups, further, strict=True):
         expected[rows, places] += more
     np.testing.assert_array_equal(whole.toarray(), expected)
-    untouched = Entries.of((smaller.indptr, smaller.indices), SHAPE, [])
+    untouched = OffBand.of((smaller.indptr, smaller.indices), SHAPE, [])
     np.testing.assert_array_equal(untouched.indices, smaller.indices)
 
 
 def test_the_values_of_a_matrix_are_written_in_place_where_nothing_comes_between(rng):
     smaller = sp.csc_array(np.triu(np.ones((4, 4))))
-    after = Entries.of((smaller.indptr, smaller.indices), SHAPE, [group(rng, range(4, 7), 5)])
-    between = Entries.of((smaller.indptr, smaller.indices), SHAPE, [(np.array([4]), np.array([0]))])
+    after = OffBand.of((smaller.indptr, smaller.indices), SHAPE, [group(rng, range(4, 7), 5)])
+    between = OffBand.of((smaller.indptr, smaller.indices), SHAPE, [(np.array([4]), np.array([0]))])
     for entries, in_place in ((after, True), (between, False)):
         values, own = entries.values(None, smaller.nnz)
         assert np.shares_memory(values, own) == in_place

@@ -27,7 +27,7 @@ from problems_small import (
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.moduli import engineering
 from collocation_sysid.methods.curvature import updated, with_curvature
-from collocation_sysid.methods.horizon import Horizon, Point
+from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
@@ -317,11 +317,11 @@ def residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return weights * (q - 1) ** 2 + 1, np.diag(2 * weights * (q - 1))
 
 
-def point_of(q: np.ndarray, before: Point | None = None) -> Point:
+def point_of(q: np.ndarray, before: Iterate | None = None) -> Iterate:
     """A point that has these."""
     residual, slope = residuals(q)
     crossed = np.zeros(len(q)) if before is None else residuals(before.p)[1].T @ residual
-    return Point(q, [], [], LeastSquares.none(len(q)).add(residual, slope), crossed)
+    return Iterate(q, [], [], LeastSquares.none(len(q)).add(residual, slope), crossed)
 
 
 def test_the_learned_curvature_explains_the_last_step():

@@ -17,7 +17,7 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.constants import GAMMA_M, bare
 from ..methods.scan import usual_parameters
-from ..model.dynamics import Row
+from ..model.dynamics import StencilRow
 from ..model.point_forces import generated
 from ..problem import Problem
 from ..program.collocation import Collocation
@@ -197,7 +197,7 @@ class Model:
         return tuple(still)
 
     @cached_property
-    def known_rows(self) -> dict[int, Row]:
+    def known_rows(self) -> dict[int, StencilRow]:
         """Rows whose masses are always the same, by number."""
         return {}
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.body import Linearisation
-from ..model.dynamics import Row
+from ..model.dynamics import StencilRow
 from ..program.least_squares import LeastSquares
 from ..program.marching import RowEquations, extrapolated, solve_row
 from ..program.newton import NewtonFailure, simulation_error
@@ -284,9 +284,9 @@ class LiveSweep:
         residual = (w @ force - self.mass_kg * acceleration)[:, free]
         return at, self.columns.sides(rows, at, acceleration, residual, free)
 
-    def _row(self, t: int) -> Row:
+    def _row(self, t: int) -> StencilRow:
         if t not in self._rows:
-            self._rows[t] = Row.of(self.dynamics, t)
+            self._rows[t] = StencilRow.of(self.dynamics, t)
         return self._rows[t]
 
     def _advanced(self, here: range, limit: float) -> tuple[list[Array], float | None]:

@@ -78,7 +78,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class HeldColumns:
     """Some columns of a sparse matrix.
 
     Attributes
@@ -96,7 +96,7 @@ class Columns:
     @classmethod
     def of(
         cls, entries: Index, rows: Index, columns: Index, wanted: Index, further: Index
-    ) -> Columns:
+    ) -> HeldColumns:
         """Those wanted, ascending, of all entries in rows and columns; with further rows."""
         here = np.flatnonzero(np.isin(columns, wanted))
         found = np.union1d(rows[here], further)
@@ -124,7 +124,7 @@ class Layout:
     structure: tuple[Index, Index]
     kept: Index
     places: Sequence[Index]
-    through: Sequence[Columns]
+    through: Sequence[HeldColumns]
 
     @classmethod
     def of(
@@ -132,7 +132,7 @@ class Layout:
         shape: tuple[int, int],
         kept: Index,
         pairs: Sequence[tuple[Index, Index]],
-        through: Sequence[Columns],
+        through: Sequence[HeldColumns],
     ) -> Layout:
         """The union of the rows and columns given, those kept first."""
         codes = [(column * shape[0] + row).ravel() for row, column in pairs]
@@ -263,7 +263,7 @@ class Condensed(Collocation):
         pairs, through = [(of_row[rows[kept]], of_variable[columns[kept]])], []
         for each in self.left_out:
             of_left = of_row[rows[left]], columns[left]
-            through.append(Columns.of(left, *of_left, each.variables, np.zeros(0, dtype=int)))
+            through.append(HeldColumns.of(left, *of_left, each.variables, np.zeros(0, dtype=int)))
             pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
         return Layout.of((self.constraints, self.variables), kept, pairs, through)
 
@@ -298,7 +298,7 @@ class Condensed(Collocation):
         column = np.concatenate([columns, rows[below]])
         for each in self.left_out:
             own = np.concatenate([each.variables, each.phi])
-            through.append(Columns.of(entries, row, column, each.variables, own))
+            through.append(HeldColumns.of(entries, row, column, each.variables, own))
             i, j = number[through[-1].rows[:, None]], number[each.phi]
             pairs.append((np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0]))
         size = self.variables

@@ -15,14 +15,14 @@ from ..errors import InputError
 from ..program.collocation import Collocation
 from ..program.least_squares import LeastSquares
 from ..program.stopwatch import Stopwatch
-from .horizon import Point
+from .horizon import Iterate
 from .solution import constraint_multipliers
 
 # B may not take more than this share of the curvature of SᵀS away in any direction.
 LARGEST_SHARE = 0.9
 
 
-def updated(b: Array, before: Point, after: Point) -> Array:
+def updated(b: Array, before: Iterate, after: Iterate) -> Array:
     """B (np, np) after a step from one point to another that was tried from it."""
     step = after.p - before.p
     change = after.fit.score - before.fit.score
@@ -80,7 +80,7 @@ def require_second_derivatives(collocation: Collocation) -> None:
 
 
 def exact_curvature(
-    collocation: Collocation, point: Point, stopwatch: Stopwatch | None = None
+    collocation: Collocation, point: Iterate, stopwatch: Stopwatch | None = None
 ) -> Array:
     """B (np, np) of the Hessian 2 (SᵀS + B) of the loss in p, at a point of the whole horizon.
 
@@ -101,7 +101,7 @@ def exact_curvature(
     return (reduced + reduced.T) / 2 - point.fit.information
 
 
-def _direction(collocation: Collocation, point: Point, k: int) -> Array:
+def _direction(collocation: Collocation, point: Iterate, k: int) -> Array:
     """Variables per unit of p_k along the equations of motion."""
     unit = np.eye(len(point.p))[k]
     moved = [

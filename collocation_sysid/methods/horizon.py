@@ -19,9 +19,9 @@ from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from .trajectory import (
     Reached,
-    Report,
     Seen,
-    Trajectory,
+    SweepReport,
+    Swept,
     moved,
     positions,
     reached,
@@ -34,14 +34,14 @@ from .workers import Here, Workers
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class Iterate:
     """Parameters and trajectories, with what one sweep found there.
 
     Attributes
     ----------
     p : (np,) all parameters, see `Collocation.pack`
-    trajectories : list of Trajectory, one per experiment, kept where they were found
-    reports : list of Report, of the trajectories
+    trajectories : list of Swept, one per experiment, kept where they were found
+    reports : list of SweepReport, of the trajectories
     fit : LeastSquares
         By a step from p: of markers after the feasibility step, sensors and priors.
     crossed : (np,) S_0ᵀ r of its residuals, with the slopes S_0 of the point it was tried from
@@ -49,7 +49,7 @@ class Point:
 
     p: Array
     trajectories: list[Any]
-    reports: list[Report]
+    reports: list[SweepReport]
     fit: LeastSquares
     crossed: Array
 
@@ -118,7 +118,7 @@ class Horizon:
         """Take the same problem, read elsewhere."""
         self.collocation, self.segments = collocation, self.workers.hold(collocation)
 
-    def evaluate(self, p: Array, x: Sequence[Any], known: Point | None = None) -> Point:
+    def evaluate(self, p: Array, x: Sequence[Any], known: Iterate | None = None) -> Iterate:
         """One sweep; a point of the first rows, at the same p and positions, is continued.
 
         Raises
@@ -129,7 +129,7 @@ class Horizon:
         trajectories = known.trajectories if known else self._all(None)
         return self._found(p, swept, x, trajectories)
 
-    def tried(self, p: Array, before: Point, step: Array) -> Point:
+    def tried(self, p: Array, before: Iterate, step: Array) -> Iterate:
         """One sweep after a step from a point, static bodies in equilibrium where that is near.
 
         Raises
@@ -139,15 +139,15 @@ class Horizon:
         """
         return self._found(p, tried, before.trajectories, self._own(step))
 
-    def reread(self, p: Array, point: Point) -> Point:
+    def reread(self, p: Array, point: Iterate) -> Iterate:
         """The point as the problem is read now, where its parameters are p."""
         return self._found(p, reread, point.trajectories)
 
     @one_blas_thread()
-    def _found(self, p: Array, run: Callable[..., Trajectory], *columns: Sequence[Any]) -> Point:
+    def _found(self, p: Array, run: Callable[..., Swept], *columns: Sequence[Any]) -> Iterate:
         common = self.segments, self._all(self.collocation.huber), self._own(p)
         trajectories = self.workers.each(run, self.solvers, *common, *columns)
-        reports: list[Report] = self.workers.fetch(self.workers.each(_report, trajectories))
+        reports: list[SweepReport] = self.workers.fetch(self.workers.each(_report, trajectories))
         nq, places = self.collocation.nq, self.collocation.places
         fit, crossed = LeastSquares.none(len(p)), np.zeros(len(p))
         for report, own in zip(reports, places, strict=True):
@@ -163,10 +163,10 @@ class Horizon:
             fit = fit.add(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
-        return Point(p, trajectories, reports, fit, crossed)
+        return Iterate(p, trajectories, reports, fit, crossed)
 
     def extend(
-        self, p: Array, x: Sequence[Any] | None = None, near: Point | None = None
+        self, p: Array, x: Sequence[Any] | None = None, near: Iterate | None = None
     ) -> tuple[list[Any], SimulationError | None]:
         """Trajectories at p as far as they go, continuing those given; and why they stopped.
 
@@ -181,7 +181,7 @@ class Horizon:
             failures += [failure] if failure else []
         return found, failures[0] if failures else None
 
-    def moved(self, point: Point, step: Array) -> list[Any]:
+    def moved(self, point: Iterate, step: Array) -> list[Any]:
         """Trajectories after a step of the parameters."""
         return self.workers.each(moved, self.segments, point.trajectories, self._own(step))
 
@@ -207,11 +207,11 @@ class Horizon:
         return [value] * len(self.rows)
 
 
-def _report(found: Trajectory) -> Report:
+def _report(found: Swept) -> SweepReport:
     return found.report
 
 
-def _rows(found: Trajectory | Reached | Array) -> int:
+def _rows(found: Swept | Reached | Array) -> int:
     return len(positions(found))
 
 
@@ -219,5 +219,5 @@ def _end(found: Reached) -> tuple[SimulationError | None, tuple[float, float, fl
     return found.failure, found.spent
 
 
-def _first(found: Trajectory | Reached | Array, count: int) -> Array:
+def _first(found: Swept | Reached | Array, count: int) -> Array:
     return positions(found)[:count]

@@ -33,7 +33,7 @@ from ..program.lapack import one_blas_thread
 from ..program.sweep import Sweep
 from .curvature import require_second_derivatives
 from .recorder import Recorder
-from .search import Search, SearchOptions
+from .search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
 from .start import completed
 from .trajectory import positions
@@ -71,7 +71,7 @@ class ReducedSpace(SearchOptions):
                 )
         workers = workers or Here(collocation.threads)
         recorder = Recorder(self.name, collocation, watch)
-        search = Search(self, recorder, start, workers)
+        search = ReducedSearch(self, recorder, start, workers)
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
         found = search.x and workers.fetch(workers.each(positions, search.x))

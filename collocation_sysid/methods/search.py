@@ -12,7 +12,7 @@ from ..checked import Count, Positive
 from ..errors import SimulationError
 from ..program.factorisation import Choice
 from .curvature import exact_curvature, updated, with_curvature
-from .horizon import Horizon, Point
+from .horizon import Horizon, Iterate
 from .options import FEWEST, SHARES, Options, Shares, part_of
 from .recorder import Recorder
 from .solution import Iteration, Status
@@ -82,7 +82,7 @@ class SearchOptions(Options):
     factorisation: Choice = "auto"
 
 
-class Search:
+class ReducedSearch:
     """The state of a solve: the best point, the trust region, and the budget."""
 
     def __init__(
@@ -108,7 +108,7 @@ class Search:
             start = np.clip(start, *collocation.bounds())
             self.p = collocation.parameters_of(start)
             self.x = [part.segment.grasped(part.x, part.phi) for part in collocation.parts(start)]
-        self.point: Point | None = None
+        self.point: Iterate | None = None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
         self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
@@ -227,7 +227,7 @@ class Search:
             if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
                 point = self._refined(rung, point)
 
-    def _curvature(self, curvature: Array, before: Point, after: Point) -> Array:
+    def _curvature(self, curvature: Array, before: Iterate, after: Iterate) -> Array:
         """What Gauss–Newton leaves out at `after`, the secant's or the exact."""
         if self.options.hessian == "exact":
             return exact_curvature(self.collocation, after, self.recorder.stopwatch)
@@ -237,14 +237,14 @@ class Search:
         """Largest step of a parameter, in what a trust region of one allows it."""
         return float(np.abs(step / self.reach).max(initial=0.0))
 
-    def _step(self, point: Point, curvature: Array) -> Array:
+    def _step(self, point: Iterate, curvature: Array) -> Array:
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
         low, high = np.minimum(low, 0.0) - 1e-15, np.maximum(high, 0.0) + 1e-15
         return with_curvature(point.fit, curvature).best(low, high)
 
-    def _try(self, rung: Horizon, point: Point, step: Array) -> Point | None:
+    def _try(self, rung: Horizon, point: Iterate, step: Array) -> Iterate | None:
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
@@ -253,7 +253,7 @@ class Search:
             return None
         return trial if trial.finite else None
 
-    def _is_better(self, point: Point, step: Array, trial: Point) -> bool:
+    def _is_better(self, point: Iterate, step: Array, trial: Iterate) -> bool:
         """Judge a trial, and widen or narrow the trust region after it."""
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
@@ -269,7 +269,7 @@ class Search:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
 
-    def _refined(self, rung: Horizon, point: Point) -> Point:
+    def _refined(self, rung: Horizon, point: Iterate) -> Iterate:
         """The point after its feasibility step, or with a simulated trajectory.
 
         The loss of the projected trajectory is then exact to a higher order: trials that were
@@ -280,7 +280,7 @@ class Search:
             return self._restored(rung, point)
         return self._accepted(rung, refined)
 
-    def _restored(self, rung: Horizon, point: Point) -> Point:
+    def _restored(self, rung: Horizon, point: Iterate) -> Iterate:
         """The point with a simulated trajectory, where that exists."""
         self.sweeps += 1
         x, failure = rung.extend(point.p, near=point)
@@ -315,7 +315,7 @@ class Search:
         self.lower, self.upper = collocation.bounds_p
         self.p = p
 
-    def _follow(self, rung: Horizon, point: Point) -> Point:
+    def _follow(self, rung: Horizon, point: Iterate) -> Iterate:
         """The point read where its estimates are."""
         collocation, p = self.collocation.following(point.p)
         if collocation is self.collocation or self.rereadings >= REREADINGS:
@@ -324,7 +324,7 @@ class Search:
         self._read_in(rung, collocation, p)
         return rung.reread(p, point)
 
-    def _accepted(self, rung: Horizon, point: Point) -> Point:
+    def _accepted(self, rung: Horizon, point: Iterate) -> Iterate:
         self.point = point = self._follow(rung, point)
         self.indefinite = sum(report.indefinite for report in point.reports)
         seen = [report.seen for report in point.reports]

@@ -1,7 +1,7 @@
 """One experiment's trajectory at a point of the search: what is done where its recording is.
 
-It holds what grows with the timesteps and stays where it was found; a `Report` of it, which does
-not grow, is all that the search needs to know. Parameters p are the experiment's own (q, φ).
+It holds what grows with the timesteps and stays where it was made; a `SweepReport` of it, which
+does not grow, is all that the search needs to know. Parameters p are the experiment's own (q, φ).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class SweepReport:
     """What a search needs to know of a trajectory, of a size that does not grow with the timesteps.
 
     Attributes
@@ -85,7 +85,7 @@ class Report:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Swept:
     """A trajectory with what one sweep found there.
 
     Attributes
@@ -93,13 +93,13 @@ class Trajectory:
     x : (rows, 3n)
     tangent : Tangent
     slope : (M, k) S, of all readings after the feasibility step
-    report : Report
+    report : SweepReport
     """
 
     x: Array
     tangent: Tangent
     slope: Array
-    report: Report
+    report: SweepReport
 
     def __sizeof__(self) -> int:
         # So that a scheduler knows what moving it would take.
@@ -116,7 +116,7 @@ class Reached:
     spent: tuple[float, float, float]
 
 
-def positions(found: Trajectory | Reached | Array) -> Array:
+def positions(found: Swept | Reached | Array) -> Array:
     """The positions (rows, 3n) of what was found."""
     return found if isinstance(found, np.ndarray) else found.x
 
@@ -126,10 +126,10 @@ def swept(
     segment: Segment,
     huber: float | None,
     p: Array,
-    start: Trajectory | Reached | Array,
-    known: Trajectory | None = None,
-    before: Trajectory | None = None,
-) -> Trajectory:
+    start: Swept | Reached | Array,
+    known: Swept | None = None,
+    before: Swept | None = None,
+) -> Swept:
     """One sweep; a known trajectory of the first rows, at the same p and positions, is continued.
 
     Raises
@@ -147,9 +147,9 @@ def tried(
     segment: Segment,
     huber: float | None,
     p: Array,
-    before: Trajectory,
+    before: Swept,
     step: Array,
-) -> Trajectory:
+) -> Swept:
     """One sweep after a step of the parameters to p.
 
     A static body is brought to equilibrium first, where one is near: a step along the tangent
@@ -174,14 +174,12 @@ def tried(
     return swept(solver, segment, huber, p, x, before=before)
 
 
-def reread(
-    solver: Sweep, segment: Segment, huber: float | None, p: Array, found: Trajectory
-) -> Trajectory:
+def reread(solver: Sweep, segment: Segment, huber: float | None, p: Array, found: Swept) -> Swept:
     """A trajectory whose recording is read elsewhere."""
     return _read(_part(segment, p, found.x), huber, found.tangent, None, solver.stopwatch.taken())
 
 
-def moved(segment: Segment, found: Trajectory, step: Array) -> Array:
+def moved(segment: Segment, found: Swept, step: Array) -> Array:
     """The trajectory after a step of the parameters."""
     return found.x + found.tangent.step + found.tangent.by_p @ step[segment.moving]
 
@@ -190,8 +188,8 @@ def reached(
     solver: Sweep,
     segment: Segment,
     p: Array,
-    known: Trajectory | Reached | Array | None,
-    near: Trajectory | None,
+    known: Swept | Reached | Array | None,
+    near: Swept | None,
 ) -> Reached:
     """The solver's rows at p as far as they go, continuing those known."""
     part = _part(segment, p, np.zeros((0, segment.dofs)) if known is None else positions(known))
@@ -214,16 +212,16 @@ def _read(
     part: Part,
     huber: float | None,
     tangent: Tangent,
-    before: Trajectory | None,
+    before: Swept | None,
     spent: tuple[float, float, float],
-) -> Trajectory:
+) -> Swept:
     """Everything after the feasibility step."""
     response = part.sensing.looked_along(tangent.by_p, tangent.held)
     found = part.sensing.linearised(part.x, response, tangent.step)
     pairs = [as_squares(*each, huber) for each in found]
     residual = np.concatenate([values.ravel() for values, _ in pairs])
     slope = np.concatenate([by.reshape(values.size, by.shape[-1]) for values, by in pairs])
-    report = Report(
+    report = SweepReport(
         fit=LeastSquares.none(slope.shape[1]).add(residual, slope),
         crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
         feasibility_m=float(np.abs(tangent.step).max()),
@@ -232,4 +230,4 @@ def _read(
         seen=Seen.of(part, part.x + tangent.step, tangent.violation_n),
         spent=spent,
     )
-    return Trajectory(part.x, tangent, slope, report)
+    return Swept(part.x, tangent, slope, report)

@@ -332,7 +332,7 @@ def _mean(tables: Tables, at_evaluations: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class StencilRow:
     """Row t of an experiment's equations of motion: its coefficients, and its block.
 
     Attributes
@@ -350,7 +350,7 @@ class Row:
     mass_kg: Array
 
     @classmethod
-    def of(cls, dynamics: Dynamics, t: int) -> Row:
+    def of(cls, dynamics: Dynamics, t: int) -> StencilRow:
         """Row t of the tables, with its mass."""
         tables, step_s = dynamics.tables, dynamics.step_s
         return cls(

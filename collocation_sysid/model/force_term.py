@@ -35,7 +35,7 @@ class States:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Slots:
     """Where what a term adds goes.
 
     Attributes
@@ -83,11 +83,11 @@ class ForceTerm(ABC):
         """F (T, 3n) [N]."""
 
     @abstractmethod
-    def add_slopes(self, at: Linearisation, places: Places, states: States) -> None:
+    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
         """Add F and its slopes, in place."""
 
     @abstractmethod
-    def add_curvature(self, at: Curvature, places: Places, states: States, weights: Array) -> None:
+    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
         """Add the derivatives of weightsᵀ F, for weights (T, 3n), in place."""
 
 
@@ -152,14 +152,14 @@ class Potential(ForceTerm):
         """(T, 3n) [N]."""
         return -self.amplitude * self.scalar.gradient(states.xi)
 
-    def add_slopes(self, at: Linearisation, places: Places, states: States) -> None:
+    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
         """Add F and its slopes."""
         gradient = self.scalar.gradient(states.xi)
         np.subtract(at.force, self.amplitude * gradient, out=at.force)
         at.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(states.xi)
         at.by_theta[:, :, places.inputs.start] -= gradient
 
-    def add_curvature(self, at: Curvature, places: Places, states: States, weights: Array) -> None:
+    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
         """Add the derivatives of weightsᵀ F."""
         xi, own = states.xi, places.inputs.start
         along = self.scalar.hessian_along(xi, weights)

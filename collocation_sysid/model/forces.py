@@ -21,7 +21,7 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Past
 from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
-from .force_term import ForceTerm, Places, Potential, States
+from .force_term import ForceTerm, Potential, Slots, States
 from .point_forces import point_forces
 from .weight import Mass, Weight
 
@@ -209,12 +209,15 @@ class Forces:
         return States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
 
     @cached_property
-    def _placed(self) -> list[tuple[ForceTerm, Places]]:
+    def _placed(self) -> list[tuple[ForceTerm, Slots]]:
         """Every term, and where what it adds goes."""
         entries: Iterator[Index] = iter(self.joined.places[1:])
         nowhere: Index = np.zeros(0, dtype=np.int64)
         return [
-            (term, Places(slice(start, stop), nowhere if term.couplings is None else next(entries)))
+            (
+                term,
+                Slots(slice(start, stop), nowhere if term.couplings is None else next(entries)),
+            )
             for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
         ]
 

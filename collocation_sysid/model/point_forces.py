@@ -12,7 +12,7 @@ from ..arrays import Array
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.node_force import DATA, NodeForce, PlacedForce
 from ..fem.pattern import SymmetricPattern
-from .force_term import ForceTerm, Places, States
+from .force_term import ForceTerm, Slots, States
 from .generated import Generated
 
 
@@ -72,7 +72,7 @@ class PointForces(ForceTerm):
         """(T, 3n) [N]."""
         return self.share * self._summed(self._law.value(*self._instances(states)))
 
-    def add_slopes(self, at: Linearisation, places: Places, states: States) -> None:
+    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
         """Add F and its slopes."""
         value, slopes = self._law.slopes(*self._instances(states))
         at.force[:] += self.share * self._summed(value)
@@ -86,7 +86,7 @@ class PointForces(ForceTerm):
         for k, column in enumerate(self.placed.columns):
             at.by_theta[:, :, column] += self._summed(by_c[:, k])
 
-    def add_curvature(self, at: Curvature, places: Places, states: States, weights: Array) -> None:
+    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
         """Add the derivatives of weightsᵀ F."""
         u, data = self._instances(states)
         w = self.share * np.moveaxis(weights[:, self.placed.dofs], 2, 0)

@@ -25,7 +25,7 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.regions import Theta
 from ..recording.experiment import Experiment
 from ..recording.loads import Force, PointMass
-from .force_term import ForceTerm, Places, States
+from .force_term import ForceTerm, Slots, States
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ class Weight(ForceTerm):
         """The same: it does not depend on the state."""
         return self.mass.kg * self.gravity + self.applied_n
 
-    def add_slopes(self, at: Linearisation, places: Places, states: States) -> None:
+    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
         """Add F and its slopes."""
         np.add(at.force, self.external_n, out=at.force)
         for density, slope in self.body.mass_slopes.items():
@@ -207,7 +207,7 @@ class Weight(ForceTerm):
         for k, (kg, newtons) in enumerate(self._joining, own + 3 * self.turns):
             at.by_theta[:, :, k] += kg * self._falling(states) + newtons
 
-    def add_curvature(self, at: Curvature, places: Places, states: States, weights: Array) -> None:
+    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
         """Add the derivatives of weightsᵀ F."""
         for density, slope in self.body.mass_slopes.items():
             at.theta[:, density] += weights @ (slope * self.gravity)

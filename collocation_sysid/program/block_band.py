@@ -27,7 +27,7 @@ from ..fem.pattern import SymmetricPattern
 
 
 @dataclass(frozen=True, eq=False)
-class Term:
+class BlockTerm:
     """a[t] A[t + shift] + b[t] B[t + shift] with a, b of length N, by column time t."""
 
     shift: int
@@ -36,7 +36,7 @@ class Term:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class BandBlock:
     """The blocks at one row offset: their entries, and the terms that fill them.
 
     Attributes
@@ -53,7 +53,7 @@ class Block:
     rows: Index
     columns: Index
     source: Index
-    terms: Sequence[Term]
+    terms: Sequence[BlockTerm]
     whole: Index
 
 
@@ -81,7 +81,7 @@ class BlockBand:
         self,
         columns: int,
         row_starts: Index,
-        blocks: Sequence[Block],
+        blocks: Sequence[BandBlock],
         top: int = 0,
         adds: bool = False,
     ) -> None:
@@ -149,7 +149,7 @@ class _Slab:
 
     columns: int
     top: int
-    blocks: Sequence[Block]
+    blocks: Sequence[BandBlock]
     entries: int
     column_ends: Index
     top_positions: Index
@@ -158,7 +158,7 @@ class _Slab:
     rows: Index
 
     @classmethod
-    def of(cls, columns: int, blocks: Sequence[Block], top: int) -> _Slab:
+    def of(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _Slab:
         top_rows = np.tile(np.arange(top), columns)
         top_columns = np.repeat(np.arange(columns), top)
         rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
@@ -318,7 +318,7 @@ def whole(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
 
 
 def adding_skew(
-    columns: int, row_starts: Index, blocks: Sequence[Block], top: int = 0
+    columns: int, row_starts: Index, blocks: Sequence[BandBlock], top: int = 0
 ) -> BlockBand:
     """What adds skew parts, as `skew_values` has them, where these blocks have symmetric ones."""
     # The slope by the velocity has none.
@@ -326,7 +326,7 @@ def adding_skew(
         replace(
             block,
             source=block.whole,
-            terms=[Term(term.shift, term.a, np.zeros(len(term.b))) for term in block.terms],
+            terms=[BlockTerm(term.shift, term.a, np.zeros(len(term.b))) for term in block.terms],
         )
         for block in blocks
     ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from .part import Part
-from .segment import Segment, Weights
+from .segment import RowWeights, Segment
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Carried(ABC):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
 
     def hessian_values(
-        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: Weights
+        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
         """The values of these entries; multipliers are those of all of g."""
         return np.zeros(0)

@@ -44,10 +44,10 @@ from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from .carried import Carried, Places
 from .charts import Chart
-from .entries import Entries
+from .entries import OffBand
 from .explicit import carried_by
 from .part import Part
-from .segment import First, Segment, Weights
+from .segment import First, RowWeights, Segment
 from .sharing import locals_of, shared_charts
 
 
@@ -380,7 +380,7 @@ class Collocation:
         return self._jacobian.structure
 
     @cached_property
-    def _jacobian(self) -> Entries:
+    def _jacobian(self) -> OffBand:
         """The columns of q and x, of each experiment those of its φ, and what is carried."""
         own = self.segments[-1].after.row
         indptr, indices = [np.arange(self.nq + 1) * own], [np.tile(np.arange(own), self.nq)]
@@ -394,7 +394,7 @@ class Collocation:
             of_phi.append((np.tile(rows, len(moving)), columns))
         structure = np.concatenate(indptr), np.concatenate(indices)
         further = [each.jacobian_entries() for each in self.carried]
-        return Entries.of(structure, (self.constraints, self.variables), of_phi + further)
+        return OffBand.of(structure, (self.constraints, self.variables), of_phi + further)
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
         """Values of ∂g/∂z in the order of `jacobian_structure`."""
@@ -448,7 +448,7 @@ class Collocation:
         return self._hessian.structure
 
     @cached_property
-    def _hessian(self) -> Entries:
+    def _hessian(self) -> OffBand:
         """The columns of q, those of x as the motion has them, and what else experiments have."""
         counts, further = np.arange(self.nq + 1), []
         indptr = [counts * (counts + 1) // 2]
@@ -460,7 +460,7 @@ class Collocation:
             further += segment.further_entries(self.of_phi.start)
         further += [each.hessian_entries() for each in self.carried]
         structure = np.concatenate(indptr), np.concatenate(indices)
-        return Entries.of(structure, (self.variables, self.variables), further)
+        return OffBand.of(structure, (self.variables, self.variables), further)
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
@@ -486,7 +486,7 @@ class Collocation:
         used = self.nq * (self.nq + 1) // 2
         count = used + sum(segment.hessian.nnz for segment in self.segments)
         values, own = self._hessian.values(out, count)
-        by_q, further, weights = np.zeros((self.nq, self.nq)), list[Array](), list[Weights]()
+        by_q, further, weights = np.zeros((self.nq, self.nq)), list[Array](), list[RowWeights]()
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
             segment = part.segment

@@ -12,7 +12,7 @@ from ..arrays import Array, Index
 
 
 @dataclass(frozen=True, eq=False)
-class Entries:
+class OffBand:
     """Structure in compressed columns, and where the values go.
 
     Attributes
@@ -33,7 +33,7 @@ class Entries:
         structure: tuple[Index, Index],
         shape: tuple[int, int],
         groups: Iterable[tuple[Index, Index]],
-    ) -> Entries:
+    ) -> OffBand:
         """Add groups of entries, some of which may be there already or in other groups.
 
         Parameters

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.memory import Past
-from ..model.dynamics import Dynamics, Row, weighted
+from ..model.dynamics import Dynamics, StencilRow, weighted
 from ..recording.experiment import Experiment
 from .lapack import one_blas_thread
 from .newton import (
@@ -148,7 +148,7 @@ class RowEquations:
         t: int,
         carried: Past | None = None,
     ) -> None:
-        self.dynamics, self.row = dynamics, Row.of(dynamics, t)
+        self.dynamics, self.row = dynamics, StencilRow.of(dynamics, t)
         self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
         self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
         row = self.row

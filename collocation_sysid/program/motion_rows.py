@@ -17,7 +17,7 @@ from ..arrays import Array, Index
 from ..fem.body import Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics
-from .block_band import Block, BlockBand, Term, adding_skew, skew_values
+from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class MotionRows:
         starts = (np.arange(self.dynamics.rows) - first_row) * len(self.row_dofs)
         return np.maximum(starts, -1) if first_row else starts
 
-    def _blocks(self) -> list[Block]:
+    def _blocks(self) -> list[BandBlock]:
         rows, columns, source = self.pattern.full
         place, moving = np.full(self.pattern.size, -1), np.zeros(self.pattern.size, dtype=bool)
         place[self.row_dofs] = np.arange(len(self.row_dofs))
@@ -71,7 +71,7 @@ class MotionRows:
         for lag in range(self.dynamics.reach + 1):
             terms = [
                 # Column time t has the block of row t + lag, whose coefficients are at t + lag.
-                Term(
+                BlockTerm(
                     lag - j - self.dynamics.first_row,
                     scale * ahead(a, lag),
                     scale * ahead(b, lag),
@@ -83,7 +83,7 @@ class MotionRows:
                 kept |= held & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
             entries = place[rows[kept]], columns[kept], source[kept]
-            blocks.append(Block(lag, *entries, terms, np.flatnonzero(kept)))
+            blocks.append(BandBlock(lag, *entries, terms, np.flatnonzero(kept)))
         return blocks
 
     def _inertia_rows(self, lag: int) -> Index:

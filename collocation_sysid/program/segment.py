@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.pattern import SymmetricPattern
-from ..model.dynamics import Dynamics, Row
+from ..model.dynamics import Dynamics, StencilRow
 from ..model.grasp_constraint import Grasping, Held
 from ..model.inputs import Inputs, inputs_of, with_inputs
 from ..model.nuisance import NuisanceMap
@@ -26,7 +26,7 @@ from ..model.schemes import Scheme
 from ..model.setting import Setting
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
-from .block_band import Block, BlockBand, Term, adding_skew, skew_values
+from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_values
 from .channel import Points
 from .charts import Chart
 from .gauge import GaugeReading, gauge_readings
@@ -54,7 +54,7 @@ class First:
 
 
 @dataclass(frozen=True, eq=False)
-class Weights:
+class RowWeights:
     """What each row counts in a Lagrangian.
 
     Attributes
@@ -327,7 +327,7 @@ class Segment:
         dynamics, pattern = self.dynamics.with_theta(theta), self.pattern
         at_last = dynamics.forces.rows(slice(dynamics.rows - 1, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
-        last = Row.of(dynamics, dynamics.rows - 1)
+        last = StencilRow.of(dynamics, dynamics.rows - 1)
         block = last.block(forces.by_position[0], forces.by_velocity[0], pattern)
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
@@ -478,7 +478,7 @@ class Segment:
         rows = self._rows(x, dynamics.assemble_residual(x, forces.force), setting)
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
-    def weights(self, multipliers: Array, of_reactions: Array | float = 0.0) -> Weights:
+    def weights(self, multipliers: Array, of_reactions: Array | float = 0.0) -> RowWeights:
         """Those of multipliers · c, and of rows (N, 3n) where no force counts as taken."""
         dynamics, t = self.dynamics, self.dynamics.tables
         rows = np.zeros((self.grid_rows, self.dofs))
@@ -490,7 +490,7 @@ class Segment:
         if isinstance(of_reactions, np.ndarray):
             rows = rows + of_reactions
             forces = forces + dynamics.combine_transposed(t.w, of_reactions)
-        return Weights(multipliers, rows, forces)
+        return RowWeights(multipliers, rows, forces)
 
     def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
         """Derivatives of multipliers · c through the memory, by scaled x (N, 3n) and by q."""
@@ -541,7 +541,7 @@ class Segment:
     def _hessian_starts(self) -> Index:
         return self.nq + np.arange(self.grid_rows) * self.dofs
 
-    def _hessian_blocks(self, factors: Factors) -> list[Block]:
+    def _hessian_blocks(self, factors: Factors) -> list[BandBlock]:
         """Blocks ∂²φ/∂x_{t−distance}∂x_t where those of ∂²φ/∂x² and ∂²φ/∂x∂v are."""
         rows, columns, source = self.pattern.full
         blocks = []
@@ -550,17 +550,19 @@ class Segment:
                 continue
             kept = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
             entries, terms = np.flatnonzero(kept), self._curvature_terms(distance, factors)
-            blocks.append(Block(-distance, rows[kept], columns[kept], source[kept], terms, entries))
+            blocks.append(
+                BandBlock(-distance, rows[kept], columns[kept], source[kept], terms, entries)
+            )
         return blocks
 
-    def _curvature_terms(self, distance: int, factors: Factors) -> list[Term]:
+    def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
         """Terms of such a block, from evaluations k = t + i."""
         p, q = self.dynamics.state_weights, self.dynamics.tables.q / self.dynamics.step_s
         terms = []
         for i in range(self.dynamics.reach + 1 - distance):
             pair = factors(p[:, i], q[:, i], p[:, i + distance], q[:, i + distance])
             if any(each.any() for each in pair):
-                terms.append(Term(i, *(ahead(self.length_m**2 * each, i) for each in pair)))
+                terms.append(BlockTerm(i, *(ahead(self.length_m**2 * each, i) for each in pair)))
         return terms
 
     def hessian_values(
@@ -568,7 +570,7 @@ class Segment:
         x: Array,
         phi: Array,
         setting: Setting,
-        weights: Weights,
+        weights: RowWeights,
         loss_weight: float,
         values: Array,
         memory_weights: Sequence[Array] = (),

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from ..model.dynamics import Dynamics, Row, weighted
+from ..model.dynamics import Dynamics, StencilRow, weighted
 from ..model.setting import Setting
 from ..model.viscoelasticity import History, Slopes, Weights
 from .block_band import Submatrix
@@ -95,7 +95,7 @@ class Step(NamedTuple):
     """One timestep's F, G, C (lower triangles), −∂c_t/∂x_t factorised, and G's skew part."""
 
     t: int
-    row: Row
+    row: StencilRow
     force: Array
     by_position: Array
     by_velocity: Array
@@ -328,7 +328,7 @@ class Sweep:
         reach, free, y = self.dynamics.reach, self.free, np.zeros_like(x)
         pulled = -gradient[:, free]  # what is left for the rows that are still to come
         history = self.dynamics_at(setting).history(x)
-        weights, later = Weights(history) if history else None, deque[Row](maxlen=reach)
+        weights, later = Weights(history) if history else None, deque[StencilRow](maxlen=reach)
         for chunk in self.chunks(x, setting, backward=True, history=history):
             for step in reversed(chunk.steps):
                 t, row = step.t, step.row
@@ -408,7 +408,7 @@ class Sweep:
                 carried = dynamics.carried(history, here)
                 at = forces.linearise(xi[seen], nu[seen], carried=carried)
             with self.stopwatch.solving():
-                rows = [Row.of(dynamics, t) for t in range(start, here.stop)]
+                rows = [StencilRow.of(dynamics, t) for t in range(start, here.stop)]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
             numbers = range(start, here.stop)
             parts = numbers, rows, at.force, at.by_position, at.by_velocity, factors
@@ -420,7 +420,7 @@ class Sweep:
         dynamics: Dynamics,
         at: Linearisation,
         here: slice,
-        rows: list[Row],
+        rows: list[StencilRow],
         rooms: Sequence[Room | None] = (),
     ) -> list[Factor]:
         pattern, taken = self.pattern, dynamics.taken[here]
@@ -564,7 +564,7 @@ class Forward:
         """Σ_i weights[i] Y_{t−i} (3n, c): how ξ, or ν, of row t changes."""
         return weights[0] * found + weighted(weights, self.past, self.shape)
 
-    def _of_past(self, step: Step, row: Row) -> Array | float:
+    def _of_past(self, step: Step, row: StencilRow) -> Array | float:
         """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
         matrix = self.solver.matrix
         if not row.lags:

@@ -25,7 +25,7 @@ from ..model.viscoelasticity import CHUNK, History
 from .carried import Carried
 from .part import Part
 from .reaction_rows import Reactions
-from .segment import Weights
+from .segment import RowWeights
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +298,7 @@ class Overstress(Carried):
         return np.concatenate(rows), np.concatenate(columns)
 
     def hessian_values(
-        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: Weights
+        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
         """The values of these entries; multipliers are those of all of g."""
         segment, setting = self.segment, part.setting

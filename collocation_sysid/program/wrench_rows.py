@@ -23,7 +23,7 @@ from .channel import Forced
 from .part import Part
 from .reaction_rows import Reactions
 from .reading import Reading
-from .segment import Weights
+from .segment import RowWeights
 from .wrench_channel import GraspWrench, smoothed, stepped
 
 
@@ -215,7 +215,7 @@ class WrenchRows(Carried):
         return _sorted(*_all([*pairs, (phi[i], phi[j])]))
 
     def hessian_values(
-        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: Weights
+        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
         """The values of these entries; multipliers are those of all of g."""
         segment, of_rows = self.segment, self._of_rows(multipliers)

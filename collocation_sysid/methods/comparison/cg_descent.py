@@ -242,7 +242,7 @@ class _Average:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
+class _Probe:
     """The function along the line at one step."""
 
     step: float
@@ -254,7 +254,7 @@ class _Trial:
 class _Found(Exception):
     """A trial that satisfies the Wolfe conditions."""
 
-    def __init__(self, trial: _Trial) -> None:
+    def __init__(self, trial: _Probe) -> None:
         super().__init__()
         self.trial = trial
 
@@ -279,7 +279,7 @@ class _Line:
     ) -> None:
         self.function, self.x, self.value, self.direction = function, x, value, direction
         self.slope = float(gradient @ direction)
-        self.start = _Trial(0.0, value, self.slope, gradient)
+        self.start = _Probe(0.0, value, self.slope, gradient)
         self.limit = value + error
         self.approximate = approximate
         self.options = options
@@ -288,7 +288,7 @@ class _Line:
     def value_at(self, step: float) -> float:
         return self.function.value(self.x + step * self.direction)
 
-    def search(self, step: float) -> _Trial | None:
+    def search(self, step: float) -> _Probe | None:
         """A step that satisfies the Wolfe conditions (L0 … L3), or None."""
         try:
             a, b = self._bracket(step)
@@ -305,19 +305,19 @@ class _Line:
         except _Exhausted:
             return None
 
-    def _try(self, step: float) -> _Trial:
+    def _try(self, step: float) -> _Probe:
         if self.trials >= self.options.max_trials:
             raise _Exhausted
         self.trials += 1
         value, gradient = self.function(self.x + step * self.direction)
         # Out of the domain the slope is not a number: neither up nor down, and the value is high.
         slope = float(gradient @ self.direction) if np.isfinite(value) else np.nan
-        trial = _Trial(step, value if np.isfinite(slope) else np.inf, slope, gradient)
+        trial = _Probe(step, value if np.isfinite(slope) else np.inf, slope, gradient)
         if self._is_enough(trial):
             raise _Found(trial)
         return trial
 
-    def _is_enough(self, trial: _Trial) -> bool:
+    def _is_enough(self, trial: _Probe) -> bool:
         """T1 or T2."""
         decrease, curvature = self.options.decrease, self.options.curvature
         if not trial.slope >= curvature * self.slope:
@@ -327,7 +327,7 @@ class _Line:
         fallen = trial.value - self.value <= decrease * trial.step * self.slope
         return fallen and not self.approximate
 
-    def _bracket(self, step: float) -> tuple[_Trial, _Trial]:
+    def _bracket(self, step: float) -> tuple[_Probe, _Probe]:
         """B0 … B3: an interval at whose ends the slopes have opposite signs."""
         low = self.start
         while True:
@@ -338,7 +338,7 @@ class _Line:
                 return self._cut(self.start, trial)
             low, step = trial, EXPANSION * step
 
-    def _update(self, a: _Trial, b: _Trial, step: float) -> tuple[_Trial, _Trial]:
+    def _update(self, a: _Probe, b: _Probe, step: float) -> tuple[_Probe, _Probe]:
         """U0 … U3: a smaller interval, if `step` is in it."""
         if not a.step < step < b.step:
             return a, b
@@ -349,7 +349,7 @@ class _Line:
             return trial, b
         return self._cut(a, trial)
 
-    def _cut(self, a: _Trial, b: _Trial) -> tuple[_Trial, _Trial]:
+    def _cut(self, a: _Probe, b: _Probe) -> tuple[_Probe, _Probe]:
         """U3: between a low point that goes down and a high one there is one that goes up."""
         while True:
             trial = self._try((1 - CUT) * a.step + CUT * b.step)
@@ -360,7 +360,7 @@ class _Line:
             else:
                 b = trial
 
-    def _double_secant(self, a: _Trial, b: _Trial) -> tuple[_Trial, _Trial]:
+    def _double_secant(self, a: _Probe, b: _Probe) -> tuple[_Probe, _Probe]:
         """S1 … S4."""
         step = _secant(a, b)
         low, high = self._update(a, b, step)
@@ -371,7 +371,7 @@ class _Line:
         return low, high
 
 
-def _secant(a: _Trial, b: _Trial) -> float:
+def _secant(a: _Probe, b: _Probe) -> float:
     if a.slope == b.slope:
         return np.nan
     return (a.step * b.slope - b.step * a.slope) / (b.slope - a.slope)

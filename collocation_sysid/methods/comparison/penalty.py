@@ -146,7 +146,7 @@ class Stages(Options):
         InputError
             For a start with inverted elements.
         """
-        climb = _Climb(self, Recorder(self.name, collocation, watch, self.max_time_s), start)
+        climb = _PenaltyClimb(self, Recorder(self.name, collocation, watch, self.max_time_s), start)
         status, why = climb.recorder.search(climb.run)
         return climb.solution(status, why)
 
@@ -244,7 +244,7 @@ class AugmentedLagrangian(Stages):
         return Stage(merit, max(0.0 if within else TIGHTER * wanted, self.tolerance))
 
 
-class _Climb:
+class _PenaltyClimb:
     """A solve in stages: the last iterate, which is the best as the merit falls, and the budget."""
 
     def __init__(self, options: Stages, recorder: Recorder, start: Array | None) -> None:
