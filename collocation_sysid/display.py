@@ -7,7 +7,7 @@ doubtful, strong, quiet, code.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape as escape_html
 from io import StringIO
@@ -18,6 +18,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from .console import PlainConsole
+from .files import is_own
 from .tree import optional
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red", "strong": "bold", "quiet": "dim"}
@@ -72,6 +73,8 @@ class Table:
     names, texts : int
         How many of the first, and of the last columns these are.
     faint : tuple of int, rows of less weight
+    aside : int
+        How many of the last columns only pages have room for.
     """
 
     title: str
@@ -81,6 +84,7 @@ class Table:
     texts: int | None = optional()
     faint: tuple[int, ...] | None = optional()
     style: str | None = optional()
+    aside: int | None = optional()
 
     def __post_init__(self) -> None:
         columns = {len(row) for row in self.rows} | ({len(self.heads)} if self.heads else set())
@@ -127,6 +131,22 @@ class Section:
 
 
 Shown = str | Line | Items | Table | Cards | Picture | Listing | Section
+
+
+def flat(parts: Iterable[Shown]) -> Iterator[Shown]:
+    """The parts without the titles of their sections, as a terminal has room for."""
+    for part in parts:
+        yield from flat(part.parts) if isinstance(part, Section) else (part,)
+
+
+def own_pictures(folder: Path) -> list[Path]:
+    """The PNG of a folder; what links lead to elsewhere is not shown."""
+    return sorted(file for file in folder.glob("*.png") if is_own(folder, file))
+
+
+def short(value: float) -> str:
+    """Two digits, and no powers of ten for the sizes of bodies."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def labelled(title: str, rows: dict[str, str]) -> Table:
@@ -184,18 +204,18 @@ def _colour(style: str) -> str:
 def _rich_table(table: Table) -> RichTable:
     # Rows that speak for themselves are nearer to what they say.
     shown = RichTable(box=None, pad_edge=False) if table.heads else RichTable.grid(padding=(0, 1))
-    columns = len(table.heads) or max(map(len, table.rows), default=0)
-    for place, head in enumerate(table.heads or [""] * columns):
+    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (table.aside or 0)
+    for place, head in enumerate((table.heads or ("",) * columns)[:columns]):
         number = table.is_number(place)
         if number and columns > MANY:  # names of materials are parted where they have a hyphen
             head = head.replace("-", "-\n")
         elif not number:  # dotted keys may take two lines
             head = head.replace(".", ".\n", 1)
-        whole = place == 0 and bool(table.texts)
+        whole = place == 0 and (table.texts or 0) > (table.aside or 0)
         side = "right" if number else "left"
         shown.add_column(head, justify=side, overflow="fold", no_wrap=whole)
     for row in table.rows:
-        shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in row))
+        shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in row[:columns]))
     return shown
 
 

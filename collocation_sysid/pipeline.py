@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .display import plain_text
 from .errors import InputError, SimulationError
 from .methods.solution import Method, Solution, Status, Watch
 from .methods.start import marched
@@ -15,10 +17,12 @@ from .model.schemes import as_scheme
 from .problem import Problem
 from .recording.turning import turning_warnings
 from .runs.answer import Answer
-from .runs.check.ram import require_memory
+from .runs.check.cost import require_memory
 from .runs.forward_simulation import roll_outs, step_error
 from .runs.refine import refine
+from .runs.result import Result
 from .runs.solving import read_where_found, shared, solve
+from .runs.told import result_of
 from .runs.warm_start import Earlier
 from .statistics.causes import likely_causes
 from .statistics.diagnostics import diagnose
@@ -40,12 +44,16 @@ class Run(Answer):
     def __str__(self) -> str:
         return self.table()
 
+    @cached_property
+    def result(self) -> Result:
+        """All that is known of it, as ``result.json`` holds it."""
+        return result_of(self)
+
     def table(self) -> str:
         """Parameters, intervals, what these hold, and the verdict, as the terminal shows them."""
-        from .display import plain_text
-        from .result.terminal import answer  # how it looks is no part of a run
+        from .result.run_sections import answer  # how it looks is no part of a run
 
-        return plain_text(answer(self))
+        return plain_text(answer(self.result))
 
     def plot(
         self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
@@ -72,7 +80,7 @@ class Run(Answer):
             For an unknown experiment or field, a count that cannot be, or a run without motion.
         """
         from .result.animation import chosen  # how it looks is no part of a run
-        from .result.portrait import portrait
+        from .result.pictures.shapes import portrait
         from .result.record import replays
 
         replay = chosen(replays(self), experiment)

@@ -16,11 +16,8 @@ def main() -> None:
     problem = Problem.read(ROOT / "problems" / "foam_cylinder" / "problem.toml")
     experiment = problem.experiments[0]
     trajectory = simulate(experiment, TRUTH)
-    seen = Replay.of(experiment)
-    picture = shapes(
-        seen.t_s, trajectory.positions_m, seen.surface, seen.held, seen.measured_m, seen.up
-    )
-    save_pictures(ROOT / "docs", {"swing": picture})
+    seen = Replay.of(experiment, (trajectory.positions_m, trajectory.markers_m))
+    save_pictures(ROOT / "docs", {"swing": shapes(seen)})
 
 
 if __name__ == "__main__":

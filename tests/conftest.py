@@ -12,7 +12,7 @@ from problems_small import uneven_box
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.result import heartbeat, record
+from collocation_sysid.result import progress, record
 
 BodyFactory = Callable[..., Body]
 
@@ -29,7 +29,7 @@ def _runs_without_pictures() -> Iterator[None]:
 def _no_lines_of_slow_machines() -> Iterator[None]:
     """What runs leave on stderr does not depend on how busy the machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(heartbeat, "FIRST_S", 1e6)
+        patch.setattr(progress, "FIRST_S", 1e6)
         yield
 
 

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from collocation_sysid.files import SCHEMA
-from collocation_sysid.methods.solution import Iteration, Timing
+from collocation_sysid.methods.solution import Timing
 from collocation_sysid.runs.result import (
     FoundDynamics,
     FoundFit,
     FoundRollout,
     FoundUncertainty,
     FoundValue,
-    HistoryLine,
     ProgramSize,
     Provenance,
     Result,
@@ -30,10 +29,6 @@ ROLLOUT = FoundRollout(0.8e-3, 2e-3, {})
 def value(number: float = 100.0, std_error: float | None = 1.0) -> FoundValue:
     interval = None if std_error is None else (number - 2 * std_error, number + 2 * std_error)
     return FoundValue(number, std_error, interval, guess=number, fixed=False)
-
-
-def lines(history: Sequence[Iteration]) -> tuple[HistoryLine, ...]:
-    return tuple(HistoryLine(*vars(line).values()) for line in history)
 
 
 def uncertainty(names: Sequence[str], covariance: np.ndarray) -> FoundUncertainty:
@@ -69,6 +64,7 @@ def a_result(parameters: Mapping[str, FoundValue] | None = None, **changes: Any)
         title="small",
         parameters={"lambda_pa": value()} if parameters is None else parameters,
         derived={},
+        basis=(),
         places={},
         nuisance={},
         uncertainty=None,

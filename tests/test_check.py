@@ -20,11 +20,11 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.terminal import check_table
+from collocation_sysid.result.check_sections import check_table
 from collocation_sysid.runs.check import Findings, check_problem, glance
+from collocation_sysid.runs.check.body import element_warnings, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import Cost, cost_notes, cost_warnings
 from collocation_sysid.runs.check.derivatives import shortened
-from collocation_sysid.runs.check.elements import element_warnings, slenderness, worst_elements
 from collocation_sysid.runs.check.motion import ModeFinding, Motion, motion_of, motion_warnings
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.

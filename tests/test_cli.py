@@ -37,8 +37,8 @@ from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
-from collocation_sysid.result import terminal
-from collocation_sysid.result.heartbeat import Heartbeat
+from collocation_sysid.result import progress as progress_shown
+from collocation_sysid.result.progress import Heartbeat
 from collocation_sysid.runs import forward_simulation, solving
 
 RESULT_KEYS = {
@@ -99,7 +99,7 @@ def test_exact_data_give_the_exact_parameters(solved):
 
 
 def test_the_result_has_every_promised_key(solved):
-    assert solved.result["schema"] == 2
+    assert solved.result["schema"] == 3
     assert solved.result["status"] == "converged"
     for key, inner in RESULT_KEYS.items():
         assert key in solved.result
@@ -214,12 +214,12 @@ def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlie
 
 
 def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
-    def interrupt(self: terminal.Progress, line: Iteration) -> None:
+    def interrupt(self: progress_shown.Progress, line: Iteration) -> None:
         if line.number == 1:
             signal.raise_signal(signal.SIGINT)
             time.sleep(0.5)  # until it is heard, on the main thread
 
-    monkeypatch.setattr(terminal.Progress, "iteration", interrupt)
+    monkeypatch.setattr(progress_shown.Progress, "iteration", interrupt)
     monkeypatch.setattr(pipeline, "likely_causes", lambda _: pytest.fail("nobody waits for this"))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
@@ -304,7 +304,7 @@ def test_a_real_process_keeps_its_streams_apart(tiny):
 def test_a_terminal_shows_iterations_as_they_come(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
-    with terminal.Progress(console, cs.Problem.read("problem.toml")) as progress:
+    with progress_shown.Progress(console, cs.Problem.read("problem.toml")) as progress:
         progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, TRUTH, 0.5))
         progress.say("checking")
     assert "violation N" in screen.getvalue()
@@ -313,7 +313,7 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
 
 
 def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.result.heartbeat.FIRST_S", 0.01)
+    monkeypatch.setattr("collocation_sysid.result.progress.FIRST_S", 0.01)
     told, lines = threading.Event(), []
 
     class Log(io.StringIO):
@@ -322,12 +322,12 @@ def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
             told.set()
             return len(text)
 
-    with terminal.Progress(Console(file=Log())) as progress:
+    with progress_shown.Progress(Console(file=Log())) as progress:
         progress.say("simulating the first samples")
         assert told.wait(30.0)
     assert "finding a start" in lines[0] or "simulating the first samples" in lines[0]
     assert "s so far)" in lines[0]
-    with terminal.Progress(Console(file=Log()), quiet=True) as progress:
+    with progress_shown.Progress(Console(file=Log()), quiet=True) as progress:
         assert progress._heartbeat is None
     assert not any(thread.name == Heartbeat.NAME for thread in threading.enumerate())
 

@@ -16,9 +16,9 @@ from results_small import a_result
 from rich.console import Console
 
 from collocation_sysid.cli import studies
+from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.plan import process
 from collocation_sysid.plan import progress as display
-from collocation_sysid.runs.result import HistoryLine
 from collocation_sysid.tree import as_json
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
@@ -46,7 +46,7 @@ record["result"]["parameters"] = {
 with open(out, "w") as file:
     json.dump(record, file)
 """
-HISTORY = tuple(HistoryLine(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2))
+HISTORY = tuple(Iteration(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2))
 
 
 @pytest.fixture

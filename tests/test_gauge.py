@@ -22,7 +22,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
 from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
-from collocation_sysid.result.pictures.readings import readings_picture
+from collocation_sysid.result.pictures.over_time import readings_picture
 
 LOW_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]

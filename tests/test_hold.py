@@ -10,7 +10,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.runs.check.hold import Hold, hold_sentence, hold_warnings, holds_of
+from collocation_sysid.runs.check.body import Hold, hold_sentence, hold_warnings, holds_of
 
 # Layers of nodes are so far apart, so a tenth of an edge is 2 mm.
 EDGE_M = 0.02

@@ -16,7 +16,7 @@ from problem_files import replace_cell, replace_text, run_command, settings
 
 from collocation_sysid.problem import Problem
 from collocation_sysid.result import writers
-from collocation_sysid.runs.check import ram as memory
+from collocation_sysid.runs.check import cost as memory
 
 pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 

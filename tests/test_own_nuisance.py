@@ -21,8 +21,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.result.record import result
-from collocation_sysid.result.terminal import summary
+from collocation_sysid.result.run_sections import summary
 
 SCALE = cs.NuisanceRow(
     "camera_scale", "1", 0.02, reading=lambda y, scale, t_s, data: (1 + scale) * y
@@ -97,12 +96,12 @@ def test_a_run_tells_of_it_and_the_verdict_judges_it():
     noise = 1e-4 * np.random.default_rng(2).normal(size=seen.markers.positions_m.shape)
     noisy = cs.with_markers(seen, seen.markers.positions_m + noise)
     finished = run(cs.Problem([noisy], GUESS, substeps=1), seek_causes=False)
-    (told,) = result(finished).nuisance["hung cube"].items()
+    (told,) = finished.result.nuisance["hung cube"].items()
     assert told[0] == "camera scale [1]"
     assert told[1].prior == 0.02
     assert abs(told[1].value - far * 0.02) < 3.5 * told[1].std_error < 0.01
     assert any("camera scale" in reason for reason in finished.trust.reasons)
-    said = " ".join(plain_text(summary(finished, Path("run"))).split())
+    said = " ".join(plain_text(summary(finished.result, Path("run"))).split())
     assert re.search(r"camera scale (9\.\d|10) % \(prior 2\)", said)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -179,10 +180,7 @@ def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
 
 
 def legend_of(places_m: np.ndarray, given_m: np.ndarray, seen) -> set[str]:
-    held = seen.held.any(axis=0)
-    figure = mesh_picture(
-        seen.undeformed_m, seen.surface, held, places_m, seen.marker_names, given_m=given_m
-    )
+    figure = mesh_picture(replace(seen, marker_places_m=places_m, given_places_m=given_m))
     keys = [child for child in figure.axes[0].get_children() if isinstance(child, Legend)]
     return {text.get_text() for each in keys for text in each.get_texts()}
 

@@ -22,7 +22,7 @@ from problems_small import (
     quadratic_bar,
     released_cube,
 )
-from results_small import a_result, lines, uncertainty, value
+from results_small import a_result, uncertainty, value
 
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
@@ -325,8 +325,7 @@ def test_what_lies_behind_the_body_is_hidden():
 def test_every_marker_is_named_once_on_the_mesh():
     seen = replay()
     names = [f"m{k}" for k in range(len(seen.marker_names))]
-    held = seen.held.any(axis=0)
-    figure = mesh_picture(seen.undeformed_m, seen.surface, held, seen.marker_places_m, names)
+    figure = mesh_picture(replace(seen, marker_names=names))
     written = [text.get_text() for text in figure.axes[0].texts]
     assert sorted(text for text in written if text.startswith("m")) == sorted(names)
 
@@ -341,9 +340,7 @@ def test_names_keep_their_order_and_a_distance():
 
 def test_shapes_stand_side_by_side_in_one_scale():
     seen = replay()
-    figure = shapes(
-        seen.t_s, seen.positions_m, seen.surface, seen.held, seen.measured_m, seen.up, count=3
-    )
+    figure = shapes(seen, 3)
     skins = [c for c in figure.axes[0].collections if isinstance(c, PolyCollection)]
     boxes = [np.vstack([path.vertices for path in skin.get_paths()]) for skin in skins]
     assert len(boxes) == 3
@@ -362,10 +359,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
     count = len(seen.surface)
     values = np.arange(1.0, 2 * count + 1).reshape(2, count)
     pressure = Field("pressure [Pa]", lambda positions_m: values[: len(positions_m)])
-    figure = shapes(
-        seen.t_s, seen.positions_m, seen.surface, seen.held, seen.measured_m, seen.up, 2,
-        field=pressure,
-    )  # fmt: skip
+    figure = shapes(seen, 2, pressure)
     sheet_axes = figure.axes[0]
     assert any(text.get_text() == "pressure [Pa]" for text in sheet_axes.texts)
     (bar,) = sheet_axes.child_axes
@@ -413,7 +407,7 @@ def told(covariance: np.ndarray | None = None) -> Result:
     pairs = zip(given.names, given.values.tolist(), strict=True)
     known = uncertainty(given.names, given.covariance if covariance is None else covariance)
     parameters = {name: value(each) for name, each in pairs}
-    return a_result(parameters, uncertainty=known, history=lines(history()))
+    return a_result(parameters, uncertainty=known, history=tuple(history()))
 
 
 @pytest.mark.parametrize("rho", [-0.95, 0.0, 0.8])
@@ -540,8 +534,8 @@ def test_an_experiment_can_be_read_back_from_its_arrays():
 def test_drawing_needs_no_display_and_leaves_pyplot_alone():
     code = (
         "import sys, collocation_sysid as c; assert 'matplotlib' not in sys.modules;"
-        "import collocation_sysid.result.animation, collocation_sysid.result.redraw as r;"
-        "from results_small import a_result; r.album([], a_result());"
+        "import collocation_sysid.result.animation; from results_small import a_result;"
+        "from collocation_sysid.result.pictures import album; album([], a_result());"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     here = Path(__file__).parent

@@ -187,7 +187,7 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
     rows = {level["halved"]: level["timesteps"] for level in kept["levels"]}
     assert rows == {"step": 4 * 8 + 1, "mesh": 2 * 8 + 1}
     assert run_command("report", folder).code == 0
-    assert "Numerical error" in Path(folder / "report.html").read_text()
+    assert "half the edges" in Path(folder / "report.html").read_text()
 
 
 def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeypatch):

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 from problem_files import TRUTH, pictures_drawn, run_command, settings, write_problem
-from results_small import ROLLOUT, a_result, value
+from results_small import ROLLOUT, a_result
 
+from collocation_sysid.display import plain_text
 from collocation_sysid.result.remedies import REMEDIES
-from collocation_sysid.result.report.run_page import verdict
+from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.result import Result, SimulatedExperiment
 from collocation_sysid.statistics.trust import Concern, Trust
 from collocation_sysid.tree import as_json
@@ -33,7 +34,9 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = folder / "run"
     method = settings("solver.method=reduced-space")
     with pictures_drawn():
-        assert run_command("solve", folder / "problem.toml", *method, "--out", out).code == 0
+        solved = run_command("solve", folder / "problem.toml", *method, "--out", out)
+    assert solved.code == 0
+    (folder / "printed.txt").write_text(solved.out)
     return out
 
 
@@ -109,24 +112,31 @@ def test_text_is_escaped(run_folder: Path, tmp_path: Path):
     assert "<script>" not in (copy / "report.html").read_text()
 
 
-def test_the_verdict_tells_how_well_parameters_are_identified():
-    def said(std_error: float | None) -> list[str]:
-        return verdict(a_result({"lambda_pa": value(100.0, std_error)}))
+def test_what_a_terminal_shows_is_on_the_page(page: str, run_folder: Path):
+    shown = plain_text(summary(Result.read(run_folder), run_folder)).splitlines()
+    text = Elements(page).text
+    assert sum("forward simulation 'swing': " in line for line in shown) == 1
+    for line in shown[:-1]:  # which names the folder
+        if not line.startswith(("residuals: ", "what to do: ")):  # a table and a section there
+            assert all(word in text for word in line.split())
 
-    assert "λ is least well, but well identified: ±2 %." in said(1.0)
-    assert "λ is weakly identified: ±39 %." in said(20.0)
-    assert "No error bar for λ: see the notes." in said(None)
-    assert "the forward simulation misses by 0.8 mm, at most 2 mm" in said(1.0)[-1]
+
+def test_a_result_read_back_is_shown_as_it_was(run_folder: Path):
+    """Nothing but the file is needed for what the terminal showed after the solve."""
+    printed = (run_folder.parent / "printed.txt").read_text()
+    shown = plain_text(summary(Result.read(run_folder), run_folder))
+    assert shown.split() == printed.split()
 
 
-def test_the_verdict_tells_of_failures_and_predictions():
+def test_failures_and_predictions_are_told():
     experiments = {
         "a": SimulatedExperiment(True, failed="no step"),
         "b": SimulatedExperiment(False, rms_m=3e-3, max_m=4e-3),
     }
-    said = verdict(a_result(rollout=replace(ROLLOUT, experiments=experiments)))
-    assert "The forward simulation of 'a' failed: no step." in said
-    assert "'b' was predicted, not fitted: 3 mm RMS." in said
+    told = a_result(rollout=replace(ROLLOUT, experiments=experiments))
+    said = plain_text(summary(told, Path("run"))).splitlines()
+    assert "forward simulation 'a': failed: no step" in said
+    assert "validation 'b': 3.000 mm RMS, at most 4.00 mm" in said
 
 
 def test_folders_without_a_run_are_refused(tmp_path: Path):
@@ -191,7 +201,7 @@ def test_a_comparison_has_a_page_too(comparison: Path):
 
 
 def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
-    (tmp_path / "summary.json").write_text('{"schema": 2, "kind": "compare"}')
+    (tmp_path / "summary.json").write_text('{"schema": 3, "kind": "compare"}')
     outcome = run_command("report", tmp_path)
     assert outcome.code == 2
     assert "summary.json is damaged" in outcome.err

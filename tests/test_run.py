@@ -13,7 +13,6 @@ from problem_files import TRUTH, run_command, settings, write_problem
 from collocation_sysid import Problem, run
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import read_markers, write_markers_csv
-from collocation_sysid.result.record import result
 from collocation_sysid.runs.forward_simulation import Rollout
 from collocation_sysid.runs.result import Result
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -70,7 +69,7 @@ def finished(two: Path):
 
 
 def test_nuisance_is_reported_with_unit_prior_and_error(finished):
-    nuisance = result(finished).nuisance["swing"]
+    nuisance = finished.result.nuisance["swing"]
     first = [nuisance[f"camera offset of low, {axis} [m]"] for axis in "xyz"]
     for found, truth in zip(first, OFFSET_M, strict=True):
         assert found.prior == 0.003
@@ -93,7 +92,7 @@ def test_the_material_is_found_within_its_error_bars(finished):
 
 
 def test_the_result_says_what_its_error_bars_are_based_on(finished):
-    found = content(result(finished))["uncertainty"]
+    found = content(finished.result)["uncertainty"]
     assert (found["noise"], found["errors"]) == ("given", "independent")
     assert found["reduced_chi_squared"] == pytest.approx(1.0, abs=0.3)
     assert np.shape(found["correlation"]) == (4, 4)
@@ -101,7 +100,7 @@ def test_the_result_says_what_its_error_bars_are_based_on(finished):
 
 
 def test_a_result_is_read_as_it_was_written(finished):
-    written = result(finished)
+    written = finished.result
     text = as_json(written)
     assert as_json(read(Result, json.loads(text))) == text
     assert "NaN" not in text
@@ -121,7 +120,7 @@ def test_a_result_is_read_as_it_was_written(finished):
     ],
 )
 def test_a_result_of_another_kind_is_not_read(finished, keys, value):
-    stored = place = content(result(finished))
+    stored = place = content(finished.result)
     for key in keys[:-1]:
         place = place[key]
     place[keys[-1]] = value
@@ -130,7 +129,7 @@ def test_a_result_of_another_kind_is_not_read(finished, keys, value):
 
 
 def test_every_marker_is_diagnosed(finished):
-    found = content(result(finished))["residuals"]
+    found = content(finished.result)["residuals"]
     assert [item["marker"] for item in found] == ["low", "mid", "side"]
     assert all(item["sentence"] for item in found)
     json.dumps(found)

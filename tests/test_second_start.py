@@ -9,8 +9,7 @@ import pytest
 from problems_small import hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.runs.second_start import NEARLY_INCOMPRESSIBLE, second_start
-from collocation_sysid.runs.solving import _from_elsewhere
+from collocation_sysid.runs.solving import NEARLY_INCOMPRESSIBLE, _from_elsewhere, second_start
 
 KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
 TRUTH = {"young_pa": 600.0, "poisson": 0.46, **KNOWN}

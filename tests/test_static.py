@@ -46,7 +46,8 @@ from collocation_sysid.recording import (
     displaced_axes,
     read_displacement,
 )
-from collocation_sysid.result.terminal import check_table, summary
+from collocation_sysid.result.check_sections import check_table
+from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import Rollout
@@ -459,7 +460,7 @@ def test_a_test_bench_without_markers_is_checked(tmp_path):
 
 def test_a_run_without_markers_speaks_of_forces(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)))
-    said = plain_text(summary(found, tmp_path))
+    said = plain_text(summary(found.result, tmp_path))
     assert " mm RMS" not in said
     assert re.search(r"wrench of 'press': \S+ N RMS \(sigma 0.01 N\)", said)
     assert re.search(r"forward simulation 'press': \S+ N RMS", said)

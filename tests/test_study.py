@@ -16,6 +16,7 @@ from collocation_sysid import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.plan import (
     PlannedRun,
     RunOptions,
@@ -32,7 +33,6 @@ from collocation_sysid.plan.progress import time_left_s
 from collocation_sysid.plan.study import short_keys
 from collocation_sysid.plan.table import Yardstick, method_rows, run_row, wilson_interval
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.result import HistoryLine
 from collocation_sysid.tree import as_json, content
 
 NAMES = tuple(TRUTH)
@@ -467,7 +467,7 @@ def answer(run: PlannedRun, factor: float = 1.0, status: str = "converged") -> d
         status=status,
         converged=status == "converged",
         iterations=7,
-        history=(HistoryLine(1, factor, 1e-3, 1e-9, {}, 0.1, 1.0),),
+        history=(Iteration(1, factor, 1e-3, 1e-9, {}, 0.1, 1.0),),
     )
     return {**run.as_dict(), "outcome": "finished", "result": content(found)}
 

@@ -14,7 +14,6 @@ from collocation_sysid.live.model import Model
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.record import result
 from collocation_sysid.runs.refine import refine
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.numerical import MOST_SUBSTEPS, Refinement, numerical_error
@@ -89,8 +88,8 @@ def test_it_is_told_what_was_chosen_and_why():
     many = finer.solution.collocation.substeps
     assert said.startswith("with one step a sample, the step moves ")
     assert said.endswith(f"solved again with {many}")
-    assert result(finer).problem.substeps == many
-    assert result(finer).iterations > found(3e-4, many).solution.iterations
+    assert finer.result.problem.substeps == many
+    assert finer.result.iterations > found(3e-4, many).solution.iterations
 
 
 def test_the_guess_and_the_way_from_it_are_kept():
@@ -189,7 +188,7 @@ def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
         assert f"{low:.5g} … {high:.5g}" in said
         assert "Verdict: check" in said
         assert "intervals cover the noise and the step, not the mesh" in said
-    found_mu = result(coarse).parameters["mu_pa"]
+    found_mu = coarse.result.parameters["mu_pa"]
     assert found_mu.ci95 == (low, high)
     assert found_mu.ci95_holds == ("noise", "step")
     assert found_mu.ci95_noise == coarse.noise_estimates["mu_pa"].ci95

@@ -17,9 +17,8 @@ from collocation_sysid import Run, run
 from collocation_sysid.display import plain_text
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.record import result
 from collocation_sysid.result.remedies import REMEDIES
-from collocation_sysid.result.terminal import summary
+from collocation_sysid.result.run_sections import summary
 from collocation_sysid.statistics.hypothesis import Hypothesis
 from collocation_sysid.statistics.trust import (
     SENTENCES,
@@ -227,8 +226,8 @@ def test_a_step_too_coarse_for_the_error_bars_is_not_good(substeps, good):
 def test_the_verdict_is_shown_stored_and_fed():
     found = judged("none")
     assert ", good: " in repr(found)
-    assert content(result(found))["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
-    lines = plain_text(summary(found, Path("runs"))).splitlines()
+    assert content(found.result)["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
+    lines = plain_text(summary(found.result, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
     assert "γ_r is that of damping = rayleigh, which also brakes rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]

@@ -140,11 +140,11 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     with np.load(folder / "trajectory.npz") as stored:
         assert stored["wrench_1"].shape == (21, 19)
     from collocation_sysid.display import plain_text
-    from collocation_sysid.result.redraw import redraw
-    from collocation_sysid.result.report import as_page, run_report
-    from collocation_sysid.result.terminal import summary
+    from collocation_sysid.result.pictures.album import redraw
+    from collocation_sysid.result.report import as_page
+    from collocation_sysid.result.run_sections import run_report, summary
 
-    said = plain_text(summary(run, folder))
+    said = plain_text(summary(run.result, folder))
     assert "wrench of 'hung cube'" in said
     assert "tare up to" in said
     assert "sensor late by" in said

@@ -12,7 +12,6 @@ from ..folders import require_possible, run_name
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import run
-from ..result.record import result
 from ..result.synthesis import Recipe, write_data
 from ..result.writers import require_replaceable
 from ..runs.check import check_problem, glance
@@ -67,7 +66,8 @@ def solve(options: Solve) -> None:
     Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods lists them.
     """
-    from ..result.terminal import Progress, summary
+    from ..result.progress import Progress
+    from ..result.run_sections import summary
 
     if options.method is not None:
         require_method(options.method, "--method")
@@ -81,9 +81,9 @@ def solve(options: Solve) -> None:
         progress.say("writing the run folder")
         finished.save(folder)
     if options.as_json:
-        typer.echo(as_json(result(finished)))
+        typer.echo(as_json(finished.result))
     else:
-        show(summary(finished, folder))
+        show(summary(finished.result, folder))
     status = finished.solution.status
     if status is Status.INTERRUPTED or finished.missing:
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -117,7 +117,7 @@ def simulate(options: Simulate) -> None:
     The markers' places are their reference_m, or follow from their file. The parameters are the
     guesses or fixed values: set others with --set.
     """
-    from ..result.terminal import Progress
+    from ..result.progress import Progress
 
     problem = options.read(simulation=True)
     require_possible(options.out)
@@ -155,7 +155,8 @@ def check(options: Check) -> None:
     Bodies, recordings and grasps are shown at once; derivatives, costs and the simulation at the
     guess follow, of the first samples where the whole takes more than some ten seconds.
     """
-    from ..result.terminal import Progress, closer_table, glance_table
+    from ..result.check_sections import closer_table, glance_table
+    from ..result.progress import Progress
 
     problem = options.read()
     if not options.as_json:

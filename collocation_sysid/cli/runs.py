@@ -44,7 +44,7 @@ def refine(options: Refine) -> None:
     solved before, as of a call that was interrupted, is not solved again.
     """
     from ..result.refined import refine_run
-    from ..result.terminal import refinement_table
+    from ..result.run_sections import refinement_table
 
     def say(what: str) -> None:
         if not options.quiet:
@@ -60,7 +60,7 @@ def refine(options: Refine) -> None:
     if options.as_json:
         typer.echo(as_json({**content(found), "trust": result.trust}))
     else:
-        show(refinement_table(found))
+        show(refinement_table(found.errors))
         for reason in result.trust.reasons:
             show(f"{result.trust.verdict}: {reason}")
 
@@ -93,8 +93,13 @@ def export(options: Export) -> None:
 
     Says what the target cannot express. By default in a folder export-TARGET of the run.
     """
-    from ..result.export import Identified, export_run, target_named, verify_export
-    from ..result.terminal import comparison_table, export_notes
+    from ..result.export import (
+        Identified,
+        comparison_table,
+        export_run,
+        target_named,
+        verify_export,
+    )
 
     target = target_named(options.to)
     folder = options.out or options.run_folder / f"export-{options.to}"
@@ -111,7 +116,8 @@ def export(options: Export) -> None:
         }
         typer.echo(as_json(told))
         return
-    show(export_notes(body.warnings, exported.limits))
+    show(f"warning: {each}" for each in body.warnings)
+    show(f"not expressed: {each}" for each in exported.limits)
     if options.verify:
         show(comparison_table(target.name, compared))
     typer.echo(folder)
@@ -127,7 +133,7 @@ class Plot(OfRun):
 @command(commands, "plot runs/swing")
 def plot(options: Plot) -> None:
     """Draw the pictures of a run again, from its files."""
-    from ..result.redraw import redraw
+    from ..result.pictures.album import redraw
 
     folder = options.out or options.run_folder
     require_possible(folder)
@@ -157,7 +163,8 @@ def report(options: Report) -> None:
 
     It holds everything that was found, and its pictures; Markdown links to them.
     """
-    from ..result.report import as_file, comparison_report, run_report
+    from ..result.report import as_file, comparison_report
+    from ..result.run_sections import run_report
 
     folder, file = options.folder, options.to or options.folder / "report.html"
     study = (folder / "summary.json").is_file()

@@ -21,7 +21,6 @@ from ..files import write_whole
 from ..pipeline import Run, run
 from ..problem import Problem
 from ..recording.grasp import held_nodes
-from ..result.record import result
 from ..runs.forward_simulation import Rollout
 from ..starting import heed_interrupts, leave
 from ..tree import as_json
@@ -50,7 +49,7 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
         return {
             "outcome": FINISHED,
             "message": finished.solution.message,
-            "result": result(finished),
+            "result": finished.result,
             "tip": _tip(finished),
         }
     except (InputError, SimulationError) as error:

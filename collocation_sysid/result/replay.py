@@ -56,7 +56,7 @@ LARGEST = 1e100
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Measured, fitted and rolled-out motion of an experiment; T samples, n nodes, M markers.
+    """Measured, fitted and simulated motion of an experiment; T samples, n nodes, M markers.
 
     Attributes
     ----------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import glob
 import os
 import platform
@@ -12,7 +11,8 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from typing import Any
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,9 +22,7 @@ from ..fem.elements import Element
 from ..files import RESULT_FILE, naming
 from .fields import ElementFields
 
-# Cell types of the VTK file format by meshio's names, which order nodes alike.
-VTK_CELL_TYPES = {"tetra": 10, "tetra10": 24}
-VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
+VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names
 MAX_FRAMES = 200
 FRAMES_FILE = "trajectory.pvd"
 
@@ -56,41 +54,24 @@ def write_vtu(
     InputError
         For an unknown cell type, or data of another length.
     """
+    import meshio  # which takes a while to import
+
     if meshio_type not in VTK_CELL_TYPES:
         raise InputError(
             f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}", path
         )
-    points = np.asarray(points_m, dtype=float)
-    nodes = np.asarray(cells, dtype=np.int64)
-    offsets = nodes.shape[1] * np.arange(1, len(nodes) + 1)
-    types = np.full(len(nodes), VTK_CELL_TYPES[meshio_type], dtype=np.uint8)
-    sections = (
-        ("PointData", _data_arrays("point", point_data or {}, len(points), path)),
-        ("CellData", _data_arrays("cell", cell_data or {}, len(nodes), path)),
-        ("Points", [_data_array("Points", points)]),
-        (
-            "Cells",
-            [
-                _data_array("connectivity", nodes.ravel()),
-                _data_array("offsets", offsets),
-                _data_array("types", types),
-            ],
-        ),
-    )
-    body = "".join(f"<{tag}>\n{''.join(arrays)}</{tag}>\n" for tag, arrays in sections)
-    Path(path).write_text(
-        '<?xml version="1.0"?>\n'
-        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" '
-        'header_type="UInt64">\n<UnstructuredGrid>\n'
-        f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{len(nodes)}">\n'
-        f"{body}</Piece>\n</UnstructuredGrid>\n</VTKFile>\n",
-        encoding="utf-8",
-    )
+    points, nodes = np.asarray(points_m, dtype=float), np.asarray(cells, dtype=np.int64)
+    at_points = _arrays("point", point_data or {}, len(points), path)
+    in_cells = _arrays("cell", cell_data or {}, len(nodes), path)
+    by_block: dict[str, Any] = {name: [array] for name, array in in_cells.items()}
+    mesh = meshio.Mesh(points, [(meshio_type, nodes)], {**at_points}, by_block)
+    meshio.vtu.write(path, mesh, compression="")
 
 
-def _data_arrays(
+def _arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
-) -> list[str]:
+) -> dict[str, NDArray]:
+    """Arrays of kinds that the format has, with a row each."""
     arrays = {name: np.asarray(values) for name, values in data.items()}
     for name, array in arrays.items():
         if array.ndim not in (1, 2) or len(array) != count:
@@ -99,20 +80,9 @@ def _data_arrays(
                 f"{count} {kind}s",
                 path,
             )
-    return [_data_array(name, array) for name, array in arrays.items()]
-
-
-def _data_array(name: str, values: NDArray) -> str:
-    kind = values.dtype.str[1:]
-    if kind not in VTK_TYPES:  # booleans, other integers and half precision
-        kind = "f8" if values.dtype.kind == "f" else "i8"
-    little = np.ascontiguousarray(values, dtype=f"<{kind}")
-    content = little.nbytes.to_bytes(8, "little") + little.tobytes()
-    components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
-    return (
-        f'<DataArray type="{VTK_TYPES[kind]}" Name={quoteattr(name)}{components} '
-        f'format="binary">{base64.b64encode(content).decode("ascii")}</DataArray>\n'
-    )
+        if array.dtype.kind == "b":
+            arrays[name] = array.astype(np.int8)
+    return {escape(name, {'"': "&quot;"}): array for name, array in arrays.items()}
 
 
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:

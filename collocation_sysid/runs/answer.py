@@ -26,6 +26,7 @@ from ..statistics.trust import Concern, Trust, cause_concerns, numerical_concern
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
+from .result import FoundValue
 from .verdict import concerns, expected_rms_m, motions_of
 
 
@@ -88,13 +89,24 @@ class Answer:
         return dict(Derived.of(constants, self.solution.q).values)
 
     @cached_property
-    def estimates(self) -> dict[str, Estimate]:
+    def estimates(self) -> dict[str, FoundValue]:
         """Parameters and derived moduli, with intervals for all that `interval_holds` names."""
         errors = {} if self.refinement is None else self.refinement.errors
-        return {
-            name: replace(estimate, ci95=errors[name].ci95) if name in errors else estimate
-            for name, estimate in self.noise_estimates.items()
-        }
+        items, values = {item.name: item for item in self.started_from.items}, {}
+        for name, by_noise in self.noise_estimates.items():
+            item, error = items.get(name), errors.get(name)
+            ci95 = by_noise.ci95 if error is None else error.ci95
+            guess, tied = item and item.guess, item and item.tied is not None
+            values[name] = FoundValue(
+                **vars(replace(by_noise, ci95=ci95)),
+                ci95_holds=() if ci95 is None else self.interval_holds,
+                ci95_noise=by_noise.ci95,
+                numerical_error=error,
+                guess=np.nan if item and guess is None else guess,
+                fixed=item and (item.fixed or tied),
+                tied=tied or None,
+            )
+        return values
 
     @property
     def interval_holds(self) -> tuple[str, ...]:
@@ -175,19 +187,17 @@ class Answer:
             pandas = import_module("pandas")
         except ImportError as error:
             raise InputError("a data frame needs pandas: pip install pandas") from error
-        items = self.started_from.items
-        guesses = {item.name: item.guess for item in items if item.tied is None}
         rows = {}
-        for name, estimate in self.estimates.items():
-            lower, upper = estimate.ci95 or (np.nan, np.nan)
+        for name, each in self.estimates.items():
+            lower, upper = each.ci95 or (np.nan, np.nan)
             rows[name] = {
-                "value": estimate.value,
-                "std_error": np.nan if estimate.std_error is None else estimate.std_error,
+                "value": each.value,
+                "std_error": np.nan if each.std_error is None else each.std_error,
                 "lower": lower,
                 "upper": upper,
-                "interval_holds": "" if estimate.ci95 is None else ", ".join(self.interval_holds),
+                "interval_holds": ", ".join(each.ci95_holds),
                 "verdict": self.trust.verdict,
-                "guess": guesses.get(name, np.nan),
+                "guess": np.nan if each.tied or each.guess is None else each.guess,
                 "unit": unit_of(name),
             }
         return pandas.DataFrame.from_dict(rows, orient="index")

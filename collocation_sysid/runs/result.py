@@ -9,7 +9,7 @@ from pathlib import Path
 from ..arrays import Array
 from ..errors import InputError
 from ..files import RESULT_FILE, damage_refused, read_json
-from ..methods.solution import Timing
+from ..methods.solution import Iteration, Timing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import NumericalError
@@ -20,7 +20,7 @@ from ..tree import optional, read
 
 @dataclass(frozen=True)
 class FoundValue(Estimate):
-    """A parameter or a modulus that follows from parameters; `guess` and `fixed` of the first.
+    """A parameter, or a modulus that follows from parameters; these have no `guess`.
 
     Attributes
     ----------
@@ -35,6 +35,7 @@ class FoundValue(Estimate):
     numerical_error: NumericalError | None = None
     guess: float | None = optional()
     fixed: bool | None = optional()
+    tied: bool | None = optional()
 
     @property
     def by_noise(self) -> Estimate:
@@ -106,14 +107,28 @@ class FoundScan:
 
 @dataclass(frozen=True)
 class FittedExperiment:
-    """How far an experiment's markers and wrenches are from the fit."""
+    """How far an experiment's markers and wrenches are from the fit.
+
+    Attributes
+    ----------
+    static : bool
+    beside : tuple of str
+        What was estimated of this recording alone, in words.
+    wrench_sigma_n, wrench_sigma_nm, reading_sigma
+        What is stated of the noise.
+    """
 
     rms_m: float
     samples: int
     missing: int
+    static: bool
+    beside: tuple[str, ...]
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
     reading_rms: Mapping[str, float] | None = optional()
+    wrench_sigma_n: float | None = optional()
+    wrench_sigma_nm: float | None = optional()
+    reading_sigma: Mapping[str, float] | None = optional()
 
 
 @dataclass(frozen=True)
@@ -174,19 +189,6 @@ class ProgramSize:
 
 
 @dataclass(frozen=True)
-class HistoryLine:
-    """An iterate, see `Iteration`, which has the same fields in the same order."""
-
-    iteration: int
-    loss: float
-    rms_m: float
-    violation_n: float
-    parameters: Mapping[str, float]
-    time_s: float
-    share: float
-
-
-@dataclass(frozen=True)
 class Provenance:
     """What made the result, of which problem."""
 
@@ -202,7 +204,10 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The content of ``result.json``, whose names are its keys."""
+    """The content of ``result.json``, whose names are its keys.
+
+    `basis` says what the values rest on: the law of the damping, and what sets the scale.
+    """
 
     schema: int
     status: str
@@ -214,6 +219,7 @@ class Result:
     title: str
     parameters: Mapping[str, FoundValue]
     derived: Mapping[str, FoundValue]
+    basis: tuple[str, ...]
     places: Mapping[str, Mapping[str, Place]]
     nuisance: Mapping[str, Mapping[str, FoundNuisance]]
     uncertainty: FoundUncertainty | None
@@ -227,7 +233,7 @@ class Result:
     timing_s: Timing
     problem: ProgramSize
     notes: tuple[str, ...]
-    history: tuple[HistoryLine, ...]
+    history: tuple[Iteration, ...]
     provenance: Provenance
 
     @classmethod
@@ -248,6 +254,17 @@ class Result:
     def values(self) -> dict[str, FoundValue]:
         """Parameters, then moduli that follow."""
         return {**self.parameters, **self.derived}
+
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """What the intervals hold: "noise", and of "step" and "mesh" what is known."""
+        return max((each.ci95_holds for each in self.values.values()), key=len, default=())
+
+    @property
+    def numerical_errors(self) -> dict[str, NumericalError]:
+        """What is known of them, by name."""
+        errors = ((name, each.numerical_error) for name, each in self.values.items())
+        return {name: error for name, error in errors if error is not None}
 
     def home(self, run: str | Path, needs: str) -> Path:
         """The folder of the problem file, which `needs` one.

@@ -8,15 +8,17 @@ from pathlib import Path
 
 from ..arrays import Array
 from ..errors import InputError
+from ..fem.constants import bare, usual_value
 from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import Scan, rescue, started
 from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.start import placed_at_guess
 from ..methods.workers import Workers, workers_of
+from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
-from .check.ram import require_memory
-from .second_start import USUAL, second_start
+from ..statistics.linearised import Derived
+from .check.cost import require_memory
 from .warm_start import Earlier
 
 # How a search ends that went astray; another start may help.
@@ -162,3 +164,38 @@ def read_where_found(
             break
         solution = solver(collocation, watch, collocation.pack(moved, positions))
     return solution
+
+
+# Linear elements lock towards ν = ½: with a smaller modulus and a ratio near one half a body can
+# move almost like a stiffer, compressible one. Beyond this Poisson's ratio an answer is looked for
+# from the usual one at the same Young's modulus too, and the better counts; less does not lock.
+NEARLY_INCOMPRESSIBLE, USUAL = 0.42, 0.3
+LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
+
+
+def second_start(solution: Solution) -> Parameters | None:
+    """The answer with other Poisson's ratios where those it found are high; None where none is.
+
+    Only ratios that were estimated count, by both of the moduli that tell them.
+    """
+    collocation, found = solution.collocation, solution.parameters
+    constants = (segment.constants for segment in collocation.segments)
+    values = {**Derived.of(constants, solution.q).values, **found}
+    free = {item.name: item for item in collocation.parameters.free}
+    changed: dict[str, float] = {}
+    for name, ratio in values.items():
+        if bare(name) == "poisson" and ratio > NEARLY_INCOMPRESSIBLE:
+            region = name.removesuffix("poisson")
+            own = [region + each for each in LAME if region + each in free]
+            if len(own) == 2 or own == [name]:
+                young_pa = values[region + "young_pa"]
+                changed |= {each: _usual(each, young_pa) for each in own}
+    if not changed or any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
+        return None
+    return collocation.parameters.with_guess({name: found[name] for name in free} | changed)
+
+
+def _usual(name: str, young_pa: float) -> float:
+    value = USUAL if bare(name) == "poisson" else usual_value(name, young_pa, USUAL)
+    assert value is not None
+    return value

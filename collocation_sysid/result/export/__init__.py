@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from ...display import Table
 from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...tree import as_json
@@ -77,6 +78,15 @@ def verify_export(body: Identified, to: str, folder: str | Path) -> Sequence[Com
         return target.verify(body, place)
 
 
+def comparison_table(name: str, compared: Sequence[Comparison]) -> Table:
+    """What a simulator predicts beside what we do."""
+    rows = []
+    for each in compared:
+        values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
+        rows.append((each.what, *values, f"{each.relative:+.2%}", each.remark))
+    return Table("", ("", name, "ours", "difference", ""), tuple(rows), names=5)
+
+
 def target_named(name: str) -> Target:
     """A target of the table.
 
@@ -98,6 +108,7 @@ __all__ = [
     "Exported",
     "Identified",
     "Target",
+    "comparison_table",
     "export_run",
     "target_named",
     "verify_export",

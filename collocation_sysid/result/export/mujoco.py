@@ -178,7 +178,7 @@ def _edge_m(body: Identified) -> float:
 
 
 def _start(body: Identified) -> str:
-    """Displacements and velocities at the first sample, as we roll it out."""
+    """Displacements and velocities at the first sample, as we simulate it."""
     free = ~_grasped(body)
     shape = body.nodes_m if body.rolled_out_m is None else body.rolled_out_m[0]
     given = body.experiment.start_velocities_m_s

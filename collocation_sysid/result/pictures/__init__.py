@@ -5,15 +5,12 @@ Positions are in metres, drawn in millimetres; names and sizes of type are of `r
 
 from .album import album, save_pictures
 from .confidence import Confidence, confidence_ellipses, correlation_matrix
-from .convergence import convergence
-from .elements import elements_picture
-from .errors import error_over_time
 from .jacobian import jacobian_sparsity
-from .mesh import mesh_picture
-from .scan import scan_picture
+from .mesh import elements_picture, mesh_picture
+from .over_time import error_over_time, tracks
+from .search import convergence, scan_picture
 from .shapes import shapes
 from .spectrum import spectrum
-from .tracks import tracks
 
 __all__ = [
     "Confidence",

@@ -1,4 +1,4 @@
-"""All pictures of a run, by file name."""
+"""All pictures of a run by file name, after a solve or from its files alone."""
 
 from __future__ import annotations
 
@@ -10,21 +10,16 @@ from matplotlib.figure import Figure
 
 from ...arrays import Array
 from ...files import safe_name, whole_file
-from ...methods.solution import Iteration
 from ...recording.wrench import COMPONENTS, UNITS
 from ...runs.result import Result
-from ..replay import Replay
+from ..replay import Replay, read_run, reading_run
 from ..style import RESOLUTION_DPI
 from .confidence import Confidence, confidence_ellipses, correlation_matrix
-from .convergence import convergence
-from .elements import elements_picture
-from .errors import error_over_time
-from .mesh import mesh_picture
-from .readings import readings_picture
-from .scan import scan_picture
+from .mesh import elements_picture, mesh_picture
+from .over_time import error_over_time, readings_picture, tracks
+from .search import convergence, scan_picture
 from .shapes import shapes
 from .spectrum import spectrum
-from .tracks import tracks
 
 
 def album(
@@ -40,9 +35,8 @@ def album(
     truth : mapping, optional
         See `convergence`.
     """
-    history = [Iteration(*vars(line).values()) for line in found.history]
     names = [name for name, item in found.parameters.items() if not item.fixed]
-    pictures = {"convergence": convergence(history, names, truth)} if history else {}
+    pictures = {"convergence": convergence(found.history, names, truth)} if found.history else {}
     if (scan := found.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
     confidence = Confidence.of(found)
@@ -50,29 +44,12 @@ def album(
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
     if replays:
-        pictures |= _of_body(replays[0])
+        body = replays[0]
+        pictures["mesh"] = mesh_picture(body)
+        pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
     for replay in replays:
         pictures |= _of_experiment(replay)
     return pictures
-
-
-def _of_body(replay: Replay) -> dict[str, Figure]:
-    return {
-        "mesh": mesh_picture(
-            replay.undeformed_m,
-            replay.surface,
-            np.asarray(replay.held.any(axis=0)),
-            replay.marker_places_m,
-            replay.marker_names,
-            replay.up,
-            replay.surface_parts,
-            replay.part_names,
-            replay.given_places_m,
-            replay.surface_nodes,
-            replay.tendons_m,
-        ),
-        "elements": elements_picture(replay.undeformed_m, replay.tetrahedra),
-    }
 
 
 def _of_experiment(replay: Replay) -> dict[str, Figure]:
@@ -93,10 +70,7 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
         names = [f"{name} {k + 1}" for k in range(count)] if count > 1 else [name]
         pictures[f"reading_{replay.name}_{name}"] = readings_picture(said, names)
     if replay.shapes_m is not None and np.isfinite(replay.shapes_m).all(axis=(1, 2)).any():
-        pictures[f"shapes_{replay.name}"] = shapes(
-            t_s, replay.shapes_m, replay.surface, replay.held, measured, replay.up,
-            surface_nodes=replay.surface_nodes,
-        )  # fmt: skip
+        pictures[f"shapes_{replay.name}"] = shapes(replay)
     return pictures
 
 
@@ -118,3 +92,16 @@ def save_pictures(folder: str | Path, pictures: Mapping[str, Figure]) -> list[Pa
             figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
         files.append(file)
     return files
+
+
+def redraw(run: str | Path, folder: str | Path) -> list[Path]:
+    """Write the pictures of a run folder into `folder`, all but that of the Jacobian.
+
+    Raises
+    ------
+    InputError
+        If `run` is not a run folder.
+    """
+    result, replays = read_run(run)
+    with reading_run(Path(run)):
+        return save_pictures(folder, album(replays, result))

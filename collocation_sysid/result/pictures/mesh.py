@@ -1,4 +1,4 @@
-"""The undeformed mesh with its grasped nodes and markers, from two opposite sides."""
+"""The undeformed mesh with grasped nodes and markers, from two sides; its elements counted."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import ArrayLike, NDArray
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from ...arrays import Array
-from ..style import BLUE, COLUMN_MM, SMALL_PT
+from ...fem.mesh_checks import edge_lengths, mean_ratios
+from ..replay import Replay
+from ..style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, dress, framed_figure
 from .camera import ELEVATION_DEG, Camera, Triangles
 from .scene import (
     Drawn,
@@ -42,40 +45,15 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 
 
-def mesh_picture(
-    nodes_m: Array,
-    surface: Triangles,
-    held: NDArray[np.bool_],
-    places_m: Array,
-    names: Sequence[str],
-    up: ArrayLike = (0.0, 0.0, 1.0),
-    parts: NDArray[np.integer] | None = None,
-    part_names: Sequence[str] = (),
-    given_m: Array | None = None,
-    surface_nodes: NDArray[np.integer] | None = None,
-    tendons_m: Array | None = None,
-) -> Figure:
+def mesh_picture(seen: Replay) -> Figure:
     """Draw the undeformed body from the front and from behind, with its markers' names.
 
-    Parameters
-    ----------
-    nodes_m : (n, 3)
-    surface : (F, 3)
-    held : (n,) bool, nodes that are grasped at any time
-    places_m : (M, 3) of the markers
-    names : (M,) str
-    up : (3,)
-    parts : (F,) the part of the body that each triangle belongs to
-    part_names : (P,) str
-    given_m : (M, 3), optional
-        The places that were given for the markers, NaN where there was none: a cross where a
-        marker was found elsewhere, and a frame about a marker without.
-    surface_nodes : (F, k), optional
-        The nodes of each triangle, its corners by default.
-    tendons_m : (p, 3), optional
-        Points of the tendons, a row of NaN after each; they are drawn through the body.
+    Tendons are drawn through the body. A cross is where a marker was given that was found
+    elsewhere, a frame about one that was not given.
     """
-    given_m = places_m if given_m is None else given_m
+    nodes_m, surface, up = seen.undeformed_m, seen.surface, seen.up
+    names, places_m, given_m = seen.marker_names, seen.marker_places_m, seen.given_places_m
+    held, part_names = np.asarray(seen.held.any(axis=0)), seen.part_names
     front = Camera.facing(nodes_m[None], up)
     behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
     everything = np.vstack([nodes_m, places_m, given_m])
@@ -87,7 +65,7 @@ def mesh_picture(
     width = (room - GAP_MM) / 2 if beside else room
     height = min(width / aspect, TALLEST_MM / (1 if beside else 2))
     elsewhere = not np.array_equal(given_m, places_m)
-    marked = elsewhere or tendons_m is not None
+    marked = elsewhere or seen.tendons_m is not None
     head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + marked)
     total = head + FOOT_MM + (height if beside else 2 * height + GAP_MM)
     figure, axes = sheet(COLUMN_MM, total)
@@ -99,10 +77,12 @@ def mesh_picture(
     views, unlike = [], set[str]()
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
         view = View.fitting(camera, everything, (width, height), corner)
-        Drawn(axes, view, surface, parts, surface_nodes).show(nodes_m, held, places_m)
+        Drawn(axes, view, surface, seen.surface_parts, seen.surface_nodes).show(
+            nodes_m, held, places_m
+        )
         unlike |= _draw_given(axes, view, places_m, given_m)
-        if tendons_m is not None:
-            axes.plot(*view.places(tendons_m).T, zorder=5.5, **LOOKS[TENDON])
+        if seen.tendons_m is not None:
+            axes.plot(*view.places(seen.tendons_m).T, zorder=5.5, **LOOKS[TENDON])
             unlike.add(TENDON)
         if named:
             dots = view.places(places_m[mine])
@@ -180,3 +160,39 @@ def apart(levels: Array, gap: float) -> Array:
             blocks[-1] += last
     means = [np.full(len(block), np.mean(block)) for block in blocks]
     return np.concatenate([*means, np.zeros(0)]) + steps
+
+
+BINS = 24
+
+
+def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
+    """Draw how many elements have which size and which quality.
+
+    The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l²: 1 for
+    the regular tetrahedron, towards 0 the flatter it is.
+
+    Parameters
+    ----------
+    nodes_m : (n, 3) undeformed
+    tetrahedra : (E, 4) corners
+    """
+    quality = np.minimum(mean_ratios(nodes_m, tetrahedra), 1.0)  # rounding
+    size_mm = 1e3 * np.sqrt((edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1))
+    figure = framed_figure(COLUMN_MM, 42, 13, 2, 9.5, 5.5)
+    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
+    widest = float(size_mm.max())
+    spread = np.ptp(size_mm) > 0.02 * widest
+    limits = (float(size_mm.min()), widest) if spread else (0.9 * widest, 1.1 * widest)
+    left.hist(size_mm, BINS, range=limits, color=BLUE)
+    right.hist(quality, BINS, range=(0.0, 1.0), color=BLUE)
+    worst = float(quality.min())
+    right.axvline(worst, color=VERMILION, lw=1.0)
+    dress(left, f"{len(tetrahedra)} elements", "size [mm]", "elements")
+    dress(right, f"worst {worst:.2f}", "quality, 1 = regular")
+    right.title.set_color(VERMILION)
+    for axes in (left, right):
+        axes.grid(False, axis="x")
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    left.xaxis.set_major_locator(MaxNLocator(4))
+    right.set_xticks((0.0, 0.5, 1.0))
+    return figure

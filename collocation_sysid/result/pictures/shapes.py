@@ -1,8 +1,8 @@
-"""A strip of the body's shapes over time, with the measured markers."""
+"""The body's shapes over time with the measured markers, in colours of its parts or of a field."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +12,14 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array
+from ...errors import InputError, hint_at
+from ...fem.body import Body
+from ..fields import ElementFields
+from ..replay import Replay
 from ..style import PAGE_MM, SMALL_PT
-from .camera import Camera, Triangles
+from .camera import Camera
 from .scene import Drawn, View, draw_directions, draw_key, draw_scale, key, sheet
 
 SHOWN = 6
@@ -42,44 +45,18 @@ class Field:
     at: Callable[[Array], Array]
 
 
-def shapes(
-    t_s: Array,
-    positions_m: Array,
-    surface: Triangles,
-    held: NDArray[np.bool_],
-    measured_m: Array,
-    up: ArrayLike = (0.0, 0.0, 1.0),
-    count: int = SHOWN,
-    surface_nodes: NDArray[np.integer] | None = None,
-    surface_parts: NDArray[np.integer] | None = None,
-    field: Field | None = None,
-) -> Figure:
-    """Draw the body at evenly spaced samples, side by side in one scale.
+def shapes(seen: Replay, count: int = SHOWN, field: Field | None = None) -> Figure:
+    """Draw `count` of the body's shapes at evenly spaced samples, side by side in one scale.
 
-    Heights are true; sideways the shapes are moved together.
-
-    Parameters
-    ----------
-    t_s : (T,)
-    positions_m : (T, n, 3)
-        Samples of a simulation that went astray, which are not finite, are left out.
-    surface : (F, 3)
-    held : (T, n) bool, grasped nodes
-    measured_m : (T, M, 3) NaN where missing
-    up : (3,)
-    count : int
-        How many shapes.
-    surface_nodes : (F, k), optional
-        The nodes of each triangle, its corners by default.
-    surface_parts : (F,), optional
-        The part of the body that each triangle belongs to.
-    field : Field, optional
-        Colours the triangles instead of their parts.
+    Heights are true; sideways the shapes are moved together. Samples of a simulation that went
+    astray, which are not finite, are left out. A field colours the body instead of its parts.
     """
+    t_s, positions_m, measured_m = seen.t_s, seen.shapes_m, seen.measured_m
+    assert positions_m is not None  # it was chosen among those that have some
     there = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
     shown = there[np.unique(np.linspace(0, len(there) - 1, count).astype(int))]
-    outer = positions_m[:, np.unique(surface)]
-    camera = Camera.facing(outer[there], up)
+    outer = positions_m[:, np.unique(seen.surface)]
+    camera = Camera.facing(outer[there], seen.up)
     places = camera.project(np.concatenate([outer[shown], measured_m[shown]], axis=1))
     left, right = np.nanmin(places[..., 0], axis=1), np.nanmax(places[..., 0], axis=1)
     low, high = float(np.nanmin(places[..., 1])), float(np.nanmax(places[..., 1]))
@@ -93,16 +70,16 @@ def shapes(
     start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, skin in zip(shown, left, right, skins, strict=True):
         view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
-        body = Drawn(axes, view, surface, surface_parts, surface_nodes)
-        body.show(positions_m[t], held[t], measured_m[t], skin)
+        body = Drawn(axes, view, seen.surface, seen.surface_parts, seen.surface_nodes)
+        body.show(positions_m[t], seen.held[t], measured_m[t], skin)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
         start += scale * (last - first) + gap
     draw_directions(axes, camera, (6.0, FOOT_MM + 3.0))
     draw_scale(axes, scale, (2.0, total - 2.5))
-    seen = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
-    draw_key(axes, key("grasped", *seen), (PAGE_MM * 0.3, total - 1.0))
+    marks = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
+    draw_key(axes, key("grasped", *marks), (PAGE_MM * 0.3, total - 1.0))
     return figure
 
 
@@ -120,3 +97,41 @@ def _coloured(axes: Axes, field: Field, positions_m: Array) -> Array:
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}
     axes.text(PAGE_MM - 1, height - 1.0, field.title, **end)
     return scale.to_rgba(values)[..., :3]
+
+
+FIELDS = {
+    "von_mises_pa": "von Mises stress [Pa]",
+    "energy_density_j_m3": "elastic energy [J/m³]",
+    "det_f": "volume over undeformed, det F",
+}
+# More would be too small to tell anything.
+MOST_SHAPES = 20
+
+
+def portrait(
+    replay: Replay, body: Body, constants: Mapping[str, float], field: str | None, count: int
+) -> Figure:
+    """Draw `count` of the replay's shapes, coloured by a field of its elements; see `FIELDS`.
+
+    Without a field the parts of the body have colours of their own.
+
+    Raises
+    ------
+    InputError
+        For an unknown field, or for no shapes or too many.
+    """
+    if not 1 <= count <= MOST_SHAPES:
+        raise InputError(f"count is {count}; expected 1 to {MOST_SHAPES} shapes")
+    if field is not None and field not in FIELDS:
+        expected = f"expected one of {', '.join(FIELDS)}{hint_at(field, list(FIELDS))}"
+        raise InputError(f"no field {field!r}; {expected}")
+    return shapes(replay, count, None if field is None else _on_surface(body, constants, field))
+
+
+def _on_surface(body: Body, constants: Mapping[str, float], field: str) -> Field:
+    elements, cells = ElementFields.of(body, body.theta(constants)), body.mesh.surface_cells
+
+    def at(positions_m: Array) -> Array:
+        return elements.at(positions_m)[field][:, cells]
+
+    return Field(FIELDS[field], at)

@@ -26,15 +26,12 @@ from ...statistics.hypothesis import Hypothesis
 from ...statistics.numerical import MOST_SUBSTEPS
 from ...statistics.scale import scale_notes, stillness_notes
 from ...statistics.trust import Concern, as_said, stability_concerns
-from .cost import Cost, cost_notes, cost_warnings, costs
+from .body import BodyFinding, ElementShape, Hold, body_finding, hold_warnings, holds_of
+from .cost import Cost, cost_notes, cost_warnings, costs, nonzeros
 from .derivatives import derivative_errors, shortened
 from .description import description_causes
-from .elements import ElementShape
-from .hold import Hold, hold_warnings, holds_of
 from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
 from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
-from .ram import nonzeros
-from .shape import BodyFinding, body_finding
 
 __all__ = [
     "BodyFinding",

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...recording.experiment import Experiment
-from .shape import BodyFinding
+from .body import BodyFinding
 
 # Of the mean edge length: beyond this, a marker's place is mostly extrapolation.
 FAR = 0.5

@@ -1,4 +1,4 @@
-"""What a method went through: error, loss, violation and parameters against iteration."""
+"""How a search went: the scan that it began from, and what the method went through."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from ..style import (
     COLUMN_MM,
     CYCLE,
     LINE_PT,
+    ORANGE,
     SMALL_PT,
     TEXT_PT,
     VERMILION,
@@ -124,3 +125,34 @@ def _positive(values: Sequence[float] | Array) -> Array:
     """Values with gaps where a logarithmic axis has no place for them."""
     array = np.asarray(values, dtype=float)
     return np.where((array > 0) & np.isfinite(array), array, np.nan)
+
+
+HEIGHT_MM = 52
+
+
+def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
+    """Draw a scan of the stiffness.
+
+    Parameters
+    ----------
+    young_pa : (k,) Young's moduli, ascending
+    misfit : (k,) in standard deviations, NaN where it could not be simulated
+    best : int
+        Position of the start.
+    """
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, 14, 2, 9.5, 6)
+    axes = figure.subplots()
+    axes.plot(young_pa, misfit, "o-", ms=2.5, lw=LINE_PT, color=BLUE, label="simulated")
+    dress(axes, "", "Young's modulus E [Pa]", "misfit [σ]")
+    axes.set_xscale("log")
+    log_axis(axes)
+    failed = np.isnan(misfit)
+    if failed.any():
+        foot = np.full(int(failed.sum()), axes.get_ylim()[0])
+        axes.plot(
+            young_pa[failed], foot, "x", ms=5, color=VERMILION, clip_on=False, zorder=3,
+            label="not simulable",
+        )  # fmt: skip
+    axes.plot(young_pa[best], misfit[best], "D", ms=5, color=ORANGE, zorder=3, label="start")
+    legend_above(axes, columns=3)
+    return figure

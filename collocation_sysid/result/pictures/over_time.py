@@ -1,16 +1,44 @@
-"""Coordinates of markers over time: measured, fitted, simulated, and what is left."""
+"""Markers and wrenches over time: measured, fitted, simulated, and what is left."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ...arrays import Array
-from ..style import BLACK, PAGE_MM, TEXT_PT, Picture, dress
-from .models import models
+from ..style import (
+    BLACK,
+    BLUE,
+    COLUMN_MM,
+    LINE_PT,
+    PAGE_MM,
+    TEXT_PT,
+    VERMILION,
+    Picture,
+    dress,
+    framed_figure,
+    legend_above,
+    log_axis,
+)
+
+
+def models(
+    fitted_m: Array | None, rolled_out_m: Array | None
+) -> list[tuple[str, Array, dict[str, Any]]]:
+    """Label, markers (T, M, 3) and style of the models that are there.
+
+    The dashes of the second leave the first visible where they agree.
+    """
+    named = (
+        ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
+        ("simulated", rolled_out_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
+    )
+    return [(label, model, style) for label, model, style in named if model is not None]
+
 
 Box = tuple[float, float, float, float]
 
@@ -117,3 +145,85 @@ def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> 
 
 def _chosen(shown: int, total: int) -> str:
     return "" if shown == total else f"{shown} of {total} markers, those with the largest errors"
+
+
+# Errors whose ratio is larger are drawn on a logarithmic axis.
+FAR_APART = 15.0
+
+
+def error_over_time(
+    t_s: Array, measured_m: Array, fitted_m: Array | None, rolled_out_m: Array | None = None
+) -> Figure:
+    """Draw the root mean square distance of the markers over time, fitted and simulated.
+
+    Parameters
+    ----------
+    t_s : (T,)
+    measured_m : (T, M, 3) NaN where missing
+        Samples at which every marker is missing leave a gap.
+    fitted_m, rolled_out_m : (T, M, 3) or None
+    """
+    figure = framed_figure(COLUMN_MM, 52, 13, 2, 9.5, 9)
+    axes = figure.subplots()
+    totals = []
+    for label, model_m, style in models(fitted_m, rolled_out_m):
+        squares = np.sum((model_m - measured_m) ** 2, axis=2)
+        if not np.isfinite(squares).any():
+            continue
+        totals.append(float(1e3 * np.sqrt(np.nanmean(squares))))
+        label = f"{label}: {totals[-1]:.3g} mm over all"
+        axes.plot(t_s, 1e3 * _rms_over_markers(squares), label=label, **style)
+    dress(axes, "", "time [s]", "RMS over markers [mm]")
+    if totals and max(totals) > FAR_APART * min(totals) > 0:
+        log_axis(axes)
+    else:
+        axes.set_ylim(bottom=0.0)
+    if totals:
+        legend_above(axes, columns=1)
+    return figure
+
+
+def _rms_over_markers(squares: Array) -> Array:
+    present = np.isfinite(squares)
+    total = np.where(present, squares, 0.0).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(total / present.sum(axis=1))
+
+
+HEIGHT_MM = 42.0
+
+
+def readings_picture(said: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
+    """Draw the numbers that are measured, three in a row, as force above torque.
+
+    Parameters
+    ----------
+    said : (S, 1 + 3m)
+        Time [s], and m numbers as measured, fitted and simulated, NaN where there are none.
+    names, units : (m,)
+    """
+    t_s, measured, fitted, rolled_out = np.split(
+        said, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
+    )
+    there = np.asarray(np.isfinite(measured).any(axis=0))
+    shown = [k for k in range(len(names)) if there[k - k % 3 : k - k % 3 + 3].any()]
+    columns = min(3, len(shown))
+    size = PAGE_MM / 25.4, HEIGHT_MM * -(-len(shown) // columns) / 25.4
+    figure = Picture(figsize=size, layout="constrained")
+    grid = figure.subplots(-(-len(shown) // columns), columns, sharex=True, squeeze=False)
+    drawn = models(*(each if np.isfinite(each).any() else None for each in (fitted, rolled_out)))
+    for k, each in zip(shown, grid.flat, strict=False):
+        last = k in shown[-columns:]
+        dress(each, names[k], "time [s]" if last else "", f"[{units[k]}]" if units else "")
+        each.yaxis.set_major_locator(MaxNLocator(4))
+        dots = {"ls": "", "marker": ".", "ms": 3.0, "color": BLACK, "mec": "none", "alpha": 0.5}
+        each.plot(t_s[:, 0], measured[:, k], label="measured", **dots)
+        for label, values, style in drawn:
+            each.plot(t_s[:, 0], values[:, k], label=label, **style)
+    for each in grid.flat[len(shown) :]:
+        each.set_visible(False)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper left", ncols=3, fontsize=TEXT_PT, frameon=False
+    )
+    return figure

@@ -1,16 +1,26 @@
-"""The page about a comparison of methods or a sweep, made from its folder alone."""
+"""Reports as files, self-contained HTML pages or Markdown; and that of a comparison of methods."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from ...display import Items, Line, Picture, Section, Table
-from ...files import damage_refused, read_json
-from ...tree import read
-from .page import own_pictures
+from ..display import (
+    Items,
+    Line,
+    Picture,
+    Section,
+    Table,
+    as_html,
+    as_markdown,
+    escape,
+    own_pictures,
+)
+from ..files import damage_refused, read_json
+from ..tree import read
 
 SUMMARY_FILE = "summary.json"
 CAPTIONS = {
@@ -46,18 +56,30 @@ def comparison_report(folder: str | Path) -> Section:
     folder = Path(folder)
     content = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
     with damage_refused(folder, SUMMARY_FILE, "repeat the study, finished runs are kept"):
-        found = read(StudySummary, content)
+        study = read(StudySummary, content)
         pictures = [Picture(f, CAPTIONS.get(f.stem, f.stem)) for f in own_pictures(folder)]
-        ended = {"Runs without an answer": [Items(found.failures)] if found.failures else []}
+        ended = {"Runs without an answer": [Items(study.failures)] if study.failures else []}
         titled = {**ended, "Pictures": pictures}
         return Section(
-            found.title,
+            study.title,
             (
-                Line(f"{len(found.runs)} runs of {found.problem}", "quiet"),
-                Section("", found.headline, style="verdict good"),
-                *(Line(note, "quiet") for note in found.notes),
-                *found.tables,
+                Line(f"{len(study.runs)} runs of {study.problem}", "quiet"),
+                Section("", study.headline, style="verdict good"),
+                *(Line(note, "quiet") for note in study.notes),
+                *study.tables,
                 *(Section(title, tuple(each)) for title, each in titled.items() if each),
             ),
             level=1,
         )
+
+
+def as_file(report: Section, file: Path) -> str:
+    """The content of a file: Markdown for ``.md``, else a page."""
+    return as_markdown([report]) if file.suffix == ".md" else as_page(report)
+
+
+def as_page(report: Section) -> str:
+    """One web page with its pictures inside."""
+    page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
+    page = page.replace("<!--TITLE-->", escape(report.title))
+    return page.replace("<!--BODY-->", as_html(report))

@@ -1,0 +1,169 @@
+"""What a check found, for a terminal."""
+
+from __future__ import annotations
+
+from ..display import Line, Shown, Table, labelled
+from ..fem.constants import symbol_of, unit_of
+from ..runs.check import BodyFinding, Findings, Glance, Recording
+from ..runs.check.body import hold_sentence
+from .run_sections import how_to
+
+SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
+
+
+def check_table(findings: Findings) -> list[Shown]:
+    """The findings of a check on one screen, warnings last."""
+    return [*glance_table(findings), *closer_table(findings)]
+
+
+def glance_table(found: Glance | Findings) -> list[Shown]:
+    """What a check sees at once."""
+    return [*map(_body_section, found.bodies), _measurements_section(found)]
+
+
+def closer_table(findings: Findings) -> list[Shown]:
+    """What follows it, warnings last."""
+    said = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
+    return [
+        *_motion_section(findings),
+        _solve_section(findings),
+        "",
+        *(
+            Table("", (), tuple((f"{kind}:", each) for each in sentences), texts=1, style=style)
+            for kind, (sentences, style) in said.items()
+            if sentences
+        ),
+        *how_to(findings.concerns),
+        _check_verdict(findings),
+    ]
+
+
+def _check_verdict(findings: Findings) -> Line:
+    if not findings.derivatives_agree:
+        return Line("The derivatives do not agree with differences at the guess.", "doubtful")
+    if findings.causes:
+        likeliest = findings.causes[0].sentence
+        said = f"The derivatives agree, but the description looks wrong: {likeliest}"
+        return Line(said, "doubtful")
+    return Line("The problem is valid and the derivatives agree.", "good")
+
+
+def _body_section(body: BodyFinding) -> Table:
+    size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
+    low, mean, high = (1e3 * x for x in body.edges_m)
+    worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
+    return labelled(
+        "Body",
+        {
+            "object": f"{size} mm, {1e6 * body.volume_m3:.4g} cm³, {1e3 * body.mass_kg:.4g} g",
+            "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
+            f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
+            "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
+        },
+    )
+
+
+def _motion_section(findings: Findings) -> list[Shown]:
+    if not findings.motions:  # equilibria only
+        return []
+    motion, *others = findings.motions
+    title = f"Modes of '{motion.experiment}' about its {motion.about} (they depend on the guess)"
+    heads = ("  Hz", "samples/period", "steps/period", "damping", "scheme adds", "period error")
+    rows = tuple(
+        (
+            f"{mode.frequency_hz:.3g}",
+            f"{mode.samples_per_period:.1f}",
+            f"{mode.steps_per_period:.1f}",
+            f"{mode.damping_ratio:.2g}",
+            f"{mode.numerical_damping_ratio:.2g}",
+            f"{mode.period_error:+.1%}",
+        )
+        for mode in motion.modes[:SHOWN_MODES]
+    )
+    firsts = [f"'{m.experiment}' {m.first.frequency_hz:.3g} Hz" for m in others if m.first]
+    more = [f"  first modes elsewhere: {_listed(firsts)}"] if firsts else []
+    return [Table(title, heads, rows, names=0), *more]
+
+
+def _measurements_section(findings: Glance | Findings) -> Table:
+    rows = {}
+    for recording in findings.recordings[:SHOWN_RECORDINGS]:
+        kind = ", validation" if recording.validation else ""
+        when = f"{recording.duration_s:.3g} s at {recording.rate_hz:.4g} Hz"
+        rows[f"'{recording.experiment}'"] = (
+            f"{'static' if recording.static else when}: {recording.frames} × "
+            f"{_markers_seen(recording)}{kind}"
+        )
+    if len(findings.recordings) > SHOWN_RECORDINGS:
+        rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+    for hold in findings.holds[:SHOWN_RECORDINGS]:
+        rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
+    return labelled("Measurements", rows)
+
+
+def _markers_seen(recording: Recording) -> str:
+    if not recording.markers:
+        return f"{', '.join(recording.instruments)}, no markers"
+    besides = "".join(f", {name}" for name in recording.instruments)
+    far, lost = recording.farthest, recording.least_seen
+    missing = (
+        f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"
+        if recording.missing
+        else "none missing"
+    )
+    return (
+        f"{len(recording.markers)} markers, {missing}; farthest from the body "
+        f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm{besides}"
+    )
+
+
+def _solve_section(findings: Findings) -> Table:
+    rows = {
+        "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
+            f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
+            for name, value in body.guess.items()
+        )
+        for body in findings.bodies
+    }
+    if findings.samples and findings.rms_at_guess_m is not None:
+        rows["at the guess"] = f"markers are missed by {1e3 * findings.rms_at_guess_m:.3g} mm RMS"
+    rows |= {
+        "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
+        f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
+    }
+    if findings.overstresses:
+        rows["memory"] = (
+            f"{findings.overstresses:,} more variables and constraints for interior-point, the "
+            "viscoelastic stress of every point, in these nonzeros"
+        )
+    if findings.wrenches:
+        rows["wrenches"] = (
+            f"{findings.wrenches:,} more variables and constraints for interior-point, what grasps "
+            "with a sensor give, in these nonzeros"
+        )
+    for cost in findings.costs:
+        chosen = ", chosen" if cost.method == findings.method else ""
+        rows[cost.method] = f"about {_duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"
+    rows["derivatives"] = (
+        f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
+        f"{findings.hessian_error:.0e} of differences"
+    )
+    return labelled("Solve", rows)
+
+
+def _duration(time_s: float | None) -> str:
+    if time_s is None:
+        return "an unknown time"
+    for unit, seconds in (("h", 3600), ("min", 60)):
+        if time_s >= 2 * seconds:
+            return f"{time_s / seconds:.2g} {unit}"
+    return f"{time_s:.1g} s" if time_s < 10 else f"{time_s:.0f} s"
+
+
+def _memory(memory_mb: float) -> str:
+    return f"{memory_mb / 1e3:.2g} GB" if memory_mb >= 1e3 else f"{memory_mb:.0f} MB"
+
+
+def _listed(items: list[str]) -> str:
+    shown = ", ".join(items[:SHOWN_RECORDINGS])
+    return shown if len(items) <= SHOWN_RECORDINGS else f"{shown}, …"

@@ -1,0 +1,394 @@
+"""A run described once, from its result: for a terminal, and with what is beside it for a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from ..display import (
+    Cards,
+    Line,
+    Listing,
+    Picture,
+    Section,
+    Shown,
+    Span,
+    Table,
+    flat,
+    own_pictures,
+    short,
+)
+from ..errors import listed
+from ..fem.constants import symbol_of, unit_of, with_unit
+from ..files import is_own
+from ..recording.nuisance import in_unit_for_people
+from ..runs.result import FoundValue, Result, SimulatedExperiment
+from ..statistics.numerical import NumericalError
+from ..statistics.trust import Concern
+from ..tree import content
+from .remedies import remedies_for
+from .replay import LARGEST, read_arrays, reading_run
+
+MEANINGS = {
+    "good": "nothing speaks against the answer and its error bars",
+    "check": "usable after a look at the reasons",
+    "doubtful": "something is wrong with the data, the model or the solve",
+}
+# What tells stiffness first, where there are several.
+FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
+# Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
+WORST, APART = 8, 5
+SHOWN_DIAGNOSES = 2
+
+CAPTIONS = {
+    "shapes": "The body at times of the recording; orange: measured markers.",
+    "mesh": "The mesh, its grasped nodes and the markers' places as found.",
+    "tracks": "Measured, fitted and simulated markers, the residual below.",
+    "wrench": "Wrench of a grasp: measured, fitted and simulated.",
+    "reading": "A reading of your own: measured, fitted and simulated.",
+    "error": "Distance of the markers from their measurements over time.",
+    "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
+    "confidence": "95 % confidence ellipses of pairs of parameters, for the noise.",
+    "correlation": "Correlation of the estimates.",
+    "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
+    "scan": "Scan of the stiffness for a start: misfit of the first part of the recordings.",
+    "elements": "Size and quality of the elements.",
+    "jacobian": "Structure of the constraints' Jacobian.",
+}
+
+
+def summary(result: Result, folder: Path) -> list[Shown]:
+    """A run on one screen."""
+    largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
+    ended = [f"residuals: {each.sentence}" for each in largest]
+    sections = (_ended(result), *answer(result), _fit(result), _notes(result))
+    return [*flat(sections), *ended, f"written to {folder}"]
+
+
+def answer(result: Result) -> list[Shown]:
+    """Verdict, values, intervals and what these hold."""
+    return [*flat([_verdict(result), *how_to(result.trust.concerns), _parameters(result)])]
+
+
+def run_report(run: str | Path) -> Section:
+    """What there is to say of a run folder.
+
+    Raises
+    ------
+    InputError
+        If it is not a run folder, or damaged.
+    """
+    run = Path(run)
+    result = Result.read(run)
+    with reading_run(run):
+        verdict, took_s = _verdict(result, linked=True), f"{result.timing_s.total:.3g} s"
+        took = f" {result.method}, {result.iterations} iterations, {took_s}"
+        badge = Span(result.status, f"badge {result.trust.verdict}")
+        meaning = Line(f"{MEANINGS[result.trust.verdict]}.", "quiet")
+        parts: list[Shown] = [
+            Line((badge, Span(took)), "quiet"),
+            replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
+            _cards(result),
+            *flat([_ended(result)]),
+            Section("What to do", tuple(_cures(result.trust.concerns))),
+            _parameters(result),
+            Section("Error bars", tuple(_error_bars(result))),
+            _fit(result),
+            _notes(result),
+            *_places(result),
+            *_nuisance(result),
+            Section("Residuals", tuple(_residuals(result, run))),
+            Section("Pictures", tuple(_pictures(run))),
+            Section("Problem and provenance", tuple(_provenance(result, run))),
+        ]
+        there = (each for each in parts if not isinstance(each, Section) or each.parts)
+        return Section(result.title or "Run", tuple(there), level=1)
+
+
+# What terminal and page show ----------------------------------------------------------------------
+
+
+def _ended(result: Result) -> Section:
+    """How the solve ended, and where it failed."""
+    parts: list[Shown] = [Line(result.message, result.trust.verdict)]
+    if not result.converged:
+        parts.append("Largest violations of the equations of motion:")
+        parts += [f"  {violation}" for violation in result.dynamics.largest]
+    return Section("", tuple(parts))
+
+
+def _verdict(result: Result, linked: bool = False) -> Section:
+    """In one word, with the reasons, linked to their cures on a page."""
+    verdict = result.trust.verdict
+    lines = [Line(f"Verdict: {verdict}", f"strong {verdict}")]
+    for concern in result.trust.concerns:
+        cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
+        said = (Span(f"  {concern.sentence}"), *[cure] * linked)
+        lines.append(Line(said, verdict))
+    return Section("", tuple(lines), style=f"verdict {verdict}")
+
+
+def how_to(concerns: Iterable[Concern]) -> list[Line]:
+    """The pages that say how to cure what gives concern."""
+    pages = dict.fromkeys(f"docs/howto/{r.page}.md" for r in remedies_for(concerns).values())
+    return [Line(f"what to do: {', '.join(pages)}", "quiet")] if pages else []
+
+
+def _parameters(result: Result) -> Section:
+    """Values with their intervals, what these hold, and what the values rest on."""
+    values, holds = result.values, result.holds
+    rows = tuple((with_unit(name), *_cells(each)) for name, each in values.items())
+    heads = ("", "value", "±", "95 % interval", "guess", "")
+    faint = tuple(range(len(result.parameters), len(values)))
+    parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
+    if holds:
+        moving = any(not each.static for each in result.fit.experiments.values())
+        left = [f"the {k}" for k in ("step", "mesh")[not moving :] if k not in holds]
+        said = f"intervals cover {listed(f'the {kind}' for kind in holds)}"
+        parts.append(said + (f", not {listed(left)}: see refine" if left else ""))
+    if "mesh" in holds:
+        parts.append(refinement_table(result.numerical_errors))
+    elif moved := [
+        f"{symbol_of(name)} {100 * (1 - error.extrapolated / values[name].value):+.2g} %"
+        for name, error in result.numerical_errors.items()
+        if values[name].value and values[name].std_error is not None
+    ]:
+        parts.append(f"the step moves, to first order: {', '.join(moved)}")
+    return Section("Parameters", (*parts, *result.basis))
+
+
+def _cells(value: FoundValue) -> tuple[str, ...]:
+    interval = _interval(value.ci95)
+    if value.at_bound:
+        interval = "at its bound"
+    elif value.reason:
+        interval = "not determined" if value.ci95 is None else "not identifiable"
+    spread = "" if value.std_error is None else f"{value.std_error:.2g}"
+    guess = "" if value.guess is None else f"{value.guess:.5g}"
+    if value.fixed:
+        guess = "tied" if value.tied else "fixed"
+    return f"{value.value:.5g}", spread, interval, guess, value.reason or ""
+
+
+def refinement_table(errors: Mapping[str, NumericalError]) -> Table:
+    """What step and mesh change, and intervals for noise and discretisation."""
+    halved = ("half the step", "order", "half the edges", "order")
+    rows = []
+    for name, e in errors.items():
+        step, mesh = ("" if x is None else f"{x:+.3g}" for x in (e.step, e.mesh))
+        first, second = ("" if x is None else f"{x:.1f}" for x in (e.step_order, e.mesh_order))
+        limit = f"{e.extrapolated:.5g}", _interval(e.ci95)
+        rows.append((with_unit(name), step, first, mesh, second, *limit))
+    return Table("", ("", *halved, "limit", "95 % interval"), tuple(rows))
+
+
+def _interval(ci95: tuple[float, float] | None) -> str:
+    return "" if ci95 is None else "{:.5g} … {:.5g}".format(*ci95)
+
+
+def _fit(result: Result) -> Section:
+    """How well the markers and the equations are met, how long that took, and what is beside."""
+    fit, timing, experiments = result.fit, result.timing_s, result.fit.experiments
+    marked = any(each.samples for each in experiments.values())
+    markers = f"markers: {_mm(fit.rms_m)} mm RMS, {_mm(fit.noise_rms_m)} mm from noise alone; "
+    violated = result.dynamics.max_violation_n, result.dynamics.max_violation_relative
+    dynamics = "equations of motion violated by at most {:.1e} N ({:.1e} of the largest force)"
+    lines = [markers * marked + dynamics.format(*violated)]
+    for name, each in experiments.items():
+        if sizes := _forces(each.wrench_rms_n, each.wrench_rms_nm):
+            sigma = _forces(each.wrench_sigma_n, each.wrench_sigma_nm)
+            lines.append(f"wrench of '{name}': {sizes} RMS (sigma {sigma})")
+        for reading, rms in (each.reading_rms or {}).items():
+            sigma = short((each.reading_sigma or {})[reading])
+            lines.append(f"{reading} of '{name}': {short(rms)} RMS (sigma {sigma})")
+    lines += [_simulated(name, each) for name, each in result.rollout.experiments.items()]
+    lines.append(
+        f"{result.iterations} iterations in {timing.total:.1f} s "
+        f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
+    )
+    for name, each in experiments.items():
+        if each.beside:
+            lines.append(f"also estimated for '{name}': {'; '.join(each.beside)}")
+    return Section("Fit", tuple(lines))
+
+
+def _simulated(name: str, simulated: SimulatedExperiment) -> str:
+    """How far a forward simulation is from the measurements."""
+    kind = "forward simulation" if simulated.fitted else "validation"
+    if simulated.failed is not None:
+        return f"{kind} '{name}': failed: {simulated.failed}"
+    forces = _forces(simulated.wrench_rms_n, simulated.wrench_rms_nm)
+    said = [f"{forces} RMS"] if forces else []
+    if simulated.rms_m:  # none without markers
+        most_mm = 1e3 * (simulated.max_m or 0.0)
+        said.insert(0, f"{_mm(simulated.rms_m)} mm RMS, at most {most_mm:.2f} mm")
+    said += [f"{reading} {rms:.2g} RMS" for reading, rms in (simulated.reading_rms or {}).items()]
+    return f"{kind} '{name}': {'; '.join(said)}"
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.3f}"
+
+
+def _forces(*sizes: float | None) -> str:
+    """Force and torque in words, "" where none is measured."""
+    pairs = zip(sizes, ("N", "N m"), strict=True)
+    return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
+
+
+def _notes(result: Result) -> Section:
+    return Section("Notes", tuple(f"note: {note}" for note in result.notes))
+
+
+# What the page alone has --------------------------------------------------------------------------
+
+
+def _cards(result: Result) -> Cards:
+    """The three numbers that matter: stiffness, misfit, and how well the answer repeats it."""
+    values, fit, simulated = result.values, result.fit, result.rollout
+    name = next((key for key in FOREMOST if key in values), next(iter(values)))
+    interval, value = values[name].ci95, f"{number(values[name].value, 4)} {unit_of(name)}"
+    known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
+    alone = f"RMS; noise alone leaves {millimetres(fit.noise_rms_m)}"
+    most = f"RMS; {millimetres(simulated.max_m)} at most"
+    return Cards(
+        (
+            (symbol_of(name), value.strip(), known),
+            ("markers, fitted", millimetres(fit.rms_m), alone),
+            ("markers, re-simulated", millimetres(simulated.rms_m), most),
+        )
+    )
+
+
+def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
+    for topic, remedy in remedies_for(concerns).items():
+        about, page = Span(f"{remedy.about}.", "strong"), f"docs/howto/{remedy.page}.md"
+        more = (Span(f" {remedy.cure} More in the how-to page "), Span(page, "code"), Span("."))
+        yield Line((about, *more), name=f"cure-{topic}")
+
+
+def _error_bars(result: Result) -> Iterator[Shown]:
+    if (known := result.uncertainty) is not None:
+        yield (
+            f"Error bars for {known.errors} errors, noise {known.noise}; reduced χ² "
+            f"{number(known.reduced_chi_squared, 3)}."
+        )
+
+
+def _places(result: Result) -> Iterator[Section]:
+    """By experiment the places of the markers in millimetres."""
+    said = (
+        "On the undeformed body, in millimetres, each with its standard error. Those that were not "
+        "given have a prior as wide as the body."
+    )
+    for experiment, places in result.places.items():
+        rows = []
+        for marker, place in places.items():
+            errors_m = [None] * 3 if place.std_error_m is None else place.std_error_m
+            cells = []
+            for x, error in zip(place.position_m, errors_m, strict=True):
+                cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
+            prior = "exact" if place.prior_m == 0 else _size(place.prior_m, "m")
+            rows.append((marker, *cells, prior, "" if place.given else "not given"))
+        heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
+        if rows:
+            table = Table("", heads, tuple(rows), texts=1)
+            title = f"Places of the markers of '{experiment}'"
+            yield Section(title, (Line(said, "quiet"), table))
+
+
+def _nuisance(result: Result) -> Iterator[Section]:
+    """By experiment its other nuisance parameters in units for people."""
+    said = "Of this recording alone, estimated beside the parameters with a prior about zero."
+    for experiment, named in result.nuisance.items():
+        rows = []
+        for label, each in named.items():
+            words, _, unit = label.rstrip("]").rpartition(" [")
+            sizes = (each.value, each.std_error, each.prior)
+            rows.append((words, *(_size(size, unit) for size in sizes)))
+        table = Table("", ("", "value", "±", "prior ±"), tuple(rows))
+        title = f"Nuisance parameters of '{experiment}'"
+        yield Section(title, (Line(said, "quiet"), table))
+
+
+def _residuals(result: Result, run: Path) -> Iterator[Shown]:
+    """What each marker's residuals suggest, and the largest errors."""
+    if result.residuals:
+        rows = tuple(
+            (
+                f"{each.experiment}/{each.marker}",
+                millimetres(each.rms_m),
+                str(each.samples),
+                each.sentence.partition(": ")[2] or each.sentence,
+            )
+            for each in result.residuals
+        )
+        yield Table("", ("marker", "RMS", "samples", "suggests"), rows, texts=1)
+    if worst := _worst_errors(run):
+        rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
+        yield from ("The largest errors:", Table("", ("marker", "time", "error"), rows))
+
+
+def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
+    """The largest residuals [m], with time and marker."""
+    arrays, worst = read_arrays(run), []
+    for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
+        prefix = key.removesuffix("residuals_m")
+        t_s, markers = arrays[f"{prefix}t_s"], arrays[f"{prefix}marker_names"]
+        shape, residuals_m = (len(t_s), len(markers), 3), arrays[key]
+        largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
+        if residuals_m.shape != shape or largest > LARGEST:
+            raise ValueError(f"{key} does not go with its times and markers")
+        errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
+        for _ in range(WORST if errors.size else 0):
+            t, m = np.unravel_index(int(errors.argmax()), errors.shape)
+            if not errors[t, m] > 0:
+                break
+            worst.append((float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}"))
+            errors[max(0, t - APART) : t + APART + 1, m] = 0
+    return sorted(worst, key=lambda each: -each[0])[:WORST]
+
+
+def _pictures(run: Path) -> Iterator[Picture]:
+    """Every PNG of the folder, those known here first."""
+    order = [*CAPTIONS, ""]
+
+    def kind(file: Path) -> str:
+        return next(k for k in order if file.stem.startswith(k))
+
+    for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):
+        about = file.stem.removeprefix(kind(file)).strip("_")
+        caption = CAPTIONS.get(kind(file), file.stem)
+        yield Picture(file, f"{about}: {caption}" if about and kind(file) else caption)
+
+
+def _provenance(result: Result, run: Path) -> Iterator[Shown]:
+    rows = content(result.problem) | content(result.provenance)
+    yield Table("", (), tuple((key, str(each)) for key, each in rows.items()), texts=1)
+    file = run / "problem.toml"
+    if is_own(run, file):
+        yield Listing("The problem file as run", file.read_text(encoding="utf-8"))
+
+
+def _size(value: float | None, unit: str) -> str:
+    """A number in the unit that suits it: millimetres, milliseconds or degrees."""
+    factor, shown = in_unit_for_people(1.0, unit)
+    # No powers of ten for the sizes of bodies.
+    digits = 2 if value is None or abs(factor * value) < 99.5 else 4
+    return "–" if value is None else f"{number(factor * value, digits)}{shown}"
+
+
+def number(value: float | None, digits: int = 5) -> str:
+    """A number as people write it; a dash for none."""
+    if value is None or not isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def millimetres(metres: float | None) -> str:
+    """A length in millimetres, to the micrometre at most."""
+    return "–" if metres is None or not isfinite(metres) else f"{1e3 * metres:.3g} mm"

@@ -1,0 +1,298 @@
+"""A body as it will be simulated: size, mesh, what its elements do to the answer, its grasps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...arrays import Array
+from ...fem.body import Body
+from ...fem.mesh import TetMesh
+from ...fem.mesh_checks import edge_lengths, mean_ratios
+from ...fem.moduli import engineering
+from ...recording.experiment import Experiment
+from ...recording.grasp import Grasp
+
+# Mean-ratio quality below which an element's shape functions are poor.
+FLAT = 0.1
+# Too stiff from this Poisson's ratio on: linear tetrahedra cannot keep their volume and bend;
+# with quadratic ones a beam's stiffness is found 6 % too low at 0.45, and 12 % at 0.49.
+LOCKING_POISSON = {"tet4": 0.4, "tet10": 0.45}
+# 0.45 by way of E, λ and μ may be a little less.
+ROUND_OFF = 1e-9
+# A body this many times as long as thick bends. Linear elements need this many across it, and where
+# the dilatation is averaged one across sags by half too much, two by 4 to 8 %.
+SLENDER, CELLS_ACROSS = 2.5, {"tet4": 4.0, "tet10-p0": 2.0}
+LINEAR = "tet4"
+FOR_BENDING, FOR_VOLUME = 'set object.element = "tet10"', 'set object.element = "tet10-p0"'
+
+_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+
+
+@dataclass(frozen=True)
+class ElementShape:
+    """How far an element is from the regular tetrahedron.
+
+    Attributes
+    ----------
+    element : int
+        Its number, counted from 0.
+    quality : float
+        Mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is.
+    aspect_ratio : float
+        Longest edge over smallest height: 1.22 for the regular tetrahedron.
+    longest_edge_m : float
+    """
+
+    element: int
+    quality: float
+    aspect_ratio: float
+    longest_edge_m: float
+
+
+@dataclass(frozen=True)
+class Slenderness:
+    """How slender a body is, and how many elements share its thickness.
+
+    Attributes
+    ----------
+    length_m, thickness_m : float
+    cells_across : float
+        Thickness over the size of a cell of six tetrahedra.
+    """
+
+    length_m: float
+    thickness_m: float
+    cells_across: float
+
+
+def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
+    """The elements of lowest quality, worst first."""
+    corners = mesh.points_m[mesh.tetrahedra]
+    areas = [_areas(corners[:, face]) for face in _FACES]
+    heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
+    quality = mean_ratios(mesh.points_m, mesh.tetrahedra)
+    longest = edge_lengths(mesh.points_m, mesh.tetrahedra).max(axis=1)
+    return tuple(
+        ElementShape(int(e), float(quality[e]), float(longest[e] / heights[e]), float(longest[e]))
+        for e in np.argsort(quality, kind="stable")[:count]
+    )
+
+
+def slenderness(mesh: TetMesh) -> Slenderness:
+    """Length and thickness of a body, and elements across."""
+    # Edges of the box with the same second moments, however it is turned.
+    edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
+    # A bent or hollow body is thinner than its extents: six times volume over surface is a cube's
+    # edge, and more than the thickness of beams and plates.
+    area = float(_areas(mesh.points_m[mesh.surface]).sum())
+    thickness = min(float(edges[0]), 6 * mesh.volume_m3 / area)
+    cell = float(np.cbrt(6 * np.median(mesh.volumes_m3)))
+    return Slenderness(float(edges[-1]), thickness, thickness / cell)
+
+
+def element_warnings(
+    body: Body, theta: Array, shape: Slenderness, worst: ElementShape
+) -> list[str]:
+    """What the elements will do to the answer, one sentence each."""
+    warnings = []
+    if worst.quality < FLAT:
+        warnings.append(
+            f"element {worst.element} is nearly flat (mean-ratio quality {worst.quality:.2g}, "
+            f"aspect ratio {worst.aspect_ratio:.0f}), which makes the body stiffer and Newton's "
+            "steps short: improve the mesh there"
+        )
+    name = body.element.name
+    poisson = max(engineering(*lame)[1] for lame in body.lame(theta).values())
+    if name in LOCKING_POISSON and poisson >= LOCKING_POISSON[name] - ROUND_OFF:
+        warnings.append(
+            f"Poisson's ratio is {poisson:.3g} at the guess and {name} elements lock from "
+            f"{LOCKING_POISSON[name]:g} on, so that the stiffness found will be too low: "
+            f"{FOR_VOLUME}"
+        )
+    needed = CELLS_ACROSS.get(name, 0.0)
+    if shape.length_m > SLENDER * shape.thickness_m and shape.cells_across < needed - ROUND_OFF:
+        off, found = ("stiff", "low") if name == LINEAR else ("soft", "high")
+        instead = f"{FOR_BENDING}, or refine" if name == LINEAR else "refine"
+        warnings.append(
+            f"only about {shape.cells_across:.1f} {name} elements lie across the body's "
+            f"{1e3 * shape.thickness_m:.3g} mm, too {off} in bending, so that the stiffness found "
+            f"of a real body will be too {found} (not of data simulated with these elements, which "
+            f"are as {off}): {instead} the mesh to {needed:.0f} or more"
+        )
+    return warnings
+
+
+def _covariance(mesh: TetMesh) -> Array:
+    """Mean of (x − x̄)(x − x̄)ᵀ over the volume, (3, 3) [m²]."""
+    shares = mesh.volumes_m3 / mesh.volume_m3
+    corners = mesh.points_m[mesh.tetrahedra]
+    corners = corners - shares @ corners.mean(axis=1)
+    # Over a tetrahedron the mean of x xᵀ is (Σ xᵢ xᵢᵀ + Σ xᵢ Σ xᵢᵀ) / 20.
+    sums = corners.sum(axis=1)
+    squares = np.einsum("e,eci,ecj->ij", shares, corners, corners)
+    return (squares + np.einsum("e,ei,ej->ij", shares, sums, sums)) / 20
+
+
+def _areas(triangles: Array) -> Array:
+    """Areas of triangles (k, 3, 3)."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.linalg.norm(normals, axis=1) / 2
+
+
+@dataclass(frozen=True)
+class BodyFinding:
+    """One body.
+
+    Attributes
+    ----------
+    experiments : tuple of the names of those that it is in
+    element : str
+    size_m : extents along the axes
+    edges_m : shortest, mean and longest edge
+    worst_elements : tuple of ElementShape, worst first
+    cells_across : float
+        Elements that share the body's thickness.
+    guess : mapping of the constants, and of E and ν at small strain, to their values at the guess
+    warnings : tuple of str
+        What the elements will do to the answer, one sentence each.
+    """
+
+    experiments: tuple[str, ...]
+    nodes: int
+    elements: int
+    element: str
+    volume_m3: float
+    mass_kg: float
+    size_m: tuple[float, float, float]
+    edges_m: tuple[float, float, float]
+    smallest_element_quality: float
+    median_element_quality: float
+    worst_elements: tuple[ElementShape, ...]
+    cells_across: float
+    guess: dict[str, float]
+    warnings: tuple[str, ...]
+
+    @property
+    def diagonal_m(self) -> float:
+        """Length of the diagonal of its bounding box."""
+        return float(np.linalg.norm(self.size_m))
+
+
+def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyFinding:
+    """Measure a body, with the constants θ at the guess."""
+    mesh = body.mesh
+    quality, worst, shape = mesh.quality(), worst_elements(mesh), slenderness(mesh)
+    x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
+    return BodyFinding(
+        experiments,
+        nodes=len(body.nodes_m),
+        elements=len(body.cells),
+        element=body.element.name,
+        volume_m3=mesh.volume_m3,
+        mass_kg=float(body.mass_of_dofs(theta).sum()) / 3,
+        size_m=(x, y, z),
+        edges_m=(quality.edge_min_m, quality.edge_mean_m, quality.edge_max_m),
+        smallest_element_quality=quality.quality_min,
+        median_element_quality=quality.quality_median,
+        worst_elements=worst,
+        cells_across=shape.cells_across,
+        guess=_guess(body, theta),
+        warnings=tuple(element_warnings(body, theta, shape, worst[0])),
+    )
+
+
+def _guess(body: Body, theta: Array) -> dict[str, float]:
+    moduli = {}
+    for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
+        young, poisson = engineering(*lame)
+        moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
+    return moduli | dict(zip(body.constants, theta.tolist(), strict=True))
+
+
+# Of the mean edge: nodes this near the held ones' box belong to it or not by chance.
+NEAR = 0.1
+ROUND_OFF = 1e-6
+# Neighbours of the held nodes are no farther from their box than so many edges.
+NEIGHBOURING = 1.5
+
+
+@dataclass(frozen=True)
+class Hold:
+    """The nodes of one grasp.
+
+    Attributes
+    ----------
+    experiment : str
+    nodes : int
+    low_m, high_m : (3,) corners of the box around them, on the undeformed body
+    share : float
+        Of all nodes.
+    nearly_held : int
+        Free nodes beside it that are less than a tenth of an edge beyond one of its faces.
+    nearly_free : int
+        Held nodes less than a tenth of an edge behind a face that the body goes on beyond, and
+        not in it.
+    axes : str
+        Along which it holds.
+    """
+
+    experiment: str
+    nodes: int
+    low_m: tuple[float, ...]
+    high_m: tuple[float, ...]
+    share: float
+    nearly_held: int
+    nearly_free: int
+    axes: str = "xyz"
+
+
+def holds_of(experiment: Experiment, mean_edge_m: float) -> tuple[Hold, ...]:
+    """One for each grasp."""
+    points_m = experiment.body.nodes_m
+    return tuple(_hold(experiment.name, points_m, g, mean_edge_m) for g in experiment.grasps)
+
+
+def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
+    nodes = grasp.nodes
+    held, free = points_m[nodes], np.delete(points_m, nodes, axis=0)
+    low, high = held.min(axis=0), held.max(axis=0)
+    outside_m = np.concatenate([low - free, free - high], axis=1)
+    beside = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOURING * mean_edge_m
+    # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
+    inner = (outside_m > 0).any(axis=0)
+    depth_m = np.concatenate([held - low, high - held], axis=1)[:, inner]
+    least_m, reach_m = ROUND_OFF * mean_edge_m, NEAR * mean_edge_m
+    slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & beside[:, None]
+    slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
+    return Hold(
+        name,
+        len(nodes),
+        tuple(low.tolist()),
+        tuple(high.tolist()),
+        len(nodes) / len(points_m),
+        int(slightly_outside.any(axis=1).sum()),
+        int(slightly_inside.any(axis=1).sum()),
+        grasp.axes,
+    )
+
+
+def hold_sentence(hold: Hold) -> str:
+    """What a grasp holds."""
+    size = " × ".join(f"{1e3 * (b - a):.4g}" for a, b in zip(hold.low_m, hold.high_m, strict=True))
+    low = ", ".join(f"{1e3 * x:.4g}" for x in hold.low_m)
+    along = "" if hold.axes == "xyz" else f", along {' and '.join(hold.axes)} only"
+    return f"{hold.nodes} nodes, {hold.share:.0%} of all, in {size} mm from ({low}) mm on{along}"
+
+
+def hold_warnings(hold: Hold) -> list[str]:
+    """Whether it is a matter of chance which nodes are held."""
+    if not hold.nearly_held and not hold.nearly_free:
+        return []
+    return [
+        f"the grasp of '{hold.experiment}' cuts through elements: with its box a tenth of an edge "
+        f"larger it holds {hold.nearly_held} nodes more than {hold.nodes}, or as much smaller "
+        f"{hold.nearly_free} less, and the stiffness found depends on them; move the edge of "
+        "grasp.nodes between layers of nodes, or mesh the body with a layer where the fingers end"
+    ]
