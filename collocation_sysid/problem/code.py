@@ -27,11 +27,11 @@ def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -
     InputError
         See `load_function`; or if the function is no energy density, see `Material.of`.
     """
-    file, found = load_function(section.file, section.function, folder, f"{key}.file", allowed)
-    if isinstance(found, Material):
-        return found
+    file, loaded = load_function(section.file, section.function, folder, f"{key}.file", allowed)
+    if isinstance(loaded, Material):
+        return loaded
     with located(file):
-        return Material.of(cast(Energy, found), section.function)
+        return Material.of(cast(Energy, loaded), section.function)
 
 
 def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool) -> NodeForce:
@@ -42,12 +42,12 @@ def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool)
     InputError
         See `load_function`; or if the function is no force, see `NodeForce.of`.
     """
-    file, found = load_function(section.file, section.function, folder, f"{key}.file", allowed)
+    file, loaded = load_function(section.file, section.function, folder, f"{key}.file", allowed)
     nodes = None if section.nodes is None else selection(section.nodes)
-    if isinstance(found, NodeForce):
-        return found if nodes is None else replace(found, nodes=nodes)
+    if isinstance(loaded, NodeForce):
+        return loaded if nodes is None else replace(loaded, nodes=nodes)
     with located(file):
-        return NodeForce.of(found, nodes=nodes, name=section.function, on=section.on)
+        return NodeForce.of(loaded, nodes=nodes, name=section.function, on=section.on)
 
 
 def load_function(
@@ -61,15 +61,15 @@ def load_function(
         If running code is not allowed, the file or the function is not there, or the file fails.
     """
     file, names = _run(name, folder, key, allowed)
-    found = names.get(function)
-    if not callable(found) and not isinstance(found, NodeForce):
+    loaded = names.get(function)
+    if not callable(loaded) and not isinstance(loaded, NodeForce):
         functions = [n for n, v in names.items() if callable(v) and not n.startswith("_")]
         raise InputError(
             f"there is no function {function!r}; expected one of "
             f"{', '.join(functions) or 'none'}{hint_at(function, functions)}",
             file,
         )
-    return file, cast(Callable[..., Any], found)
+    return file, cast(Callable[..., Any], loaded)
 
 
 def load_row(section: OwnRow, folder: Path, key: str, allowed: bool) -> NuisanceRow:
@@ -81,15 +81,15 @@ def load_row(section: OwnRow, folder: Path, key: str, allowed: bool) -> Nuisance
         If running code is not allowed, the file or the row is not there, or the file fails.
     """
     file, names = _run(section.file, folder, f"{key}.file", allowed)
-    found = names.get(section.row)
-    if not isinstance(found, NuisanceRow):
+    row = names.get(section.row)
+    if not isinstance(row, NuisanceRow):
         rows = [name for name, value in names.items() if isinstance(value, NuisanceRow)]
         raise InputError(
             f"there is no NuisanceRow {section.row!r}; expected one of "
             f"{', '.join(rows) or 'none'}{hint_at(section.row, rows)}",
             file,
         )
-    return found
+    return row
 
 
 def _run(name: str, folder: Path, key: str, allowed: bool) -> tuple[Path, dict[str, Any]]:

@@ -12,7 +12,7 @@ from .schema import ObjectSection, ParameterSection, RegionSection
 Given = Mapping[str, ParameterSection | float]
 
 
-def completed(section: ObjectSection, given: Given) -> ObjectSection:
+def completed(section: ObjectSection, parameters: Given) -> ObjectSection:
     """[object] with the guesses of densities that it leaves out.
 
     Raises
@@ -20,10 +20,10 @@ def completed(section: ObjectSection, given: Given) -> ObjectSection:
     InputError
         Where neither tells the body's mass.
     """
-    regions = [_weighed(region, given) for region in section.region]
-    found: dict[str, object] = {"region": regions}
+    regions = [_weighed(region, parameters) for region in section.region]
+    changes: dict[str, object] = {"region": regions}
     if section.mass_kg is None and section.density_kg_m3 is None:
-        guesses = {name: _guess(given, name) for name in (DENSITY.name, MASS.name)}
+        guesses = {name: _guess(parameters, name) for name in (DENSITY.name, MASS.name)}
         known = {name: guess for name, guess in guesses.items() if guess is not None}
         if len(known) != 1:
             which = " and ".join(known) or f"no {MASS.name} or {DENSITY.name}"
@@ -31,11 +31,11 @@ def completed(section: ObjectSection, given: Given) -> ObjectSection:
                 f"found {which}; expected exactly one of {MASS.name}, {DENSITY.name}, here or with "
                 "a guess in [parameters]"
             )
-        found |= known
-    return section.model_copy(update=found)
+        changes |= known
+    return section.model_copy(update=changes)
 
 
-def guessed(given: Given, body: Body) -> dict[str, ParameterSection | float]:
+def guessed(parameters: Given, body: Body) -> dict[str, ParameterSection | float]:
     """[parameters] with the densities that [object] states as guesses, where there are none."""
     return {
         name: section.model_copy(update={"guess": _stated(body, name)})
@@ -43,21 +43,21 @@ def guessed(given: Given, body: Body) -> dict[str, ParameterSection | float]:
         and is_density(name)
         and section.fixed is None
         and section.tied_to is None
-        and _guess(given, name) is None
+        and _guess(parameters, name) is None
         else section
-        for name, section in given.items()
+        for name, section in parameters.items()
     }
 
 
-def _weighed(region: RegionSection, given: Given) -> RegionSection:
+def _weighed(region: RegionSection, parameters: Given) -> RegionSection:
     if region.density_kg_m3 is not None:
         return region
-    guess = _guess(given, f"{region.name}.{DENSITY.name}")
+    guess = _guess(parameters, f"{region.name}.{DENSITY.name}")
     return region.model_copy(update={DENSITY.name: guess})
 
 
-def _guess(given: Given, name: str) -> float | None:
-    section = given.get(name)
+def _guess(parameters: Given, name: str) -> float | None:
+    section = parameters.get(name)
     if not isinstance(section, ParameterSection):
         return section
     if section.guess is None and section.prior is not None:

@@ -52,14 +52,16 @@ def contents_of(
         )
     folder = path.parent if folder is None else Path(folder)
     mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
-    given = file.parameters
+    unknowns = file.parameters
     body = _located(
         path,
         "object",
-        lambda: _load_body(completed(file.object, given), mesh, folder, allow_code),
+        lambda: _load_body(completed(file.object, unknowns), mesh, folder, allow_code),
     )
-    body = body.with_free_densities(body.weighed_by(given))
-    parameters = _located(path, "parameters", lambda: _load_parameters(guessed(given, body), body))
+    body = body.with_free_densities(body.weighed_by(unknowns))
+    parameters = _located(
+        path, "parameters", lambda: _load_parameters(guessed(unknowns, body), body)
+    )
     odd = _located(path, "object", lambda: [oddity.sentence for oddity in oddities(body)])
     experiments, notes = [], []
 
@@ -147,10 +149,10 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
 
 
 def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: bool) -> Body:
-    def material(given: str | CodeSection, key: str) -> str | Material:
-        if isinstance(given, CodeSection):
-            return load_material(given, folder, key, allow_code)
-        return given
+    def material(law: str | CodeSection, key: str) -> str | Material:
+        if isinstance(law, CodeSection):
+            return load_material(law, folder, key, allow_code)
+        return law
 
     regions = [
         Region(
@@ -184,8 +186,8 @@ def _branches(section: ObjectSection, region: str | None) -> list[str]:
     return [branch.name for branch in section.prony if branch.region == region]
 
 
-def _load_parameters(given: Mapping[str, ParameterSection | float], body: Body) -> Parameters:
-    parameters = Parameters.of({name: _stated(name, section) for name, section in given.items()})
+def _load_parameters(sections: Mapping[str, ParameterSection | float], body: Body) -> Parameters:
+    parameters = Parameters.of({name: _stated(name, section) for name, section in sections.items()})
     parameters.fit([body])
     return parameters
 

@@ -117,21 +117,21 @@ def nuisance_of(
     """The defaults, with what the table says otherwise, and rows of the user's own."""
     if section == "none":
         return Nuisance.none()
-    found: dict[str, float | None] = {}
+    deviations: dict[str, float | None] = {}
     scope: dict[str, str] = {}
     assert isinstance(section, NuisanceSection)
     for key, rows in KEYS.items():
-        given = getattr(section, key)
-        if given == "none":
-            found |= {row.name: None for row in rows}
-        elif given is not None:
-            known = {row.name: getattr(given, row.prior) for row in rows}
+        prior = getattr(section, key)
+        if prior == "none":
+            deviations |= {row.name: None for row in rows}
+        elif prior is not None:
+            known = {row.name: getattr(prior, row.prior) for row in rows}
             # A scope alone leaves the deviations as they are.
-            found |= known if any(known.values()) else {}
-            if given.scope != "recording":
-                scope |= {row.name: given.scope for row in rows}
+            deviations |= known if any(known.values()) else {}
+            if prior.scope != "recording":
+                scope |= {row.name: prior.scope for row in rows}
     tables: list[OwnRow] = vars(section)["own"]
     own = [row_of(each) for each in tables]
     said = {row.name: each.scope for row, each in zip(own, tables, strict=True)}
     scope |= {name: word for name, word in said.items() if word != "recording"}
-    return Nuisance(**found, scope=scope, own=own)
+    return Nuisance(**deviations, scope=scope, own=own)

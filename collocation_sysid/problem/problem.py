@@ -23,8 +23,8 @@ from ..statistics.scale import scale_notes, stillness_notes
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
-def _as_parameters(given: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
-    return given if isinstance(given, Parameters) else Parameters.of(given)
+def _as_parameters(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
+    return parameters if isinstance(parameters, Parameters) else Parameters.of(parameters)
 
 
 @stated
@@ -207,10 +207,10 @@ class Problem:
 
 def _weighed(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[Experiment, ...]:
     """The experiments with bodies whose densities are free where parameters give them."""
-    found, experiments = {}, tuple(experiments)
+    weighed, experiments = {}, tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():
-        found[id(body)] = body.with_free_densities(body.weighed_by(parameters.names))
+        weighed[id(body)] = body.with_free_densities(body.weighed_by(parameters.names))
     return tuple(
-        e if found[id(e.body)] is e.body else replace(e, body=found[id(e.body)])
+        e if weighed[id(e.body)] is e.body else replace(e, body=weighed[id(e.body)])
         for e in experiments
     )

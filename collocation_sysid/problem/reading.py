@@ -123,10 +123,10 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
     reason, _, place = complaint.rpartition(" (at ")
     reason = _PLAINER.get(reason, reason)
-    found = re.match(r"line (\d+)", place)
-    if found is None:
+    matched = re.match(r"line (\d+)", place)
+    if matched is None:
         return InputError(f"not valid TOML: {reason or complaint}, at its end", path)
-    number = int(found[1])
+    number = int(matched[1])
     line = excerpt(text.splitlines()[number - 1].strip())
     return InputError(f"not valid TOML: {reason} in: {line}", path, f"line {number}")
 

@@ -332,8 +332,10 @@ class RecordingReader:
         """The tracks asked for, without the gripper's markers and those of weight 0."""
         markers = self.section.markers
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
-            given = getattr(markers, key)
-            _refuse_unknown(given if isinstance(given, dict) else (), table.names, f"markers.{key}")
+            by_name = getattr(markers, key)
+            _refuse_unknown(
+                by_name if isinstance(by_name, dict) else (), table.names, f"markers.{key}"
+            )
         unweighted = [name for name in table.names if markers.weights.get(name) == 0]
         if unweighted:
             self._note(f"left out, with the weight 0: {', '.join(unweighted)}")
@@ -428,8 +430,8 @@ def _among(at_s: Array, t_s: Array) -> NDArray[np.bool_]:
     All of a sensor that was read at other times.
     """
     apart_s = np.abs(at_s[:, None] - t_s).min(axis=1)
-    found = apart_s <= TIME_TOLERANCE_S
-    return found if found.any() else np.ones(len(at_s), dtype=bool)
+    near = apart_s <= TIME_TOLERANCE_S
+    return near if near.any() else np.ones(len(at_s), dtype=bool)
 
 
 def _each(values: Mapping[str, float] | float, names: Sequence[str], usual: float) -> Array:
@@ -438,8 +440,8 @@ def _each(values: Mapping[str, float] | float, names: Sequence[str], usual: floa
     return np.array([by_name.get(name, usual) for name in names])
 
 
-def _refuse_unknown(given: Iterable[str], names: Sequence[str], key: str) -> None:
-    for name in given:
+def _refuse_unknown(asked: Iterable[str], names: Sequence[str], key: str) -> None:
+    for name in asked:
         if name not in names:
             hint = hint_at(name, names)
             raise InputError(

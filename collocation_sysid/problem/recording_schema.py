@@ -445,7 +445,7 @@ def _at_least_three(places: dict[str, Any], key: str) -> None:
         )
 
 
-def _all_among(given: dict[str, Any], names: dict[str, Any], key: str) -> None:
-    for name in given:
+def _all_among(asked: dict[str, Any], names: dict[str, Any], key: str) -> None:
+    for name in asked:
         if name not in names:
             raise ValueError(f"found {name!r} in {key}; expected names among {', '.join(names)}")

@@ -252,12 +252,12 @@ class ParameterSection(Section):
         return self
 
 
-def _flat(given: Any, *, front: str = "") -> Any:
+def _flat(tables: Any, *, front: str = "") -> Any:
     """Regions' parameters, ``core.mu_pa``, also where they are written as tables in a table."""
-    if not isinstance(given, dict):
-        return given
+    if not isinstance(tables, dict):
+        return tables
     flat: dict[str, Any] = {}
-    for name, value in given.items():
+    for name, value in tables.items():
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
         whole = f"{front}{name}"
         inner = _flat(value, front=f"{whole}.") if nested and value else {whole: value}
@@ -321,8 +321,8 @@ class ProblemFile(Section):
 def completed(content: Any) -> Any:
     """The content of a problem file with what its experiments share in each of them."""
     shared = content.get("experiment_defaults") if isinstance(content, dict) else None
-    given = content.get("experiment") if isinstance(content, dict) else None
-    if not (isinstance(shared, dict) and isinstance(given, list)):
+    experiments = content.get("experiment") if isinstance(content, dict) else None
+    if not (isinstance(shared, dict) and isinstance(experiments, list)):
         return content
-    whole = [shared | table if isinstance(table, dict) else table for table in given]
+    whole = [shared | table if isinstance(table, dict) else table for table in experiments]
     return content | {"experiment": whole}

@@ -60,21 +60,21 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
     InputError
         If the values are not whole numbers from 0 upwards, or their shape differs.
     """
-    given = np.asarray(values)
-    if given.size and not np.issubdtype(given.dtype, np.integer):
-        raise InputError(f"{name} must hold node numbers (integers), not {given.dtype}")
-    _require_shape(given.shape, shape, name)
-    nodes = given.astype(np.int64)
+    numbers = np.asarray(values)
+    if numbers.size and not np.issubdtype(numbers.dtype, np.integer):
+        raise InputError(f"{name} must hold node numbers (integers), not {numbers.dtype}")
+    _require_shape(numbers.shape, shape, name)
+    nodes = numbers.astype(np.int64)
     if nodes.size and nodes.min() < 0:
         raise InputError(f"{name} must hold node numbers from 0 upwards, not {nodes.min()}")
     nodes.setflags(write=False)
     return nodes
 
 
-def _require_shape(found: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:
-    matches = len(found) == len(expected) and all(
-        want is None or have == want for have, want in zip(found, expected, strict=True)
+def _require_shape(shape: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:
+    matches = len(shape) == len(expected) and all(
+        want is None or have == want for have, want in zip(shape, expected, strict=True)
     )
     if not matches:
         wanted = ", ".join("any" if want is None else str(want) for want in expected)
-        raise InputError(f"{name} has the shape {found}; expected ({wanted})")
+        raise InputError(f"{name} has the shape {shape}; expected ({wanted})")

@@ -318,12 +318,12 @@ class Experiment:
         """(M,) standard deviation of each marker's place, zero where it is exact."""
         markers = self.markers
         usual = self.nuisance.marker_offset_m or 0.0
-        given = np.full(len(markers.names), usual)
+        sigma_m = np.full(len(markers.names), usual)
         if markers.places_sigma_m is not None:
             own = markers.places_sigma_m
-            given = np.where(np.isfinite(own), own, usual)
+            sigma_m = np.where(np.isfinite(own), own, usual)
         body_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
-        return np.where(markers.located, given, body_m)
+        return np.where(markers.located, sigma_m, body_m)
 
     def _check_kind(self) -> None:
         if not self.static:
@@ -417,7 +417,7 @@ class Experiment:
                 f"loaded_since_s is given, but start is '{self.start}'; it says how long a body "
                 "that starts in equilibrium has been loaded"
             )
-        given = self.start_positions_m is not None or self.start_velocities_m_s is not None
+        stated = self.start_positions_m is not None or self.start_velocities_m_s is not None
         if self.start == "given":
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
@@ -425,7 +425,7 @@ class Experiment:
                 vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
-        elif given:
+        elif stated:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
         if self.start == "equilibrium":
             self._refuse_free_motions()

@@ -98,8 +98,8 @@ class Grasp:
         nodes, poses = on_body(self.nodes, body), self.poses
         if not isinstance(poses, PoseSequence):
             poses = PoseSequence.from_matrices(t_s, poses)
-        given = nodes is self.nodes and poses is self.poses
-        return self if given else replace(self, nodes=nodes, poses=poses)
+        placed = nodes is self.nodes and poses is self.poses
+        return self if placed else replace(self, nodes=nodes, poses=poses)
 
     @cached_property
     def columns(self) -> Index:

@@ -174,11 +174,11 @@ def _archive(path: str | Path) -> tuple[Array, Array]:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
     except (ValueError, OSError, zipfile.BadZipFile) as error:
         raise InputError(f"is not a NumPy archive of numbers: {error}", path) from error
-    found = {key: array.shape for key, array in arrays.items()}
-    shape = found.get("t_s", ())
-    if len(shape) != 1 or found.get("matrices") != (*shape, 4, 4) or not shape[0]:
+    shapes = {key: array.shape for key, array in arrays.items()}
+    shape = shapes.get("t_s", ())
+    if len(shape) != 1 or shapes.get("matrices") != (*shape, 4, 4) or not shape[0]:
         raise InputError(
-            f"holds {', '.join(f'{key} {size}' for key, size in found.items()) or 'nothing'}; "
+            f"holds {', '.join(f'{key} {size}' for key, size in shapes.items()) or 'nothing'}; "
             "expected t_s (T,) and matrices (T, 4, 4)",
             path,
         )

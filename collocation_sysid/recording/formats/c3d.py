@@ -44,12 +44,12 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     except Failed as error:
         raise InputError(f"is a damaged C3D file: ezc3d says '{error}'", path) from error
     points = read.pop("points")  # (3, points, frames)
-    for what, stated, found in (
+    for what, stated, count in (
         ("points", points_stated, points.shape[1]),
         ("frames", frames_stated, points.shape[2]),
     ):
-        if stated is not None and found != stated:
-            raise InputError(f"the header states {stated} {what}, but {found} are there", path)
+        if stated is not None and count != stated:
+            raise InputError(f"the header states {stated} {what}, but {count} are there", path)
     labels = _labels(read)
     if len(labels) != points.shape[1]:
         raise InputError(
@@ -101,8 +101,8 @@ def _stated_counts(path: str | Path, content: bytes) -> tuple[int, int | None]:
     return points, frames
 
 
-def _labels(found: Mapping[str, NDArray]) -> list[str]:
+def _labels(parameters: Mapping[str, NDArray]) -> list[str]:
     """Labels of the points; those beyond the 255th stand in LABELS2, LABELS3 …"""
-    keys = [key for key in found if key.startswith("LABELS")]
+    keys = [key for key in parameters if key.startswith("LABELS")]
     ordered = sorted(keys, key=lambda key: int(key.removeprefix("LABELS") or 1))
-    return [str(label).strip() for key in ordered for label in found[key]]
+    return [str(label).strip() for key in ordered for label in parameters[key]]

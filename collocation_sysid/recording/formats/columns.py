@@ -129,11 +129,11 @@ def read_columns(
     grid = read_grid(path, decode(read_bytes(path), path))
     if "t_s" in grid.columns and not mapped:
         _refuse_unknown(grid, wanted, all_of)
-    found = _found(grid, wanted, mapped or {})
-    t = found.pop(TIME.key, None)
-    if len(found) < (len(wanted) if all_of else 1) or (timed and t is None):
+    places = _found(grid, wanted, mapped or {})
+    t = places.pop(TIME.key, None)
+    if len(places) < (len(wanted) if all_of else 1) or (timed and t is None):
         raise _other_columns(grid, wanted, all_of)
-    values = {key: _values(grid, column, blank_allowed) for key, column in found.items()}
+    values = {key: _values(grid, column, blank_allowed) for key, column in places.items()}
     if t is None:
         return Columns(grid, np.arange(float(len(grid.rows))), values)
     return Columns(grid, times_of(grid, *t), values)

@@ -84,18 +84,18 @@ def _marker_columns(
     path: str | Path, heads: Sequence[tuple[str, str, str, str]], line: int
 ) -> dict[str, _Columns]:
     """The columns of every marker by its name, measured ones before solved ones."""
-    found: dict[tuple[str, str], dict[str, int]] = {}
+    by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):
         if not kind.endswith(_MEASURED) or quantity != "Position":
             continue
-        axes = found.setdefault((name, kind), {})
+        axes = by_kind.setdefault((name, kind), {})
         if axis in axes:
             raise InputError(
                 f"two markers are named '{name}'; expected names that differ", path, f"line {line}"
             )
         axes[axis] = column
     columns: dict[str, _Columns] = {}
-    for (name, kind), axes in found.items():
+    for (name, kind), axes in by_kind.items():
         if sorted(axes) != ["X", "Y", "Z"]:
             raise InputError(
                 f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z",

@@ -45,8 +45,8 @@ def read_grid(path: str | Path, text: str) -> Grid:
 
 def _first_of_numbers(rows: Sequence[Row]) -> int:
     """Which row is the first that holds several cells of numbers only; 0 where none does."""
-    found = (k for k, r in enumerate(rows) if len(r.cells) > 1 and _holds_numbers(r.cells))
-    return next(found, 0)
+    numeric = (k for k, r in enumerate(rows) if len(r.cells) > 1 and _holds_numbers(r.cells))
+    return next(numeric, 0)
 
 
 def _holds_numbers(cells: Sequence[str]) -> bool:
