@@ -94,14 +94,6 @@ class Element:
         return element_named, (self.name,)
 
 
-def _linear_functions(barycentric: Array) -> Array:
-    return np.asarray(barycentric, dtype=float)
-
-
-def _linear_gradients(barycentric: Array) -> Array:
-    return np.broadcast_to(np.eye(4), (len(barycentric), 4, 4))
-
-
 _TET10 = Element(
     name="tet10",
     nodes=10,
@@ -119,8 +111,8 @@ ELEMENTS: dict[str, Element] = {
     "tet4": Element(
         name="tet4",
         nodes=4,
-        shape_functions=_linear_functions,
-        shape_gradients=_linear_gradients,
+        shape_functions=lambda L: np.asarray(L, dtype=float),
+        shape_gradients=lambda L: np.broadcast_to(np.eye(4), (len(L), 4, 4)),
         points=np.full((1, 4), 0.25),
         weights=np.ones(1),
         mass_shares=np.full(4, 0.25),

@@ -71,7 +71,9 @@ def _tetrahedra(
     points_m = np.asarray(data.points, dtype=float) * metres
     blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
     if not blocks:
-        raise InputError(_explain_no_tetrahedra(counts))
+        filled = "; a closed surface can be filled by TetMesh.from_surface"
+        hint = filled if "triangle" in counts else ""
+        raise InputError(f"no tetrahedra in this file, found {_listed(counts)}{hint}")
     notes = _note_left_out(counts)
     quadratic = [block.data for block in blocks if block.type == "tetra10"]
     if quadratic:
@@ -102,9 +104,10 @@ def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray
     metres = length_in_metres(length_unit)
     with _reading(path) as data:
         fans = [
-            _fan(np.asarray(block.data, dtype=np.int64))
+            np.asarray(block.data, dtype=np.int64)[:, [0, corner, corner + 1]]
             for block in data.cells
             if block.type in ("triangle", "quad", "polygon") and len(block.data)
+            for corner in range(1, block.data.shape[1] - 1)
         ]
         if not fans:
             raise InputError(f"no triangles in this file, found {_listed(_cell_counts(data))}")
@@ -249,11 +252,6 @@ def _triangle_sets(data: Any, arrays: Mapping[str, Any]) -> Arrays:
     return found
 
 
-def _fan(polygons: np.ndarray) -> np.ndarray:
-    corners = range(1, polygons.shape[1] - 1)
-    return np.concatenate([polygons[:, [0, i, i + 1]] for i in corners])
-
-
 def _cell_counts(data: Any) -> Counter[str]:
     counts: Counter[str] = Counter()
     for block in data.cells:
@@ -272,8 +270,3 @@ def _note_left_out(counts: Mapping[str, int]) -> tuple[str, ...]:
     solid = any(name.startswith(_SOLID_CELLS) for name in others)
     warning = ": that part of the body is missing" if solid else ""
     return (f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",)
-
-
-def _explain_no_tetrahedra(counts: Mapping[str, int]) -> str:
-    surface = "; a closed surface can be filled by TetMesh.from_surface" * ("triangle" in counts)
-    return f"no tetrahedra in this file, found {_listed(counts)}{surface}"

@@ -278,7 +278,7 @@ class Model:
     def used_names(self, known: Sequence[str]) -> set[str]:
         """Those of the names that are known which give its constants."""
         own = {name for source in self.sources(known) for name in source.names.values()}
-        return own | self._of_forces
+        return own | {c.name for force in self.forces for c in force.constants}
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -289,10 +289,6 @@ class Model:
             owns.append(DENSITY.name)
             names += [part.full_name(own) for own in owns] + owns
         return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
-
-    @property
-    def _of_forces(self) -> set[str]:
-        return {c.name for force in self.forces for c in force.constants}
 
     def assembled(self, values: Mapping[str, Any]) -> list[Any]:
         """θ from values by the user's names: numbers, or CasADi expressions.

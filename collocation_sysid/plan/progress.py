@@ -34,7 +34,7 @@ class StudyProgress(Watched):
     ) -> None:
         super().__init__(console, quiet)
         self.total = total
-        self._waiting = {run.key: run.method for run in remaining}
+        self._waiting = {run.key: run for run in remaining}
         self._walls: dict[str, list[float]] = {}
 
     def __enter__(self) -> StudyProgress:
@@ -49,17 +49,17 @@ class StudyProgress(Watched):
 
     def done(self, record: Record, slots: int) -> None:
         """Count a finished run."""
-        method = self._waiting.pop(record["key"])
+        run = self._waiting.pop(record["key"])
         if record.get("wall_s") is not None:
-            self._walls.setdefault(method, []).append(record["wall_s"])
+            self._walls.setdefault(run.method, []).append(record["wall_s"])
         status = (record.get("result") or record).get("status", record["outcome"])
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
-        line = f"{count}: {label_of(record)} {status} in {wall:.1f} s{self._left(slots)}"
+        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._left(slots)}"
         self.update(Text(line, style="dim"), line)
 
     def _left(self, slots: int) -> str:
-        left_s = time_left_s(list(self._waiting.values()), self._walls, slots)
+        left_s = time_left_s([run.method for run in self._waiting.values()], self._walls, slots)
         return "" if left_s is None else f"; about {duration(left_s)} left"
 
 
@@ -80,12 +80,6 @@ class DesignProgress(Watched):
     def say(self, what: str) -> None:
         """Show what is being done now."""
         self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
-
-
-def label_of(record: Record) -> str:
-    """A record's run in a few words."""
-    names = PlannedRun.__dataclass_fields__
-    return PlannedRun(**{name: record[name] for name in names if name in record}).label
 
 
 def time_left_s(

@@ -155,7 +155,7 @@ def _declared(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.
 
 def _compared(sign: str) -> Emit:
     def emit(b: Builder, x: Value, y: Value) -> Value:
-        return _number(b, _comparison(b, sign, x, y), x.type)
+        return b.uitofp(_comparison(b, sign, x, y), x.type)
 
     return emit
 
@@ -165,29 +165,8 @@ def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
 
-def _number(b: Builder, truth: Value, vector: ir.VectorType) -> Value:
-    return b.uitofp(truth, vector)
-
-
 def _is_true(b: Builder, x: Value) -> Value:
     return _comparison(b, "!=", x, _constant(x.type, 0.0))
-
-
-def _not(b: Builder, x: Value) -> Value:
-    return _number(b, b.not_(_is_true(b, x)), x.type)
-
-
-def _and(b: Builder, x: Value, y: Value) -> Value:
-    return _number(b, b.and_(_is_true(b, x), _is_true(b, y)), x.type)
-
-
-def _or(b: Builder, x: Value, y: Value) -> Value:
-    return _number(b, b.or_(_is_true(b, x), _is_true(b, y)), x.type)
-
-
-def _if_else_zero(b: Builder, condition: Value, x: Value) -> Value:
-    # Not a product: the branch that is not taken may be infinite or NaN.
-    return b.select(_is_true(b, condition), x, _constant(x.type, 0.0))
 
 
 def _sign(b: Builder, x: Value) -> Value:
@@ -247,10 +226,11 @@ OPERATIONS: dict[int, Emit] = {
     ca.OP_SQ: lambda b, x: b.fmul(x, x, flags=FUSE),
     ca.OP_TWICE: lambda b, x: b.fadd(x, x, flags=FUSE),
     ca.OP_INV: lambda b, x: b.fdiv(_constant(x.type, 1.0), x, flags=FUSE),
-    ca.OP_NOT: _not,
-    ca.OP_AND: _and,
-    ca.OP_OR: _or,
-    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+    ca.OP_NOT: lambda b, x: b.uitofp(b.not_(_is_true(b, x)), x.type),
+    ca.OP_AND: lambda b, x, y: b.uitofp(b.and_(_is_true(b, x), _is_true(b, y)), x.type),
+    ca.OP_OR: lambda b, x, y: b.uitofp(b.or_(_is_true(b, x), _is_true(b, y)), x.type),
+    # Not a product: the branch that is not taken may be infinite or NaN.
+    ca.OP_IF_ELSE_ZERO: lambda b, x, y: b.select(_is_true(b, x), y, _constant(y.type, 0.0)),
     ca.OP_SIGN: _sign,
     ca.OP_ERFINV: _erfinv,
     **{operation: _compared(sign) for operation, sign in COMPARISONS.items()},
