@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import re
 import shlex
 import shutil
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -177,3 +180,19 @@ def test_the_reference_of_the_command_line_has_every_command_and_option(referenc
     for option in ("--start", "--allow-code", "--time-limit", "--over"):
         assert f"`{option}`" in page
     assert "collocation-sysid solve problem.toml --method interior-point" in page
+
+
+# Scripts
+
+
+SCRIPTS = [each for folder in ("scripts", "docs") for each in sorted((ROOT / folder).rglob("*.py"))]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=name_of)
+def test_scripts_import_what_there_is(script: Path):
+    for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("collocation_sysid"):
+            module = importlib.import_module(str(node.module))
+            for name in node.names:
+                there = hasattr(module, name.name) or find_spec(f"{node.module}.{name.name}")
+                assert there, f"line {node.lineno}: {node.module} has no {name.name}"

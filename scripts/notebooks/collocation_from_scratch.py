@@ -879,7 +879,10 @@ display(figure)
 rollout = finished.rollouts["swing"]
 assert not isinstance(rollout, str), rollout
 noise_mm = 1e3 * np.sqrt(3) * 0.0005
-print(f"fit {1e3 * solution.rms_m:.3f} mm RMS, roll-out {1e3 * rollout.rms_m:.3f} mm RMS,", end=" ")
+print(
+    f"fit {1e3 * solution.rms_m:.3f} mm RMS, forward simulation {1e3 * rollout.rms_m:.3f} mm RMS,",
+    end=" ",
+)
 print(f"√3 · noise {noise_mm:.3f} mm; law of motion broken by {solution.max_violation_n:.1e} N")
 assert abs(1e3 * solution.rms_m / noise_mm - 1) < 0.1
 assert rollout.rms_m < 1.1 * solution.rms_m
