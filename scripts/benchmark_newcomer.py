@@ -2,8 +2,8 @@
 
 The same recording is identified with both (a guess a factor of two off, places known to 1 mm) and
 without either, in turn and with the default nuisance parameters; the ratio of the medians is
-printed. A run is the whole of it: start, solve, forward simulation, error bars and verdict. Compiling
-the element's code comes before.
+printed. A run is the whole of it: start, solve, forward simulation, error bars and verdict.
+Compiling the element's code comes before.
 """
 
 from __future__ import annotations

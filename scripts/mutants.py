@@ -5,8 +5,9 @@
 A mutant is one comparison, sign, operation, constant, `not` or `and` changed. The tests that it has
 to survive are those which ran its function, the quickest first, for which the suite runs once
 under a tracer (``--ran`` keeps what that found). All is done in a copy of the tree under
-``build/mutants``, with kernels compiled there. What was tried is kept a line each, so that the
-command goes on where it was stopped; survivors are listed at the end.
+``build/mutants``, with kernels compiled there; remove that folder to begin anew with other code. What
+was tried is kept a line each, so that the command goes on where it was stopped, and a larger
+``--budget`` tries survivors again. They are listed at the end.
 
 A survivor is either a mistake that no test would notice, or a change that makes none.
 """
@@ -215,7 +216,6 @@ def tests_against(mutant: Mutant, table: list[Ran], tree: Path, budget_s: float)
 
 def copy_tree(to: Path) -> None:
     """What git knows of, as it stands in the working tree."""
-    shutil.rmtree(to, ignore_errors=True)
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"],
         cwd=ROOT,
@@ -313,7 +313,8 @@ def main() -> None:
     asked = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     tree = OUT / "tree"
-    copy_tree(tree)
+    if not tree.exists():
+        copy_tree(tree)
     record_what_tests_run(tree, asked.ran, asked.tests)
     table = [Ran(**row) for row in read_rows(asked.ran)]
     every = [
@@ -325,12 +326,19 @@ def main() -> None:
     chosen = random.Random(asked.seed).sample(every, min(asked.count, len(every)))
     results = OUT / f"seed_{asked.seed}.jsonl"
     results.touch()
-    done = {str(Mutant(**row["mutant"])): row["end"] for row in read_rows(results)}
+    done = {
+        str(Mutant(**row["mutant"])): row["end"]
+        for row in read_rows(results)
+        if row["end"] != "survived" or row["budget"] >= asked.budget
+    }
     for number, mutant in enumerate(chosen, 1):
         if str(mutant) not in done:
             done[str(mutant)] = end = try_mutant(mutant, tree, table, asked.budget)
             with results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"mutant": asdict(mutant), "end": end}) + "\n")
+                file.write(
+                    json.dumps({"mutant": asdict(mutant), "end": end, "budget": asked.budget})
+                    + "\n"
+                )
         print(f"{number}/{len(chosen)} {done[str(mutant)]:9} {mutant}", flush=True)
     ends = [done[str(mutant)] for mutant in chosen]
     print(", ".join(f"{ends.count(end)} {end}" for end in sorted(set(ends))))
