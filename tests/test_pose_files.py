@@ -67,10 +67,10 @@ def assert_same_poses(found, expected):
 
 
 def test_columns_may_be_called_and_measured_as_robots_write_them(file):
-    text = NAMED.replace("t_s,x_m,y_m,z_m", "Time (ms),X [mm],Y [mm],Z / m").replace(
-        "0.1,0.5,", "100,500,"
+    exported = (
+        "Controller;KR 6\n\nTime (ms);X [mm];Y (mm);Z / mm;qx;qy;qz;qw\n"
+        "0;0;0;1000;0;0;0;1\n100;500;0;1000;0;0;0,6;0,8\n"
     )
-    exported = "Controller;KR 6\n\n" + text.replace(",", ";").replace("0.", "0,")
     assert_same_poses(read_poses(file(exported)), read_poses(file(NAMED)))
 
 

@@ -115,13 +115,13 @@ def _refused(grid: Grid, message: str) -> InputError:
     return InputError(message, grid.path, f"line {grid.names_line}")
 
 
-def _axes(grid: Grid, given: str | None) -> tuple[list[int], Array]:
-    """The columns of the position, and what their units are in metres."""
+def _axes(grid: Grid, given: str | None) -> tuple[list[int], float]:
+    """The columns of the position, and what their unit is in metres; of two, one is a slip."""
     parts = [name_and_unit(column) for column in grid.columns]
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
     stated = [parts[k][1] for k in axes]
     metres = [si_factor(unit or given or "m", "length") for unit in stated]
-    if len(axes) != 3 or None in metres:
+    if len(axes) != 3 or None in metres or len(set(metres)) > 1:
         raise _other_columns(grid)
     named = listed(grid.columns[k] for k in axes)
     if given is None and None in stated:
@@ -138,7 +138,7 @@ def _axes(grid: Grid, given: str | None) -> tuple[list[int], Array]:
             f"length_unit is '{given}', but the columns are {named}; expected the same unit, or no "
             "length_unit",
         )
-    return axes, np.array(metres, dtype=np.float64)
+    return axes, float(metres[0] or 1.0)
 
 
 def _components(grid: Grid, given: str | None, others: list[int]) -> list[int]:
