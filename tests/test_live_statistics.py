@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from collocation_sysid.live.statistics import Scatter, widened
+from collocation_sysid.live.trust import Scatter, widened
 from collocation_sysid.program.least_squares import LeastSquares
 
 WAVE = 2.0 * np.cos(np.pi / 4 * np.arange(33))

@@ -37,10 +37,9 @@ from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .intake import LONGEST, Intake
 from .model import TOGETHER, Model, Poses
 from .search import SEEN, Search
-from .statistics import Scatter, widened
 from .sweep import LoggedRow, Tracks
 from .track import JoinedPasses, Track
-from .trust import UNSETTLED, data_concerns, estimate_concerns
+from .trust import UNSETTLED, Scatter, data_concerns, estimate_concerns, widened
 from .whole import recording_of, solved
 
 # Standard deviation of a prior about the last pass for where the next one is, until many samples

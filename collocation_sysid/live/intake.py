@@ -17,8 +17,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
+from ..program.reading import lagrange_weights
 from ..recording.clock import TIME_TOLERANCE_S
-from .sweep import LATEST, LoggedRow, Tracks, lagrange
+from .sweep import LATEST, LoggedRow, Tracks
 
 # Frames this near in time, in samples, are of one time.
 TOLERANCE = 0.1
@@ -188,7 +189,7 @@ class Intake:
         times, places, quaternions = (list(each) for each in zip(*self._poses, strict=True))
         far = any(b - a > (FEW + TOLERANCE) * self.interval_s for a, b in pairwise(times))
         used = slice(-2, None) if far else slice(None)
-        weights = lagrange(times[used], t_s)
+        weights = lagrange_weights(t_s, times[used])
         position_m, quaternion = (
             np.einsum("k,kgi->gi", weights, each[used]) for each in (places, quaternions)
         )

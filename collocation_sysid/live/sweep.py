@@ -9,7 +9,6 @@ reduced-space method. A row whose correction is long is linearised again, alone,
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from ..model.dynamics import StencilRow
 from ..program.least_squares import LeastSquares
 from ..program.marching import RowEquations, extrapolated, solve_row
 from ..program.newton import NewtonFailure, simulation_error
-from ..program.reading import as_squares
+from ..program.reading import as_squares, lagrange_weights
 from ..program.rest import start_state
 from ..program.sweep import Columns, Forward, GraspMotion, LastRows, Step
 from .model import TOGETHER, Model, Poses
@@ -381,7 +380,7 @@ class LiveSweep:
             return kept.x, seen
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
-        weights = lagrange(rows, back)
+        weights = lagrange_weights(back, rows)
         kept, seen = zip(*(self.read[last - row] for row in rows), strict=True)
         return np.tensordot(weights, [k.x for k in kept], 1), np.tensordot(weights, seen, 1)
 
@@ -400,8 +399,3 @@ class LiveSweep:
             at_zero[here] + slopes @ self.flat, slopes, self.model.collocation.huber
         )
         return known.add(rows.ravel(), slopes.reshape(-1, slopes.shape[2]), self.flat)
-
-
-def lagrange(points: Sequence[float], wanted: float) -> Array:
-    """Weights of values at points (k,) in the polynomial through them, at another."""
-    return np.array([math.prod((wanted - b) / (a - b) for b in points if b != a) for a in points])

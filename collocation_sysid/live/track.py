@@ -19,8 +19,8 @@ import numpy as np
 from ..arrays import Array
 from ..program.least_squares import LeastSquares
 from .model import TOGETHER, Model, Poses
-from .statistics import Scatter
 from .sweep import Kept, LiveSweep, LoggedRow, Said, State
+from .trust import Scatter
 
 # Readings that a pass may lack for its others to count; all are joined anew with each frame.
 LATE = 20

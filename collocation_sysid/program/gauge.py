@@ -106,7 +106,8 @@ class GaugeReading(Reading):
         """The user's, with zeros up to a multiple of three numbers."""
         *places, t_s = ca.vertsplit(data)
         late, each = ca.SX.sym("late"), self.channel.each
-        weights, by_time = lagrange_weights(late, places), ca.reshape(looked, GROUP * each, -1)
+        by_time = ca.reshape(looked, GROUP * each, -1)
+        weights = ca.vertcat(*lagrange_weights(late, places))
         at = []
         for _ in range(3):
             now = by_time @ ca.substitute(weights, late, ca.SX(0))

@@ -148,7 +148,7 @@ class MarkerReading(Reading):
         if len(self.nuisance.of_clock):
             late = self.nuisance.late_s(*own, t_s) / self.nuisance.interval_s
             places = [ca.SX(k) for k in range(self._neighbours)]
-            reading = looked @ lagrange_weights(place + late, places)
+            reading = looked @ ca.vertcat(*lagrange_weights(place + late, places))
         return self.nuisance.read(reading, *own, t_s)
 
     # Of positions -----------------------------------------------------------------------------

@@ -7,11 +7,12 @@ three, the loss Σ ρ(‖r‖) over the groups. All derivatives are generated.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -29,6 +30,7 @@ GROUP = 3
 # What can be looked at.
 Channel = Points | GraspWrench
 
+T = TypeVar("T", float, ca.SX)
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
 
@@ -429,13 +431,9 @@ def _product(slopes: sp.csr_array, blocks: Array) -> Entries:
     return Entries(rows, columns, np.asarray(found.data, dtype=np.float64))
 
 
-def lagrange_weights(at: ca.SX, places: list[ca.SX]) -> ca.SX:
-    """Weights of samples at some places, for the value between them."""
-    weights = []
-    for i, own in enumerate(places):
-        weight = ca.SX(1)
-        for j, other in enumerate(places):
-            if j != i:
-                weight *= (at - other) / (own - other)
-        weights.append(weight)
-    return ca.vertcat(*weights)
+def lagrange_weights(at: T, places: Sequence[T]) -> list[Any]:
+    """Weights of samples at some places, numbers or expressions, for the value between them."""
+    return [
+        math.prod((at - other) / (own - other) for j, other in enumerate(places) if j != i)
+        for i, own in enumerate(places)
+    ]

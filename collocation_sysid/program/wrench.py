@@ -111,7 +111,7 @@ class WrenchReading(Reading):
         own = phi * self.nuisance.scales[self.own[0]][:, None]
         late = len(self.channel.phi_places(SENSOR_TIME))
         at = own[0] if late else ca.SX(0)
-        read = ca.reshape(looked, 6, times) @ lagrange_weights(at, ca.vertsplit(data))
+        read = ca.reshape(looked, 6, times) @ ca.vertcat(*lagrange_weights(at, ca.vertsplit(data)))
         read[tared[: own.numel() - late]] += own[late:]
         return read
 
