@@ -5,8 +5,8 @@
 A mutant is one comparison, sign, operation, constant, `not` or `and` changed. The tests that it has
 to survive are those which ran its function, the quickest first, for which the suite runs once
 under a tracer (``--ran`` keeps what that found). All is done in a copy of the tree under
-``build/mutants``, with kernels compiled there; remove that folder to begin anew with other code. What
-was tried is kept a line each, so that the command goes on where it was stopped, and a larger
+``build/mutants``, with kernels compiled there; remove that folder to begin anew with other code.
+What was tried is kept a line each, so that the command goes on where it was stopped, and a larger
 ``--budget`` tries survivors again. They are listed at the end.
 
 A survivor is either a mistake that no test would notice, or a change that makes none.
