@@ -20,8 +20,8 @@ from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Grasp
+from collocation_sysid.runs.check import description_causes
 from collocation_sysid.runs.check.body import hold_warnings, holds_of
-from collocation_sysid.runs.check.description import description_causes
 from collocation_sysid.statistics.causes import likely_causes
 from collocation_sysid.statistics.plausible import odd_material, oddities
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from ...arrays import Array
 from ...methods.reduced_space import ReducedSpace
-from ...methods.scan import SOFT_PA, started, usual_parameters
+from ...methods.scan import SOFT_PA, started, usual_constants, usual_parameters
 from ...methods.start import initial_variables
 from ...model.schemes import as_scheme
 from ...problem import Problem
@@ -22,14 +22,15 @@ from ...program.stability import Instability, instabilities
 from ...program.viscoelastic_rows import Overstress
 from ...program.wrench_rows import WrenchRows
 from ...recording.turning import turning_warnings
-from ...statistics.hypothesis import Hypothesis
+from ...statistics.hypothesis import Hypothesis, ranked
+from ...statistics.modal import doubts
 from ...statistics.numerical import MOST_SUBSTEPS
+from ...statistics.plausible import oddities
 from ...statistics.scale import scale_notes, stillness_notes
 from ...statistics.trust import Concern, as_said, stability_concerns
 from .body import BodyFinding, ElementShape, Hold, body_finding, hold_warnings, holds_of
 from .cost import Cost, cost_notes, cost_warnings, costs, nonzeros
 from .derivatives import derivative_errors, shortened
-from .description import description_causes
 from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
 from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
 
@@ -332,3 +333,19 @@ def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
         for body in bodies
         for warning in body.warnings
     ]
+
+
+def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
+    """What is likely wrong with a problem's description; mostly nothing.
+
+    Odd sizes and densities come first, as the rest may follow from them; then the likeliest.
+
+    Raises
+    ------
+    InputError
+        For a size or a density that no body can have.
+    """
+    constants = usual_constants(problem.parameters)
+    odd = (oddity for body in problem.bodies for oddity in oddities(body))
+    doubtful = (cause for e in problem.experiments for cause in doubts(e, constants, problem.huber))
+    return (*odd, *ranked(doubtful))
