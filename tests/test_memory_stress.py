@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import Prony
-from collocation_sysid.fem.memory import Branch, fading
+from collocation_sysid.fem.memory import fading
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.model.viscoelasticity import History, Recursion, Remembered
+from collocation_sysid.model.viscoelasticity import Fading, History, Remembered
 from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
@@ -224,22 +224,23 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
 
 
 def test_how_fast_a_branch_fades_is_exact_and_differentiated():
-    until_next_s, theta = np.array([1e-4, 0.01, 0.3]), np.array([0.4, 0.07])
-    branch, loaded_s = Branch(0, slice(0), slice(0), 0, 1), 0.1
-    here = Recursion.of(branch, theta, until_next_s, loaded_s)
-    np.testing.assert_allclose(here.d, np.exp(-until_next_s / theta[1]))
-    np.testing.assert_allclose(here.c[0], theta[0] * np.exp(-loaded_s / theta[1]))
-    _, c = fading(*theta, until_next_s[1])
-    np.testing.assert_allclose(here.c[2], c)
-    np.testing.assert_allclose(here.a[1], here.d[1] * here.c[1] - c)
-    for k in range(2):
-        step = 1e-6 * np.eye(2)[k]
+    body, until_next_s, loaded_s = body_of(), np.array([1e-4, 0.01, 0.3]), 0.1
+    (branch,), theta = body.memory.branches, body.theta(ONE)
+    share, tau_s = theta[branch.share], theta[branch.tau]
+    here = Fading.of(body, theta, until_next_s, loaded_s)
+    np.testing.assert_allclose(here.d[0], np.exp(-until_next_s / tau_s))
+    np.testing.assert_allclose(here.c[0, 0], share * np.exp(-loaded_s / tau_s))
+    _, c = fading(share, tau_s, until_next_s[1])
+    np.testing.assert_allclose(here.c[0, 2], c)
+    np.testing.assert_allclose(here.a[0, 1], here.d[0, 1] * here.c[0, 1] - c)
+    for k, place in enumerate((branch.share, branch.tau)):
+        step = 1e-6 * np.eye(len(theta))[place]
         ahead, behind = (
-            Recursion.of(branch, theta + s, until_next_s, loaded_s) for s in (step, -step)
+            Fading.of(body, at, until_next_s, loaded_s) for at in (theta + step, theta - step)
         )
         for j, name in enumerate("cda"):
-            slope = (getattr(ahead, name) - getattr(behind, name)) / 2e-6
-            np.testing.assert_allclose(here.by[j, k], slope, rtol=1e-6, atol=1e-9)
+            slope = (getattr(ahead, name) - getattr(behind, name))[0] / 2e-6
+            np.testing.assert_allclose(here.by[j, k, 0], slope, rtol=1e-6, atol=1e-9)
 
 
 # Descriptions -----------------------------------------------------------------------------------

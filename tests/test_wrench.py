@@ -26,17 +26,13 @@ from wrenches_small import EVERYTHING, felt, fitted, sensing, wristed_cube
 from collocation_sysid.methods.comparison.shooting import simulated
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.model.recursion import Course
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.channel import Forced, Motion
 from collocation_sysid.program.collocation import Collocation, Part
 from collocation_sysid.program.marching import march
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.wrench_channel import (
-    fading,
-    pulled_through,
-    smoothed,
-    smoothed_slope,
-)
+from collocation_sysid.program.wrench_channel import LOW_PASS
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 
@@ -167,30 +163,31 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
     assert errors[1] < 0.4 * errors[0]
 
 
+def low_passed(signal: np.ndarray, lag_s: float, step_s: float = 0.01) -> Course:
+    data = np.stack([np.arange(len(signal)) == 0, np.full(len(signal), 1 / step_s)])
+    return Course.of(LOW_PASS, np.array([lag_s]), data[..., None], signal[None, :, None])
+
+
 def test_a_low_pass_follows_a_ramp_by_its_time_constant():
-    step_s, lag_s = 0.01, 0.025
-    ramp = step_s * np.arange(60)
-    lag = ramp - smoothed(fading(lag_s, step_s)[:, 0], ramp)
+    lag_s, ramp = 0.025, 0.01 * np.arange(60)
+    lag = ramp - low_passed(ramp, lag_s).states.ravel()
     assert lag[-1] == pytest.approx(lag_s * (1 - np.exp(-ramp[-1] / lag_s)), rel=1e-12)
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.002, 0.05])
-def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float):
-    signal = np.random.default_rng(0).standard_normal(20)
-    step, coefficients = 1e-6, fading(lag_s, 0.01)
-
-    def read(lag_s: float) -> np.ndarray:
-        return smoothed(fading(lag_s, 0.01)[:, 0], signal)
-
-    slope = smoothed_slope(coefficients, signal, read(lag_s))
-    change = read(lag_s + step) - read(max(0.0, lag_s - step))
-    np.testing.assert_allclose(slope, change / (step + min(step, lag_s)), rtol=1e-3, atol=0.02)
+def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float, rng):
+    signal, step = rng.normal(size=20), 1e-6
+    still = np.zeros((1, len(signal), 1, 1))
+    slope = low_passed(signal, lag_s).forward(still, np.ones((1, 1))).ravel()
+    ahead, behind = (low_passed(signal, at).states for at in (lag_s + step, max(0, lag_s - step)))
+    expected = (ahead - behind).ravel() / (step + min(step, lag_s))
+    np.testing.assert_allclose(slope, expected, rtol=1e-3, atol=0.02)
 
 
-def test_a_low_pass_is_pulled_through_by_its_transpose(rng):
-    (signal, weights), e_a_b = rng.normal(size=(2, 20)), fading(0.02, 0.01)[:, 0]
-    forward = weights @ smoothed(e_a_b, signal)
-    assert pulled_through(e_a_b, weights) @ signal == pytest.approx(forward, rel=1e-12)
+def test_a_low_pass_lets_what_is_steady_through_and_nothing_without_a_lag(rng):
+    signal = rng.normal(size=20)
+    np.testing.assert_allclose(low_passed(signal, 0.0).states.ravel(), signal, rtol=1e-14)
+    np.testing.assert_allclose(low_passed(np.full(9, 3.0), 0.05).states, 3.0, rtol=1e-14)
 
 
 # Static experiments and single axes ---------------------------------------------------------------

@@ -129,6 +129,31 @@ class PointLayout:
                 own = here.stop
         return found
 
+    def borne(self, values: Array) -> Array:
+        """(…, all branches) what each branch's points have, of a row (…, width)."""
+        parts = [values[..., branch.points] for branch in self.branches]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+
+    def summed(self, values: Array) -> Array:
+        """(…, width), its transpose: the sum of what branches (…, all branches) have of a point."""
+        if len(self.branches) == 1:
+            return values
+        found = np.zeros((*values.shape[:-1], self.width))
+        for branch in self.branches:
+            found[..., branch.points] += values[..., branch.own]
+        return found
+
+    def spread(self, values: Array) -> Array:
+        """Of all that a branch carries (…, all branches) what the branch has (branches, …)."""
+        if len(self.branches) == 1:
+            return values[0][..., None]
+        sizes = [branch.own.stop - branch.own.start for branch in self.branches]
+        return np.moveaxis(np.repeat(values, sizes, axis=0), 0, -1)
+
+    def totals(self, values: Array) -> Array:
+        """(branches, …) sums over all that a branch carries (…, all branches)."""
+        return np.stack([values[..., branch.own].sum(axis=-1) for branch in self.branches])
+
     def nothing(self, states: int) -> Past:
         """What points that have relaxed bring into some states."""
         count = self.constants
@@ -136,7 +161,7 @@ class PointLayout:
         return Past(*(np.zeros((states, *size)) for size in sizes))
 
 
-def fading(share: float, tau_s: float, spacing_s: float) -> tuple[float, float]:
-    """E and c of a branch over an interval [s] in which S changes evenly."""
+def fading(share: Array, tau_s: Array, spacing_s: float) -> tuple[Array, Array]:
+    """E and c of branches over an interval [s] in which S changes evenly."""
     ratio = spacing_s / tau_s
-    return float(np.exp(-ratio)), share * float(-np.expm1(-ratio) / ratio)
+    return np.exp(-ratio), -share * np.expm1(-ratio) / ratio

@@ -24,7 +24,7 @@ from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .forces import Forces
 from .schemes import QUASI_STATIC, Scheme, as_scheme
-from .viscoelasticity import History, Recursion, recursions_of
+from .viscoelasticity import History
 from .weight import Mass
 
 
@@ -77,9 +77,6 @@ class Dynamics:
         How long the body has been in its start shape; infinite where its memory has relaxed.
     static : bool
         Whether each row is an equilibrium of its own.
-    brought : (N, all branches) or None
-        What the evaluations bring from the past, m_{k−1} of each branch in turn, where it is given
-        instead of following from x.
     """
 
     body: Body
@@ -94,7 +91,6 @@ class Dynamics:
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
     static: bool = False
-    brought: Array | None = None
 
     @classmethod
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
@@ -215,18 +211,16 @@ class Dynamics:
         """(k,) constants of the body."""
         return self.forces.theta
 
-    def history(self, x: Array) -> History | None:
-        """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing."""
+    def history(self, x: Array, brought: Array | None = None) -> History | None:
+        """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing.
+
+        What they bring from the past, (N, all branches), follows from x where it is not given.
+        """
         if not self.body.remembers:
             return None
         xi = self.combine(self.state_weights[: len(x)], x)
         intervals = self.until_next_s[: len(x)]
-        return History.of(self.body, xi, self.theta, intervals, self.loaded_since_s, self.brought)
-
-    @property
-    def recursions(self) -> list[Recursion]:
-        """How each branch of the memory fades over all evaluations."""
-        return recursions_of(self.body, self.theta, self.until_next_s, self.loaded_since_s)
+        return History.of(self.body, xi, self.theta, intervals, self.loaded_since_s, brought)
 
     def carried(self, history: History | None, rows: slice | None = None) -> Past | None:
         """What rows `first_row`…, or some, bring from the past."""
@@ -247,18 +241,21 @@ class Dynamics:
                 result[: len(rows) - lag] += column * rows[lag:]
         return result
 
-    def residual(self, x: Array) -> Array:
-        """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero."""
-        return self.assemble_residual(x, self.force(x))
+    def residual(self, x: Array, history: History | None = None) -> Array:
+        """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero.
+
+        Here and below the history is that of x, unless another is given.
+        """
+        return self.assemble_residual(x, self.force(x, history))
 
     @property
     def evaluated(self) -> Forces:
         """The forces of rows `first_row`…."""
         return self.forces.rows(slice(self.first_row, self.rows))
 
-    def force(self, x: Array) -> Array:
+    def force(self, x: Array, history: History | None = None) -> Array:
         """Forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
-        carried = self.carried(self.history(x))
+        carried = self.carried(history or self.history(x))
         return self.evaluated.total(*self.evaluation_states(x), carried)
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
@@ -279,9 +276,14 @@ class Dynamics:
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
         return acceleration
 
-    def linearise(self, x: Array, out: Array | None = None) -> Linearisation:
+    def linearise(
+        self,
+        x: Array,
+        out: Array | None = None,
+        history: History | None = None,
+    ) -> Linearisation:
         """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
-        carried = self.carried(self.history(x))
+        carried = self.carried(history or self.history(x))
         return self.evaluated.linearise(*self.evaluation_states(x), out, carried)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:

@@ -78,6 +78,12 @@ class Generated:
         return not ca.depends_on(ca.jacobian(y, u), u)
 
     @cached_property
+    def slope_pattern(self) -> NDArray[np.bool_]:
+        """(m, k) which slopes there may be."""
+        u, _, y = self._symbols
+        return np.array(ca.DM(ca.jacobian(y, u).sparsity(), 1.0).full(), dtype=bool)
+
+    @cached_property
     def curvature_pattern(self) -> NDArray[np.bool_]:
         """(k, k) which second derivatives there may be."""
         u, _, y = self._symbols

@@ -13,60 +13,78 @@ where the body has relaxed. Columns of derivatives follow by the chain rule,
 and backward, with weights λ_k of the forces and μ_k of m_k,
 
     μ_{k−1} = d_k μ_k + (∂f_H/∂H)ᵀ λ_k,   ξ_k gets (∂S_k/∂ξ_k)ᵀ Σ a_k μ_k.
+
+The recursion is one of `recursion`; as it is linear in m and S, all points of a branch share its
+coefficients, which spares most of what generated rows of each point would cost.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..fem.body import Body, Curvature
-from ..fem.memory import Branch, Past, fading
+from ..fem.memory import Past, PointLayout, fading
 from .generated import Generated
+from .recursion import Recursion
 
 # Stress slopes of so many evaluations are kept at a time.
 CHUNK = 16
-
-
-def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
-    """c, d and a of an evaluation, of (g, τ).
-
-    Data are the time from the one before, or since the load of the start came, and whether it is
-    the start, and the time to the next.
-    """
-    share, tau_s = u[0], u[1]
-    since_s, began, on_s = data[0], data[1], data[2]
-
-    def even(spacing_s: ca.SX) -> ca.SX:
-        return -share * ca.expm1(-spacing_s / tau_s) * tau_s / spacing_s
-
-    c = began * share * ca.exp(-since_s / tau_s) + (1 - began) * even(since_s + began)
-    e = ca.exp(-on_s / tau_s)
-    return ca.vertcat(c, e, e * c - even(on_s))
-
-
-COEFFICIENTS = Generated(_coefficients, 2, 3)
 # Of what was held for so many relaxation times nothing is left.
 LONG = 1e3
 
 
+def _even(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
+    """C of an interval in which S changes evenly."""
+    share, tau_s = u[0], u[1]
+    return -share * ca.expm1(-spacing_s / tau_s) * tau_s / spacing_s
+
+
+def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
+    """C of an evaluation."""
+    since_s, began = data[0], data[1]
+    at_once = u[0] * ca.exp(-since_s / u[1])
+    return began * at_once + (1 - began) * _even(u, since_s + began)
+
+
+def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> ca.SX:
+    """M from the one before and from S, of u = (g, τ).
+
+    Data are the time from the evaluation before, or since the load of the start came, and whether
+    it is the start, and the time to the next.
+    """
+    e = ca.exp(-data[2] / u[1])
+    return e * before + (e * _stiffening(u, data) - _even(u, data[2])) * now
+
+
+OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
+
+
+def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
+    """c, d and a."""
+    return ca.vertcat(_stiffening(u, data), OVERSTRESS.coefficients(u, data)[:2])
+
+
+COEFFICIENTS = Generated(_coefficients, 2, 3)
+
+
 @dataclass(frozen=True, eq=False)
-class Recursion:
-    """c, d and a of one branch at every evaluation, with their derivatives by g and τ.
+class Fading:
+    """c, d and a of B branches at N evaluations, with their derivatives by g and τ.
 
     Attributes
     ----------
-    branch : Branch
-    u, data : (2,) and (3, N) of `COEFFICIENTS`
-    c, d, a : (N,)
-    by : (3, 2, N) their slopes
+    places : (2, B) of g and τ in θ
+    u, data : (2, B, N) and (3, B, N) of `COEFFICIENTS`
+    c, d, a : (B, N)
+    by : (3, 2, B, N) their slopes
     """
 
-    branch: Branch
+    places: Index
     u: Array
     data: Array
     c: Array
@@ -75,25 +93,27 @@ class Recursion:
     by: Array
 
     @classmethod
-    def of(cls, branch: Branch, theta: Array, until_next_s: Array, loaded_s: float) -> Recursion:
-        """Of a branch, from the times (N,) from each evaluation to the next."""
-        count = len(until_next_s)
-        u = theta[[branch.share, branch.tau]]
-        since_s = np.append(min(loaded_s, LONG * theta[branch.tau]), until_next_s[:-1])
-        data = np.stack([since_s, np.arange(count) == 0, until_next_s])
+    def of(cls, body: Body, theta: Array, until_next_s: Array, loaded_s: float) -> Fading:
+        """Of all branches, from the times (N,) from each evaluation to the next."""
+        places = np.array([(each.share, each.tau) for each in body.memory.branches]).T
+        shape = len(body.memory.branches), len(until_next_s)
+        since_s = np.empty(shape)
+        since_s[:, 0] = np.minimum(loaded_s, LONG * theta[places[1]])
+        since_s[:, 1:] = until_next_s[:-1]
+        began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
+        data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape)])
+        u = np.broadcast_to(theta[places][..., None], (2, *shape))
         (c, d, a), by = COEFFICIENTS.slopes(u, data)
-        return cls(branch, u, data, c, d, a, by)
+        return cls(places, u, data, c, d, a, by)
+
+    def along(self, theta_q: Array) -> tuple[Array, Array]:
+        """Derivatives (q, B, N) of d and a by what θ changes with by theta_q (k, q)."""
+        d_q, a_q = np.einsum("cjbn,jbq->cqbn", self.by[1:], theta_q[self.places])
+        return d_q, a_q
 
     def bent(self, weights: Array) -> Array:
-        """Second derivatives (2, 2, N) of the sum of c, d and a with weights (3, N)."""
+        """Second derivatives (2, 2, B, N) of the sum of c, d and a with weights (3, B, N)."""
         return COEFFICIENTS.curvature(self.u, self.data, weights)
-
-
-def recursions_of(
-    body: Body, theta: Array, until_next_s: Array, loaded_s: float
-) -> list[Recursion]:
-    """Those of all branches of a body."""
-    return [Recursion.of(b, theta, until_next_s, loaded_s) for b in body.memory.branches]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +126,16 @@ class History:
     theta : (k,)
     xi : (N, 3n) evaluation states
     stress : (N, width) S
-    recursions : tuple of Recursion
-    brought : tuple of (N, …), m_{k−1} of each branch
+    fading : Fading
+    brought : (N, all branches) m_{k−1}
     """
 
     body: Body
     theta: Array
     xi: Array
     stress: Array
-    recursions: tuple[Recursion, ...]
-    brought: tuple[Array, ...]
+    fading: Fading
+    brought: Array
 
     @classmethod
     def of(
@@ -125,59 +145,67 @@ class History:
         theta: Array,
         until_next_s: Array,
         loaded_s: float,
-        given: Array | None = None,
+        brought: Array | None = None,
     ) -> History:
         """Of the states xi (N, 3n), the first of which is the start.
 
-        What they bring follows from that, or is `given`, (N, …) of all branches.
+        What they bring follows from that, where it is not given.
         """
         stress = body.stresses.stress(xi, theta)
-        recursions = recursions_of(body, theta, until_next_s, loaded_s)
-        if given is not None:
-            brought = [given[:, r.branch.own] for r in recursions]
-            return cls(body, theta, xi, stress, tuple(recursions), tuple(brought))
-        brought = []
-        for r in recursions:
-            own = stress[:, r.branch.points]
-            m = np.zeros_like(own)
-            for k in range(len(m) - 1):
-                m[k + 1] = r.d[k] * m[k] + r.a[k] * own[k]
-            brought.append(m)
-        return cls(body, theta, xi, stress, tuple(recursions), tuple(brought))
+        fades = Fading.of(body, theta, until_next_s, loaded_s)
+        if brought is None:
+            borne, (d, a) = body.memory.borne(stress), map(body.memory.spread, (fades.d, fades.a))
+            brought = np.zeros(borne.shape)
+            for k in range(len(brought) - 1):
+                brought[k + 1] = d[k] * brought[k] + a[k] * borne[k]
+        return cls(body, theta, xi, stress, fades, brought)
+
+    @property
+    def memory(self) -> PointLayout:
+        """What is where."""
+        return self.body.memory
 
     def carried(self, rows: slice) -> Past:
         """What some of the evaluations bring from the past."""
-        found = self.body.memory.nothing(len(self.xi[rows]))
-        for r, m in zip(self.recursions, self.brought, strict=True):
-            only_c = np.outer([1.0, 0.0, 0.0], np.ones_like(r.c))
-            bent = r.bent(only_c)
-            found.overstress[:, r.branch.points] += m[rows]
-            found.stiffening[:, r.branch.part] += r.c[rows]
-            own = slice(r.branch.share, r.branch.tau + 1)
-            found.slopes[:, own] = r.by[0, :, rows].T
-            found.bends[:, own, own] = np.moveaxis(bent[..., rows], 2, 0)
+        found, fades = self.memory.nothing(len(self.xi[rows])), self.fading
+        found.overstress[:] = self.memory.summed(self.brought[rows])
+        for branch, c in zip(self.memory.branches, fades.c, strict=True):
+            found.stiffening[:, branch.part] += c[rows]
+        bent = fades.bent(np.stack([np.ones_like(fades.c), 0 * fades.c, 0 * fades.c]))
+        found.slopes[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
+        found.bends[:, fades.places[:, None], fades.places] = np.moveaxis(bent[..., rows], 3, 0)
         return found
 
     @property
     def last(self) -> Remembered:
         """After the last evaluation."""
-        overstress = [
-            m[-1] + r.c[-1] * self.stress[-1, r.branch.points]
-            for r, m in zip(self.recursions, self.brought, strict=True)
-        ]
-        branches = [r.branch for r in self.recursions]
-        return Remembered(self.body, self.theta, branches, self.stress[-1], overstress)
+        c = self.memory.spread(self.fading.c)[-1]
+        overstress = self.brought[-1] + c * self.memory.borne(self.stress[-1])
+        return Remembered(self.body, self.theta, self.stress[-1], overstress)
 
-    def weights(self, pushes: Array) -> list[Array]:
-        """μ_k (N, …) of each branch from (∂f_H/∂H)ᵀ λ_k (N, width)."""
-        found = []
-        for r in self.recursions:
-            own = pushes[:, r.branch.points]
-            mu = np.zeros_like(own)
-            for k in range(len(mu) - 1, 0, -1):
-                mu[k - 1] = r.d[k] * mu[k] + own[k]
-            found.append(mu)
-        return found
+    @property
+    def gaps(self) -> Array:
+        """(N − 1, …) m_k − d_k m_{k−1} − a_k S_k: zero where m follows."""
+        d, a = (self.memory.spread(each[:, :-1]) for each in (self.fading.d, self.fading.a))
+        m, borne = self.brought, self.memory.borne(self.stress[:-1])
+        return m[1:] - d * m[:-1] - a * borne
+
+    # Derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k), μ (N, all branches) --------------------------
+
+    def stress_weights(self, mu: Array) -> Array:
+        """σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k."""
+        return self.memory.summed(self.memory.spread(self.fading.a) * mu)
+
+    def _sums(self, mu: Array) -> tuple[Array, Array]:
+        """Derivatives (B, N) by d and by a."""
+        totals, borne = self.memory.totals, self.memory.borne(self.stress)
+        return totals(mu * self.brought), totals(mu * borne)
+
+    def stress_by(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
+        """∂S/∂θ θ_q (T, q, width), a few evaluations at a time."""
+        for start in range(0, len(self.xi), CHUNK):
+            rows = slice(start, start + CHUNK)
+            yield rows, self.body.stresses.stress_by(self.xi[rows], self.theta, theta_q)
 
     def pulled(self, force_weights: Array, theta_q: Array) -> tuple[Array, Array]:
         """Derivatives of Σ λ_k f_H(H_k) through H, by ξ (N, 3n) and by q.
@@ -187,62 +215,40 @@ class History:
         force_weights : (N, 3n) λ
         theta_q : (k, q) derivatives of θ
         """
-        stresses, by_q = self.body.stresses, np.zeros(theta_q.shape[1])
-        mus = self.weights(stresses.against(self.xi, force_weights, self.theta))
-        of_stress = self.stress_weights(mus)
-        for r, m, mu in zip(self.recursions, self.brought, mus, strict=True):
-            own = self.stress[:, r.branch.points]
-            along = r.by[1] @ np.sum(mu * m, axis=1) + r.by[2] @ np.sum(mu * own, axis=1)
-            by_q += along @ theta_q[[r.branch.share, r.branch.tau]]
-        for start in range(0, len(self.xi), CHUNK):
-            rows = slice(start, start + CHUNK)
-            slopes = stresses.stress_by(self.xi[rows], self.theta, theta_q)
-            by_q += np.einsum("tqp,tp->q", slopes, of_stress[rows])
-        return stresses.pulled(self.xi, of_stress, self.theta), by_q
+        stresses, d = self.body.stresses, self.memory.spread(self.fading.d)
+        pushes = self.memory.borne(stresses.against(self.xi, force_weights, self.theta))
+        mu = np.zeros_like(pushes)
+        for k in range(len(mu) - 1, 0, -1):
+            mu[k - 1] = d[k] * mu[k] + pushes[k]
+        parts = zip(self.fading.along(theta_q), self._sums(mu), strict=True)
+        by_q = np.sum([np.einsum("qbn,bn->q", *each) for each in parts], axis=0)
+        sigma = self.stress_weights(mu)
+        for rows, slopes in self.stress_by(theta_q):
+            by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
+        return stresses.pulled(self.xi, sigma, self.theta), by_q
 
-    # Where what they bring is given -------------------------------------------------------------
-
-    @property
-    def gaps(self) -> Array:
-        """(N − 1, …) of all branches, m_k − d_k m_{k−1} − a_k S_k: zero where m follows."""
-        found = [
-            m[1:] - r.d[:-1, None] * m[:-1] - r.a[:-1, None] * self.stress[:-1, r.branch.points]
-            for r, m in zip(self.recursions, self.brought, strict=True)
-        ]
-        return np.hstack(found)
-
-    def stress_weights(self, mus: Sequence[Array]) -> Array:
-        """σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k."""
-        found = np.zeros_like(self.stress)
-        for r, mu in zip(self.recursions, mus, strict=True):
-            found[:, r.branch.points] += r.a[:, None] * mu
-        return found
-
-    def add_curvature(self, curvature: Curvature, mus: Sequence[Array]) -> None:
-        """Add the derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) by g and τ, and those by another.
+    def add_curvature(self, curvature: Curvature, mu: Array) -> None:
+        """Add those by g and τ, and those by another.
 
         In place, to the N states of a `Curvature` that has those of Σ σ_k S_k.
         """
-        stresses, elastic = self.body.stresses, self.body.elastic_places
-        units = np.eye(len(self.theta))[:, elastic]
-        for r, m, mu in zip(self.recursions, self.brought, mus, strict=True):
-            own, points = slice(r.branch.share, r.branch.tau + 1), r.branch.points
-            of_m = np.sum(mu * m, axis=1)
-            of_stress = np.sum(mu * self.stress[:, points], axis=1)
-            weights = np.stack([0 * of_m, of_m, of_stress])
-            curvature.theta[:, own] += np.einsum("ct,cjt->tj", weights, r.by)
-            curvature.theta_theta[:, own, own] += np.moveaxis(r.bent(weights), 2, 0)
-            for place, a_by in zip((r.branch.share, r.branch.tau), r.by[2], strict=True):
-                weights = np.zeros_like(self.stress)
-                weights[:, points] = a_by[:, None] * mu
-                pulled = stresses.pulled(self.xi, weights, self.theta)
-                curvature.position_theta[:, :, place] += pulled
-            for start in range(0, len(self.xi), CHUNK):
-                rows = slice(start, start + CHUNK)
-                slopes = stresses.stress_by(self.xi[rows], self.theta, units)[:, :, points]
-                by = np.einsum("tqp,tp,bt->tbq", slopes, mu[rows], r.by[2][:, rows])
-                curvature.theta_theta[rows, own, elastic] += by
-                curvature.theta_theta[rows, elastic, own] += by.swapaxes(1, 2)
+        fades, elastic, (of_m, of_stress) = self.fading, self.body.elastic_places, self._sums(mu)
+        weights, places = np.stack([0 * of_m, of_m, of_stress]), fades.places
+        curvature.theta[:, places] += np.einsum("cbn,cjbn->njb", weights, fades.by)
+        bent = np.moveaxis(fades.bent(weights), 3, 0)
+        curvature.theta_theta[:, places[:, None], places] += bent
+        sigmas = {}
+        for (j, b), place in np.ndenumerate(places):
+            only = np.zeros_like(fades.a)
+            only[b] = fades.by[2, j, b]
+            sigmas[place] = self.memory.summed(self.memory.spread(only) * mu)
+            pulled = self.body.stresses.pulled(self.xi, sigmas[place], self.theta)
+            curvature.position_theta[:, :, place] += pulled
+        for rows, slopes in self.stress_by(np.eye(len(self.theta))[:, elastic]):
+            for place, sigma in sigmas.items():
+                by = np.einsum("tqp,tp->tq", slopes, sigma[rows])
+                curvature.theta_theta[rows, place, elastic] += by
+                curvature.theta_theta[rows, elastic, place] += by
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,16 +258,14 @@ class Remembered:
     Attributes
     ----------
     body, theta
-    branches : sequence of Branch
     stress : (width,) S
-    overstress : sequence of (…,) Q of each branch
+    overstress : (all branches,) Q
     """
 
     body: Body
     theta: Array
-    branches: Sequence[Branch]
     stress: Array
-    overstress: Sequence[Array]
+    overstress: Array
 
     @classmethod
     def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> Remembered:
@@ -272,31 +276,31 @@ class Remembered:
     def now(self) -> Past:
         """What this very state bears beside S."""
         found = self.body.memory.nothing(1)
-        for branch, overstress in zip(self.branches, self.overstress, strict=True):
-            found.overstress[0, branch.points] += overstress
+        found.overstress[0] = self.body.memory.summed(self.overstress)
         return found
 
     def ahead(self, interval_s: float) -> Past:
         """What a state after an interval brings from this one."""
-        found = self.body.memory.nothing(1)
-        for branch, overstress in zip(self.branches, self.overstress, strict=True):
-            e, c = self._fading(branch, interval_s)
-            brought = e * overstress - c * self.stress[branch.points]
-            found.overstress[0, branch.points] += brought
-            found.stiffening[0, branch.part] += c
+        found, (brought, c) = self.body.memory.nothing(1), self._brought(interval_s)
+        found.overstress[0] = self.body.memory.summed(brought)
+        for branch, own in zip(self.body.memory.branches, c, strict=True):
+            found.stiffening[0, branch.part] += own
         return found
 
     def after(self, x: Array, interval_s: float) -> Remembered:
         """At the state x (3n,) an interval later."""
-        stress, overstress = self.body.stresses.stress(x[None], self.theta)[0], []
-        for branch, before in zip(self.branches, self.overstress, strict=True):
-            e, c = self._fading(branch, interval_s)
-            change = stress[branch.points] - self.stress[branch.points]
-            overstress.append(e * before + c * change)
-        return Remembered(self.body, self.theta, self.branches, stress, overstress)
+        memory, (brought, c) = self.body.memory, self._brought(interval_s)
+        stress = self.body.stresses.stress(x[None], self.theta)[0]
+        overstress = brought + memory.spread(c) * memory.borne(stress)
+        return Remembered(self.body, self.theta, stress, overstress)
 
-    def _fading(self, branch: Branch, interval_s: float) -> tuple[float, float]:
-        return fading(self.theta[branch.share], self.theta[branch.tau], interval_s)
+    def _brought(self, interval_s: float) -> tuple[Array, Array]:
+        """E Q − c S of all branches, and c (B,)."""
+        memory = self.body.memory
+        share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
+        e, c = fading(share, tau_s, interval_s)
+        borne = memory.borne(self.stress)
+        return memory.spread(e) * self.overstress - memory.spread(c) * borne, c
 
 
 def start_carried(body: Body, theta: Array, loaded_s: float) -> Past | None:
@@ -304,10 +308,9 @@ def start_carried(body: Body, theta: Array, loaded_s: float) -> Past | None:
     if not body.remembers or np.isinf(loaded_s):
         return None
     found = body.memory.nothing(1)
-    for branch in body.memory.branches:
-        found.stiffening[:, branch.part] += theta[branch.share] * np.exp(
-            -loaded_s / theta[branch.tau]
-        )
+    c = Fading.of(body, theta, np.ones(1), loaded_s).c
+    for branch, own in zip(body.memory.branches, c, strict=True):
+        found.stiffening[:, branch.part] += own
     return found
 
 
@@ -320,77 +323,65 @@ class Slopes:
     theta_q : (k, columns) derivatives of θ
     done : int
         Evaluations that are known.
-    known : sequence of arrays, optional
+    known : (columns, all branches), optional
         `columns` after the last of them.
     """
 
     def __init__(
-        self, history: History, theta_q: Array, done: int = 0, known: Sequence[Array] = ()
+        self, history: History, theta_q: Array, done: int = 0, known: Array | None = None
     ) -> None:
-        self.history, self.theta_q, self.next = history, theta_q, done
+        self.history, self.next, self.memory = history, done, history.memory
         self.stresses, self.theta = history.body.stresses, history.theta
-        count = theta_q.shape[1]
-        # (columns, …) of each branch
-        self.columns = [each.copy() for each in known] or [
-            np.zeros((count, m.shape[1])) for m in history.brought
-        ]
+        shape = theta_q.shape[1], history.brought.shape[1]
+        self.columns = np.zeros(shape) if known is None else known.copy()
         # Work space, kept: fresh pages would cost as much as the numbers in them.
-        self._stress = np.zeros((count, self.stresses.width))
-        self._total, self._scratch = np.zeros_like(self._stress), np.zeros_like(self._stress)
-        self._state = np.zeros((count, history.xi.shape[1]))
+        self._stress = np.zeros((len(self.columns), self.stresses.width))
+        self._state = np.zeros((len(self.columns), history.xi.shape[1]))
         self._direction = np.zeros_like(self._state)
         self._moduli = np.flatnonzero(theta_q[history.body.elastic_places].any(axis=0))
-        self._slopes, self._first = np.zeros((0, 0, 0)), 0
-        # (columns, N) derivatives of d and a of each branch, and where they are not zero.
-        self._own = []
-        for r in history.recursions:
-            own = theta_q[[r.branch.share, r.branch.tau]].T
-            self._own.append((np.flatnonzero(own.any(axis=1)), own @ r.by[1], own @ r.by[2]))
+        self._theta_q, self._by_moduli = theta_q[:, self._moduli], np.zeros((0, 0, 0))
+        fades = history.fading
+        self._own = np.flatnonzero(theta_q[fades.places].any(axis=(0, 1)))
+        self._d, self._a = map(self.memory.spread, (fades.d, fades.a))
+        self._d_own, self._a_own = fades.along(theta_q[:, self._own])
 
     def force(self) -> Array:
         """What they add to dF at the next evaluation, (3n, columns)."""
-        total = self.columns[0]
-        if len(self.columns) > 1:
-            total = self._total
-            total.fill(0.0)
-            for r, columns in zip(self.history.recursions, self.columns, strict=True):
-                total[:, r.branch.points] += columns
         self._state[:] = self.history.xi[self.next]
-        return self.stresses.force(self._state, total, self.theta).T
+        return self.stresses.force(self._state, self.memory.summed(self.columns), self.theta).T
 
     def advance(self, of_state: Array) -> None:
         """Go past the next evaluation, whose state changes by (3n, columns)."""
-        k, history, stress = self.next, self.history, self._stress
+        k, history, stress, spread = self.next, self.history, self._stress, self.memory.spread
         self._state[:], self._direction[:] = history.xi[k], of_state.T
         # Of a single branch the stress itself is not needed.
-        alone = history.recursions[0] if len(history.recursions) == 1 else None
-        if alone is not None:
-            stress = self.columns[0]
-            stress *= alone.d[k]
-            self._direction *= alone.a[k]
+        alone, a = len(self.memory.branches) == 1, self._a[k]
+        self.columns *= self._d[k]
+        if alone:
+            stress = self.columns
+            self._direction *= a
         else:
             stress.fill(0.0)
         self.stresses.along(self._state, self._direction, self.theta, stress)
-        if len(self._moduli):
-            for column, slope in zip(self._moduli, self._by_moduli(k), strict=True):
-                stress[column] += slope if alone is None else alone.a[k] * slope
-        for r, m, columns, (moved, d_own, a_own) in zip(
-            history.recursions, history.brought, self.columns, self._own, strict=True
-        ):
-            points = r.branch.points
-            if alone is None:
-                columns *= r.d[k]
-                columns += np.multiply(stress[:, points], r.a[k], out=self._scratch[:, points])
-            for j in moved:
-                columns[j] += d_own[j, k] * m[k]
-                columns[j] += a_own[j, k] * history.stress[k, points]
+        for column, slope in zip(self._moduli, self._slopes(k), strict=True):
+            stress[column] += a * slope if alone else slope
+        if not alone:
+            self.columns += a * self.memory.borne(stress)
+        m, borne = history.brought[k], self.memory.borne(history.stress[k])
+        for j, column in enumerate(self._own):
+            self.columns[column] += spread(self._d_own[j, :, k]) * m
+            self.columns[column] += spread(self._a_own[j, :, k]) * borne
         self.next += 1
 
-    def _by_moduli(self, k: int) -> Array:
-        if not self._first <= k < self._first + len(self._slopes):
-            xi, theta_q = self.history.xi[k : k + CHUNK], self.theta_q[:, self._moduli]
-            self._slopes, self._first = self.stresses.stress_by(xi, self.theta, theta_q), k
-        return self._slopes[k - self._first]
+    def _slopes(self, k: int) -> Array:
+        """(moduli, width) of S by what changes moduli."""
+        if not len(self._moduli):
+            return self._by_moduli
+        if k % CHUNK == 0 or not len(self._by_moduli):
+            first = k - k % CHUNK
+            xi = self.history.xi[first : first + CHUNK]
+            self._by_moduli = self.stresses.stress_by(xi, self.theta, self._theta_q)
+        return self._by_moduli[k % CHUNK]
 
 
 class Weights:
@@ -398,21 +389,21 @@ class Weights:
 
     def __init__(self, history: History) -> None:
         self.history, self.next = history, len(history.xi) - 1
-        self.columns = [np.zeros(m.shape[1]) for m in history.brought]
+        self.columns = np.zeros(history.brought.shape[1])
 
     def pulled(self) -> Array:
         """What the state of the evaluation gets through S, (3n,)."""
         history, k = self.history, self.next
-        weights = np.zeros((1, history.stress.shape[1]))
-        for r, mu in zip(history.recursions, self.columns, strict=True):
-            weights[0, r.branch.points] += r.a[k] * mu
-        return history.body.stresses.pulled(history.xi[k][None], weights, history.theta)[0]
+        weights = history.memory.summed(
+            history.memory.spread(history.fading.a[:, k]) * self.columns
+        )
+        return history.body.stresses.pulled(history.xi[k][None], weights[None], history.theta)[0]
 
     def retreat(self, force_weight: Array) -> None:
         """Go before the evaluation, whose force has weights (3n,)."""
         history, k = self.history, self.next
         state, weight = history.xi[k][None], force_weight[None]
         push = history.body.stresses.against(state, weight, history.theta)[0]
-        for b, r in enumerate(history.recursions):
-            self.columns[b] = r.d[k] * self.columns[b] + push[r.branch.points]
+        d = history.memory.spread(history.fading.d[:, k])
+        self.columns = d * self.columns + history.memory.borne(push)
         self.next -= 1

@@ -1,18 +1,22 @@
 """What a program has as variables, with an equation each, that follows from its other variables.
 
 The equations come after all rows of the program given, the variables after all of its variables.
+Most are patterns, see `pattern_rows`: to be carried is to declare them.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ..arrays import Array, Index
+from ..model.viscoelasticity import History
 from .part import Part
+from .pattern_rows import Pattern
 from .segment import RowWeights, Segment
 
 
@@ -76,27 +80,37 @@ class Carried(ABC):
     def following(self, part: Part) -> Array:
         """(count,) the variables as they follow from what the program given has."""
 
-    @abstractmethod
+    @cached_property
+    def patterns(self) -> tuple[Pattern, ...]:
+        """What adds up to the equations; rows count from the first of these."""
+        return ()
+
     def values(self, part: Part, z: Array) -> Array:
         """(count,) the equations."""
+        return np.sum([pattern.values(z, self.count) for pattern in self.patterns], axis=0)
 
-    @abstractmethod
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Rows and columns of the further entries of ∂g/∂z, in the order of their values."""
+        rows, columns = together(pattern.jacobian_entries() for pattern in self.patterns)
+        return self.places.row + rows, columns
 
-    @abstractmethod
     def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
         """The equations, and the values of these entries."""
+        found = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
+        values, slopes = zip(*found, strict=True)
+        return np.sum(values, axis=0), np.concatenate(slopes)
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of the Lagrangian's Hessian, in columns of variables."""
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        """The same of the upper triangle of the Lagrangian's Hessian."""
+        return together(pattern.hessian_entries() for pattern in self.patterns)
 
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
         """The values of these entries; multipliers are those of all of g."""
-        return np.zeros(0)
+        own = multipliers[self.rows]
+        found = [pattern.hessian_values(z, own) for pattern in self.patterns]
+        return np.concatenate([np.zeros(0), *found])
 
     # What the loss has of the variables ---------------------------------------------------------
 
@@ -110,11 +124,18 @@ class Carried(ABC):
         """(N, 3n) derivative of multipliers · its equations by what c has in newtons."""
         return 0.0
 
-    def memory_weights(self, multipliers: Array) -> Sequence[Array]:
-        """μ (N, …) of each branch of a memory such that multipliers · g has Σ μ (d m + a S)."""
-        return ()
+    def remembered(self, part: Part, multipliers: Array) -> tuple[History, Array] | None:
+        """The history of a memory, and μ (N, …) such that multipliers · g has Σ μ (d m + a S)."""
+        return None
 
     @property
     def nonzeros(self) -> tuple[int, int]:
         """How many further entries Jacobian and Hessian have."""
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
+
+
+def together(parts: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
+    """Rows and columns of all."""
+    none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    rows, columns = zip(none, *parts, strict=True)
+    return np.concatenate(rows), np.concatenate(columns)

@@ -370,7 +370,9 @@ class Collocation:
     def constraint_values(self, z: Array) -> Array:
         """g, scaled."""
         parts = self.parts(z)
-        rows = [part.segment.constraint_values(part.x, part.setting) for part in parts]
+        rows = [
+            part.segment.constraint_values(part.x, part.setting, part.history) for part in parts
+        ]
         further = [each.values(parts[each.number], z) for each in self.carried]
         return np.concatenate([*rows, *further])
 
@@ -494,9 +496,9 @@ class Collocation:
             mine = [each for each in self.carried if each.number == number]
             of_rows = sum((each.row_weights(multipliers) for each in mine), start=0.0)
             weights.append(segment.weights(multipliers[segment.rows], of_rows))
-            of_memory = [mu for each in mine for mu in each.memory_weights(multipliers)]
+            carried = next((c for each in mine if (c := each.remembered(part, multipliers))), None)
             at = part.x, part.phi, part.setting, weights[number], weight
-            found, more = segment.hessian_values(*at, here, of_memory, bent)
+            found, more = segment.hessian_values(*at, here, carried, bent)
             by_q, further, used = by_q + found, further + more, used + len(here)
         for each in self.carried:
             at = parts[each.number], z, weight, multipliers, weights[each.number]
@@ -544,7 +546,7 @@ class Collocation:
         largest = 0.0
         for part in self.parts(z):
             dynamics = part.setting.dynamics
-            total = dynamics.force(part.x)
+            total = dynamics.force(part.x, part.history)
             external = dynamics.evaluated.weight.external_n
             for force in (total - external, external):
                 # What a grasp bears counts too: where nothing else acts, all other forces vanish.

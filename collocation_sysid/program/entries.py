@@ -4,11 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
+
+
+class Outer(NamedTuple):
+    """Entries whose rows and columns are sums of what broadcasts."""
+
+    rows: Sequence[Index | int]
+    columns: Sequence[Index | int]
+
+    @property
+    def count(self) -> int:
+        """How many these are."""
+        return int(np.prod(np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))))
+
+    def laid_out(self) -> tuple[Index, Index]:
+        """Row and column of each."""
+        rows, columns = np.broadcast_arrays(sum(self.rows), sum(self.columns))
+        return rows.ravel(), columns.ravel()
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +38,14 @@ class OffBand:
     indptr, indices : column pointers and row indices
     kept : place of each value of the smaller matrix; None where they all come first
     places : of each group, the place of each of its entries
+    repeats : of each group, whether several of its entries are at the same place
     """
 
     indptr: Index
     indices: Index
     kept: Index | None
     places: tuple[Index, ...]
+    repeats: tuple[bool, ...]
 
     @classmethod
     def of(
@@ -40,7 +60,7 @@ class OffBand:
         ----------
         structure : column pointers and row indices, ascending, of the first columns
         shape : rows and columns of the whole
-        groups : rows and columns of each group's entries, each entry once
+        groups : rows and columns of each group's entries
         """
         (indptr, indices), (height, width) = structure, shape
         wanted = [columns * height + rows for rows, columns in groups]
@@ -54,11 +74,13 @@ class OffBand:
         whole[is_kept], whole[added] = indices, codes[absent] - columns * height
         counts = np.bincount(columns, minlength=width)
         counts[: len(indptr) - 1] += np.diff(indptr)
+        numbers = [np.searchsorted(codes, each) for each in wanted]
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
             whole,
             None if is_kept[: len(indices)].all() else np.flatnonzero(is_kept),
-            tuple(own[np.searchsorted(codes, each)] for each in wanted),
+            tuple(own[each] for each in numbers),
+            tuple(bool(np.bincount(each, minlength=1).max() > 1) for each in numbers),
         )
 
     @property
@@ -82,8 +104,11 @@ class OffBand:
         else:
             values[:] = 0.0
             values[self.kept] = smaller
-        for places, more in zip(self.places, groups, strict=True):
-            values[places] += more
+        for places, repeats, more in zip(self.places, self.repeats, groups, strict=True):
+            if repeats:
+                np.add.at(values, places, more)
+            else:
+                values[places] += more
 
 
 def _found(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..model.setting import Setting
+from ..model.viscoelasticity import History
 from .channel import Motion
 from .segment import Segment
 from .sensing import Sensing
@@ -27,7 +28,7 @@ class Part:
     phi : (k,) its nuisance parameters
     x : (N, 3n) positions [m], or its first rows
     brought : (N, …) or None
-        What the evaluations bring from the past, where it is given; see `Dynamics`.
+        What the evaluations bring from the past, where that does not follow from x.
     given : mapping
         Of readings, by their numbers, what they look at where that does not follow from x.
     bent : bool
@@ -45,10 +46,12 @@ class Part:
     @cached_property
     def setting(self) -> Setting:
         """The physical parameters."""
-        found = self.segment.setting(self.q, self.phi)
-        if self.brought is None:
-            return found
-        return replace(found, dynamics=replace(found.dynamics, brought=self.brought))
+        return self.segment.setting(self.q, self.phi)
+
+    @cached_property
+    def history(self) -> History | None:
+        """What the evaluations went through, of a body with memory."""
+        return self.setting.dynamics.history(self.x, self.brought)
 
     @cached_property
     def sensing(self) -> Sensing:
@@ -58,7 +61,7 @@ class Part:
     @cached_property
     def motion(self) -> Motion:
         """What channels look at."""
-        return self.sensing.motion(self.x)
+        return self.sensing.motion(self.x, self.history)
 
     @cached_property
     def looked(self) -> list[Array]:
@@ -102,9 +105,9 @@ class Part:
     def forces(self) -> Linearisation:
         """Those of the evaluations with their slopes, valid until others are formed."""
         rows = self.segment.linearisation_rows
-        return self.setting.dynamics.linearise(self.x, rows)
+        return self.setting.dynamics.linearise(self.x, rows, self.history)
 
     @property
     def residual_n(self) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
-        return self.segment.residual_n(self.x, self.setting)
+        return self.segment.residual_n(self.x, self.setting, self.history)

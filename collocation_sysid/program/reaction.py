@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..model.dynamics import Dynamics
+from ..model.viscoelasticity import History
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
@@ -65,10 +66,10 @@ class HeldForces:
         self.force[:done], self.slopes[:done] = known.force, known.slopes
 
 
-def forces_on(dynamics: Dynamics, x: Array, dofs: Index) -> Array:
+def forces_on(dynamics: Dynamics, x: Array, dofs: Index, history: History | None = None) -> Array:
     """F (N, g) on some dofs at the evaluations of x (N, 3n), also those that grasps take."""
     force = np.zeros((len(x), len(dofs)))
-    force[dynamics.first_row :] = dynamics.force(x)[:, dofs]
+    force[dynamics.first_row :] = dynamics.force(x, history)[:, dofs]
     return force
 
 

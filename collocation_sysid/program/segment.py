@@ -6,7 +6,7 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -24,6 +24,7 @@ from ..model.nuisance import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..model.setting import Setting
+from ..model.viscoelasticity import History
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
 from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_values
@@ -406,9 +407,11 @@ class Segment:
 
     # Values ---------------------------------------------------------------------------------
 
-    def constraint_values(self, x: Array, setting: Setting) -> Array:
+    def constraint_values(
+        self, x: Array, setting: Setting, history: History | None = None
+    ) -> Array:
         """(constraints,) scaled rows at x (N, 3n) in metres."""
-        return self._rows(x, setting.dynamics.residual(x), setting)
+        return self._rows(x, setting.dynamics.residual(x, history), setting)
 
     def _rows(self, x: Array, residual: Array, setting: Setting) -> Array:
         rows = residual / self.force_n
@@ -428,9 +431,9 @@ class Segment:
         grasped[:, self.held_dofs] = True
         return self.of_rows(grasped)
 
-    def residual_n(self, x: Array, setting: Setting) -> Array:
+    def residual_n(self, x: Array, setting: Setting, history: History | None = None) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
-        residual = setting.dynamics.residual(x)
+        residual = setting.dynamics.residual(x, history)
         return self.dynamics.without_taken(residual)[:, self.free_dofs]
 
     @cached_property
@@ -573,7 +576,7 @@ class Segment:
         weights: RowWeights,
         loss_weight: float,
         values: Array,
-        memory_weights: Sequence[Array] = (),
+        carried: tuple[History, Array] | None = None,
         bent: bool = True,
     ) -> tuple[Array, list[Array]]:
         """Second derivatives of loss_weight · L + weights · c.
@@ -582,7 +585,7 @@ class Segment:
         ----------
         values : (hessian.nnz,) out, of the dynamics in the columns of x
         bent : whether readings are, see `LocalLoss.hessian`
-        memory_weights : μ (N, …) of each branch
+        carried : optional, a history and μ (N, all branches)
             Where the memory is given, Σ μ_k (d_k m_{k−1} + a_k S_k) is added; see `memory`.
 
         Returns
@@ -591,7 +594,7 @@ class Segment:
         further : list of the values of `further_entries`
         """
         dynamics, band = setting.dynamics, self.hessian
-        curvature = self._curvature(x, setting, weights.forces, memory_weights)
+        curvature = self._curvature(x, setting, weights.forces, carried)
         band.fill(
             values, curvature.position_position, curvature.position_velocity, self.body.threads
         )
@@ -621,19 +624,19 @@ class Segment:
         return twice[: self.nq, : self.nq], further
 
     def _curvature(
-        self, x: Array, setting: Setting, weights: Array, memory_weights: Sequence[Array]
+        self, x: Array, setting: Setting, weights: Array, carried: tuple[History, Array] | None
     ) -> Curvature:
         """That of the forces and the memory at all N evaluations, a given start included."""
         dynamics = setting.dynamics
         xi = dynamics.combine(dynamics.state_weights, x)
         nu = dynamics.combine(dynamics.tables.q, x) / dynamics.step_s
-        history = dynamics.history(x) if memory_weights else None
-        past = history and history.carried(slice(None))
-        sigma = history and history.stress_weights(memory_weights)
-        rows = self._curvature_rows
-        curvature = dynamics.forces.curvature(xi, nu, weights, rows, past, sigma)
-        if history:
-            history.add_curvature(curvature, memory_weights)
+        at = xi, nu, weights, self._curvature_rows
+        if carried is None:
+            return dynamics.forces.curvature(*at)
+        history, mu = carried
+        borne = history.carried(slice(None)), history.stress_weights(mu)
+        curvature = dynamics.forces.curvature(*at, *borne)
+        history.add_curvature(curvature, mu)
         return curvature
 
     @cached_property

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.setting import Setting
+from ..model.viscoelasticity import History
 from .block_band import Submatrix
 from .channel import Forced, Motion
 from .reaction import HeldForces, forces_on, reaction_slopes, reactions
@@ -48,13 +49,14 @@ class Sensing:
     setting: Setting
     phi: Array
 
-    def motion(self, x: Array) -> Motion:
+    def motion(self, x: Array, history: History | None = None) -> Motion:
         """Positions x (N, 3n), or the first rows, with the reactions that follow from them."""
-        return Motion(x, lambda: self._forced(x))
+        return Motion(x, lambda: self._forced(x, history))
 
-    def _forced(self, x: Array) -> Forced:
+    def _forced(self, x: Array, history: History | None = None) -> Forced:
         dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
-        force, mass_kg = forces_on(dynamics, x, dofs), self._mass_kg[: len(x)]
+        force = forces_on(dynamics, x, dofs, history)
+        mass_kg = self._mass_kg[: len(x)]
         reaction = reactions(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
         return Forced(reaction, x[:, dofs])
 

@@ -82,13 +82,13 @@ class LastRows:
     solutions : (3n, c) Y_{t−i}
     increments : (free, c) dF_{t−j}
     forces : (free,) total forces F_{t−j} at the evaluations
-    overstress : dm of each branch
+    overstress : (c, …) dm of all branches, where a body has a memory
     """
 
     solutions: tuple[Array, ...]
     increments: tuple[Array, ...]
     forces: tuple[Array, ...] = ()
-    overstress: tuple[Array, ...] = ()
+    overstress: Array | None = None
 
 
 class Step(NamedTuple):
@@ -469,7 +469,8 @@ class Forward:
         size, reach = solver.pattern.size, solver.dynamics.reach
         self.shape, self._of_free = (size, columns.count), (len(solver.free), columns.count)
         nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
-        last = last or LastRows(*((each,) * reach for each in nothing))
+        solutions, increments, forces = ((each,) * reach for each in nothing)
+        last = last or LastRows(solutions, increments, forces)
         self.past = deque(last.solutions, maxlen=reach)
         self.past_increments = deque(last.increments, maxlen=reach)
         self.past_forces = deque(last.forces, maxlen=reach)
@@ -481,7 +482,7 @@ class Forward:
     @property
     def last(self) -> LastRows:
         """What later rows depend on."""
-        overstress = tuple(self.slopes.columns) if self.slopes else ()
+        overstress = self.slopes.columns if self.slopes else None
         past = tuple(self.past), tuple(self.past_increments), tuple(self.past_forces)
         return LastRows(*past, overstress)
 

@@ -12,7 +12,7 @@ read are values of L W, L being a first-order low-pass.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -24,6 +24,7 @@ from ..fem.pattern import dofs_of
 from ..model.dynamics import Dynamics
 from ..model.generated import Generated
 from ..model.nuisance import NuisanceMap
+from ..model.recursion import Course, Recursion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.nuisance import SENSOR_LAG, TOOL_CENTRE, TOOL_MASS, NuisanceRow, rotation
@@ -190,7 +191,7 @@ class GraspWrench:
         return Generated(_moment, 6, 15)
 
     @cached_property
-    def _moment_data(self) -> Array:
+    def moment_data(self) -> Array:
         """(15, n, h)."""
         axes, points = self.frames
         nodes = len(self.held) // 3
@@ -204,7 +205,7 @@ class GraspWrench:
         both = forced.position_m[k], forced.reaction[k + self.on.late]
         shape = len(k), len(self.places) // 3, 3
         u = [np.moveaxis(each[:, self.places].reshape(shape), 2, 0) for each in both]
-        return np.concatenate(u), self._moment_data[:, : len(k)]
+        return np.concatenate(u), self.moment_data[:, : len(k)]
 
     def arms(self, forced: Forced) -> tuple[Array, Array]:
         """A and B (n, 6, d) of dW = A dR + B dx, W = A R."""
@@ -282,24 +283,26 @@ class GraspWrench:
         """Position in φ of what its time constant T is not known by; none without a low-pass."""
         return self.phi_places(SENSOR_LAG)
 
-    def fading(self, phi: Array) -> Array | None:
-        """Coefficients of the low-pass, see `fading`."""
-        if not len(self.lag_phi):
+    def low_passed(self, value: Array, phi: Array) -> Course | None:
+        """What the low-pass makes of W (n, 6); None without one."""
+        if not len(self.lag_phi) or not len(value):
             return None
-        lag_s = float(phi[self.lag_phi[0]] * self.nuisance.scales[self.lag_phi[0]])
-        return fading(lag_s, self.on.step_s)
+        data = self.low_pass_data[:, : len(value), None]
+        return Course.of(LOW_PASS, phi[self.lag_phi], data, value[None])
+
+    @cached_property
+    def low_pass_data(self) -> Array:
+        """(2, n) of `LOW_PASS`."""
+        per_step = self.nuisance.scales[self.lag_phi] / self.on.step_s
+        return np.stack([np.arange(self.count) == 0, np.repeat(per_step, self.count)])
 
     # As channels are --------------------------------------------------------------------------
 
     def values(self, motion: Motion, phi: Array) -> Array:
         """Y = L W (n, 2, 3)."""
-        return self.read(self.on_grid(motion.forced, phi), phi)
-
-    def read(self, value: Array, phi: Array) -> Array:
-        """Y (n, 2, 3) of W (n, 6)."""
-        e_a_b = self.fading(phi)
-        smooth = value if e_a_b is None or not len(value) else smoothed(e_a_b[:, 0], value)
-        return smooth.reshape(-1, 2, 3)
+        value = self.on_grid(motion.forced, phi)
+        course = self.low_passed(value, phi)
+        return (course.states[0] if course else value).reshape(-1, 2, 3)
 
     def linearised(
         self, motion: Motion, phi: Array, columns: Index, size: int
@@ -316,12 +319,9 @@ class GraspWrench:
         if len(self.tool_phi):
             by_phi = self.tool.slopes(*self.tool_at(phi, len(k)))[1]
             slope[..., first + self.tool_phi] += np.moveaxis(by_phi, 2, 0)
-        if len(k) and (e_a_b := self.fading(phi)) is not None:
-            (place,), read = self.lag_phi, smoothed(e_a_b[:, 0], value)
-            slope = smoothed(e_a_b[:, 0], slope)
-            by_lag = smoothed_slope(e_a_b, value, read)
-            slope[..., first + place] += self.nuisance.scales[place] * by_lag
-            value = read
+        if course := self.low_passed(value, phi):
+            by_lag = np.arange(size) == first + self.lag_phi[:, None]
+            value, slope = course.states[0], course.forward(slope[None], by_lag)[0]
         slope = slope.reshape(len(k), 2, 3, size)
         return value.reshape(len(k), 2, 3), Slopes.along(np.arange(size), slope)
 
@@ -330,11 +330,8 @@ class GraspWrench:
         forced, by_phi = motion.forced, np.zeros(len(phi))
         by_x, by_reaction = np.zeros_like(motion.x), np.zeros_like(forced.reaction)
         by_w = by_values.reshape(-1, 6)
-        if len(by_w) and (e_a_b := self.fading(phi)) is not None:
-            value = self.on_grid(forced, phi)
-            by_lag = smoothed_slope(e_a_b, value, smoothed(e_a_b[:, 0], value))
-            by_phi[self.lag_phi] = self.nuisance.scales[self.lag_phi] * np.sum(by_w * by_lag)
-            by_w = pulled_through(e_a_b[:, 0], by_w)
+        if course := self.low_passed(self.on_grid(forced, phi), phi):
+            (by_w,), by_phi[self.lag_phi] = course.backward(by_w[None])
         if len(self.tool_phi):
             slopes = self.tool.slopes(*self.tool_at(phi, len(by_w)))[1]
             by_phi[self.tool_phi] += np.einsum("na,abn->b", by_w, slopes)
@@ -357,12 +354,9 @@ class GraspWrench:
         k = self.grid[: len(value)]
         off = np.concatenate([turns[k], shifts[k]], axis=2)
         change = np.einsum("abn,ncb->nac", slopes, off)
-        return self.read_changes(change, phi).reshape(len(change), 2, 3, change.shape[2])
-
-    def read_changes(self, change: Array, phi: Array) -> Array:
-        """Those of Y (n, 6, c) from those of W."""
-        e_a_b = self.fading(phi)
-        return change if e_a_b is None or not len(change) else smoothed(e_a_b[:, 0], change)
+        if course := self.low_passed(value, phi):
+            (change,) = course.forward(change[None], np.zeros((1, change.shape[2])))
+        return change.reshape(len(change), 2, 3, change.shape[2])
 
     @cached_property
     def _off(self) -> Generated:
@@ -397,63 +391,13 @@ def _by_dof(by_node: Array) -> Array:
     return np.ascontiguousarray(by_node).reshape(*by_node.shape[:2], -1)
 
 
-def _accumulated(e: float, given: Array) -> Array:
-    """y_k = e y_{k−1} + given_k (n, …)."""
-    found = np.array(given)  # `scipy.signal` would cost every command a third of a second
-    for k in range(1, len(found)):
-        found[k] += e * found[k - 1]
-    return found
-
-
-def smoothed(e_a_b: Array, value: Array) -> Array:
-    """y_k = e y_{k−1} + a W_{k−1} + b W_k of W (n, …), steady before."""
-    given = stepped(e_a_b, value, np.zeros_like(value))
-    given[0] = value[0]
-    return _accumulated(e_a_b[0], given)
-
-
-def smoothed_slope(coefficients: Array, value: Array, read: Array) -> Array:
-    """The slope of y by T, from W and y."""
-    change = np.zeros_like(value)
-    change[1:] = stepped(coefficients[:, 1], value, read)[1:]
-    return _accumulated(coefficients[0, 0], change)
-
-
-def pulled_through(e_a_b: Array, by_read: Array) -> Array:
-    """Slopes of a scalar by W (n, …), from those by y."""
-    e, a, b = e_a_b
-    through = _accumulated(e, by_read[::-1])[::-1]
-    found = b * through
-    found[0] = through[0]
-    found[:-1] += a * through[1:]
-    return found
-
-
-def stepped(e_a_b: Array, value: Array, before: Array) -> Array:
-    """E y_{k−1} + a W_{k−1} + b W_k (n, …) of any y; zero at first."""
-    e, a, b = e_a_b
-    found = np.zeros_like(value)
-    found[1:] = e * before[:-1] + a * value[:-1] + b * value[1:]
-    return found
-
-
-def fading(lag_s: float, step_s: float) -> Array:
-    """(3, 3) e, a and b of y_k = e y_{k−1} + a W_{k−1} + b W_k, each with two slopes by T.
-
-    That is y' = (W − y) / T, W linear between grid times.
-    """
-    if lag_s < 1e-6 * step_s:
-        return np.array([[0.0, 0.0, 0.0], [0.0, 1 / step_s, 0.0], [1.0, -1 / step_s, 0.0]])
-    return _fading()(lag_s, step_s).full()
-
-
-@cache
-def _fading() -> ca.Function:
-    lag_s, step_s = ca.SX.sym("lag_s"), ca.SX.sym("step_s")
-    share = lag_s / step_s
-    e = ca.exp(-1 / share)
+def _low_pass(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -> ca.SX:
+    """Y' = (W − Y) / T, W linear between grid times, and steady before the first."""
+    began, share = data[0], lag * data[1]
+    e = ca.exp(-1 / ca.fmax(share, 1e-6))
     a = share * (1 - e) - e
-    value = ca.vertcat(e, a, 1 - e - a)
-    slope = ca.jacobian(value, lag_s)
-    both = ca.horzcat(value, slope, ca.jacobian(slope, lag_s))
-    return ca.Function("fading", [lag_s, step_s], [both])
+    return began * now + (1 - began) * (e * before + a * last + (1 - e - a) * now)
+
+
+# Of T by the φ of `lag_phi`; data are whether it is the start, and T / Δt of a φ of one.
+LOW_PASS = Recursion(_low_pass, 1, 1, 1, 2)
