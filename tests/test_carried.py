@@ -11,7 +11,7 @@ import pytest
 from checks import assert_derivative, relative_error
 from problems_small import GUESS, hung_cube
 
-from collocation_sysid.model.recursion import Course, Recursion
+from collocation_sysid.model.recursion import Evolution, Recursion
 from collocation_sysid.program.carried import Carried, Places
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.part import Part
@@ -47,9 +47,9 @@ class Stretches(Carried):
     def began(self) -> np.ndarray:
         return (np.arange(self.segment.grid_rows) == 0)[None, :, None]
 
-    def course(self, part: Part) -> Course:
+    def evolution(self, part: Part) -> Evolution:
         modulus_pa = np.exp(part.q[:1])
-        return Course.of(STRETCH, modulus_pa, self.began, self.looked(part.x))
+        return Evolution.of(STRETCH, modulus_pa, self.began, self.looked(part.x))
 
     def looked(self, x: np.ndarray) -> np.ndarray:
         """(6, N, 3, …) positions of each pair."""
@@ -57,7 +57,7 @@ class Stretches(Carried):
         return np.moveaxis(at.reshape(len(x), 3, 6, *x.shape[2:]), 2, 0)
 
     def following(self, part: Part) -> np.ndarray:
-        return self.course(part).states.ravel()
+        return self.evolution(part).states.ravel()
 
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
@@ -124,14 +124,18 @@ def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
     )
     rows = program.jacobian(z)[carried.rows].toarray()
     (part,) = program.parts_at(program.guess_p, [x])
-    course, moved, by_q = carried.course(part), rng.normal(size=(*x.shape, 2)), rng.normal(size=2)
-    change = course.forward(carried.looked(moved), np.exp(part.q[:1]) * by_q[None])
+    evolution, moved, by_q = (
+        carried.evolution(part),
+        rng.normal(size=(*x.shape, 2)),
+        rng.normal(size=2),
+    )
+    change = evolution.forward(carried.looked(moved), np.exp(part.q[:1]) * by_q[None])
     columns = np.vstack([by_q, moved.reshape(-1, 2) / segment.length_m])
     sides = rows[:, [0, *range(*segment.columns.indices(len(z)))]] @ columns
     expected = -np.linalg.solve(rows[:, carried.variables], sides)
     assert relative_error(change.reshape(-1, 2), expected) < 1e-12
-    weights = rng.normal(size=course.states.shape)
-    by_looked, by_modulus = course.backward(weights)
+    weights = rng.normal(size=evolution.states.shape)
+    by_looked, by_modulus = evolution.backward(weights)
     along = np.einsum("ikp,ikpc->c", by_looked, carried.looked(moved))
     along += by_modulus[0] * np.exp(part.q[0]) * by_q
     expected = weights.ravel() @ change.reshape(-1, 2)

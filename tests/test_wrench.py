@@ -26,7 +26,7 @@ from wrenches_small import EVERYTHING, felt, fitted, sensing, wristed_cube
 from collocation_sysid.methods.comparison.shooting import simulated
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.model.recursion import Course
+from collocation_sysid.model.recursion import Evolution
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.channel import Forced, Motion
 from collocation_sysid.program.collocation import Collocation, Part
@@ -163,9 +163,9 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
     assert errors[1] < 0.4 * errors[0]
 
 
-def low_passed(signal: np.ndarray, lag_s: float, step_s: float = 0.01) -> Course:
+def low_passed(signal: np.ndarray, lag_s: float, step_s: float = 0.01) -> Evolution:
     data = np.stack([np.arange(len(signal)) == 0, np.full(len(signal), 1 / step_s)])
-    return Course.of(LOW_PASS, np.array([lag_s]), data[..., None], signal[None, :, None])
+    return Evolution.of(LOW_PASS, np.array([lag_s]), data[..., None], signal[None, :, None])
 
 
 def test_a_low_pass_follows_a_ramp_by_its_time_constant():

@@ -64,7 +64,7 @@ class Recursion:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class Evolution:
     """A recursion along what it looks at.
 
     Attributes
@@ -83,7 +83,7 @@ class Course:
     states: Array
 
     @classmethod
-    def of(cls, recursion: Recursion, constants: Array, data: Array, looked: Array) -> Course:
+    def of(cls, recursion: Recursion, constants: Array, data: Array, looked: Array) -> Evolution:
         """From the start on; data need not be told for each instance."""
         data = np.broadcast_to(data, (recursion.data, *looked.shape[1:]))
         states = np.zeros((recursion.state, *looked.shape[1:]))

@@ -24,7 +24,7 @@ from ..fem.pattern import dofs_of
 from ..model.dynamics import Dynamics
 from ..model.generated import Generated
 from ..model.nuisance import NuisanceMap
-from ..model.recursion import Course, Recursion
+from ..model.recursion import Evolution, Recursion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.nuisance import SENSOR_LAG, TOOL_CENTRE, TOOL_MASS, NuisanceRow, rotation
@@ -283,12 +283,12 @@ class GraspWrench:
         """Position in φ of what its time constant T is not known by; none without a low-pass."""
         return self.phi_places(SENSOR_LAG)
 
-    def low_passed(self, value: Array, phi: Array) -> Course | None:
+    def low_passed(self, value: Array, phi: Array) -> Evolution | None:
         """What the low-pass makes of W (n, 6); None without one."""
         if not len(self.lag_phi) or not len(value):
             return None
         data = self.low_pass_data[:, : len(value), None]
-        return Course.of(LOW_PASS, phi[self.lag_phi], data, value[None])
+        return Evolution.of(LOW_PASS, phi[self.lag_phi], data, value[None])
 
     @cached_property
     def low_pass_data(self) -> Array:
@@ -301,8 +301,8 @@ class GraspWrench:
     def values(self, motion: Motion, phi: Array) -> Array:
         """Y = L W (n, 2, 3)."""
         value = self.on_grid(motion.forced, phi)
-        course = self.low_passed(value, phi)
-        return (course.states[0] if course else value).reshape(-1, 2, 3)
+        evolution = self.low_passed(value, phi)
+        return (evolution.states[0] if evolution else value).reshape(-1, 2, 3)
 
     def linearised(
         self, motion: Motion, phi: Array, columns: Index, size: int
@@ -319,9 +319,9 @@ class GraspWrench:
         if len(self.tool_phi):
             by_phi = self.tool.slopes(*self.tool_at(phi, len(k)))[1]
             slope[..., first + self.tool_phi] += np.moveaxis(by_phi, 2, 0)
-        if course := self.low_passed(value, phi):
+        if evolution := self.low_passed(value, phi):
             by_lag = np.arange(size) == first + self.lag_phi[:, None]
-            value, slope = course.states[0], course.forward(slope[None], by_lag)[0]
+            value, slope = evolution.states[0], evolution.forward(slope[None], by_lag)[0]
         slope = slope.reshape(len(k), 2, 3, size)
         return value.reshape(len(k), 2, 3), Slopes.along(np.arange(size), slope)
 
@@ -330,8 +330,8 @@ class GraspWrench:
         forced, by_phi = motion.forced, np.zeros(len(phi))
         by_x, by_reaction = np.zeros_like(motion.x), np.zeros_like(forced.reaction)
         by_w = by_values.reshape(-1, 6)
-        if course := self.low_passed(self.on_grid(forced, phi), phi):
-            (by_w,), by_phi[self.lag_phi] = course.backward(by_w[None])
+        if evolution := self.low_passed(self.on_grid(forced, phi), phi):
+            (by_w,), by_phi[self.lag_phi] = evolution.backward(by_w[None])
         if len(self.tool_phi):
             slopes = self.tool.slopes(*self.tool_at(phi, len(by_w)))[1]
             by_phi[self.tool_phi] += np.einsum("na,abn->b", by_w, slopes)
@@ -354,8 +354,8 @@ class GraspWrench:
         k = self.grid[: len(value)]
         off = np.concatenate([turns[k], shifts[k]], axis=2)
         change = np.einsum("abn,ncb->nac", slopes, off)
-        if course := self.low_passed(value, phi):
-            (change,) = course.forward(change[None], np.zeros((1, change.shape[2])))
+        if evolution := self.low_passed(value, phi):
+            (change,) = evolution.forward(change[None], np.zeros((1, change.shape[2])))
         return change.reshape(len(change), 2, 3, change.shape[2])
 
     @cached_property

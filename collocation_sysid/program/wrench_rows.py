@@ -89,8 +89,8 @@ class WrenchRows(Carried):
     def following(self, part: Part) -> Array:
         """W and Y as they follow from the motion."""
         own = [self.channel.on_grid(part.motion.forced, part.phi)]
-        if course := self.channel.low_passed(own[0], part.phi):
-            own += [*course.states]
+        if evolution := self.channel.low_passed(own[0], part.phi):
+            own += [*evolution.states]
         return (np.stack(own) / self._unit).ravel()
 
     # Equations ----------------------------------------------------------------------------------
