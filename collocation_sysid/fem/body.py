@@ -33,7 +33,7 @@ from .memory import Past
 from .mesh import TetMesh
 from .node_force import NodeForce, PlacedForce
 from .pattern import Joined, SymmetricPattern
-from .regions import BodyPart, Model, Region, Theta, parts_of
+from .regions import BodyPart, Region, SumOfParts, Theta, parts_of
 from .selection import Selection
 from .stress import Stresses
 
@@ -184,7 +184,7 @@ class Body(Discretisation):
         other = copy(self)
         for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
             vars(other).pop(name, None)
-        Model.__init__(other, free, self.forces)
+        SumOfParts.__init__(other, free, self.forces)
         other._evaluators = {}
         return other
 

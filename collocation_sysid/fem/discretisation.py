@@ -18,16 +18,16 @@ from .memory import Past, PointLayout
 from .mesh import Nodes, TetMesh
 from .node_force import NodeForce
 from .pattern import SymmetricPattern, element_destinations, in_ascending_order
-from .regions import BodyPart, Model, Theta
+from .regions import BodyPart, SumOfParts, Theta
 from .selection import Selection
 
 
-class Discretisation(Model):
+class Discretisation(SumOfParts):
     """A mesh of elements with quadrature points, and evaluators of what is summed over them.
 
     Parameters
     ----------
-    parts, forces : see `Model`
+    parts, forces : see `SumOfParts`
     mesh, element, evaluator, threads : see `Body`
     """
 

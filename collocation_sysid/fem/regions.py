@@ -226,7 +226,7 @@ def _cells(mesh: TetMesh, given: Selection | ArrayLike) -> Index:
 Theta = Sequence[float] | Array
 
 
-class Model:
+class SumOfParts:
     """A sum of terms, part by part.
 
     Parameters
