@@ -74,10 +74,10 @@ class ReducedSpace(SearchOptions):
         search = ReducedSearch(self, recorder, start, workers)
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
-        found = search.x and workers.fetch(workers.each(positions, search.x))
-        z = completed(collocation, search.p, found)
+        solved = search.x and workers.fetch(workers.each(positions, search.x))
+        z = completed(collocation, search.p, solved)
         rows = [segment.grid_rows for segment in collocation.segments]
-        reached = found is not None and [len(x) for x in found] == rows
+        reached = solved is not None and [len(x) for x in solved] == rows
         recorder.notes += _notes(collocation, search.indefinite, z, status)
         multipliers = None if reached else np.zeros(collocation.constraints)
         return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)

@@ -56,9 +56,9 @@ class Generated:
     def depends(self) -> NDArray[np.bool_]:
         """(k,) whether any y depends on each of u."""
         u, _, y = self._symbols
-        found = np.zeros(self.inputs, dtype=bool)
-        found[ca.jacobian(y, u).sparsity().get_col()] = True
-        return found
+        depends = np.zeros(self.inputs, dtype=bool)
+        depends[ca.jacobian(y, u).sparsity().get_col()] = True
+        return depends
 
     def takes(self, datum: int) -> bool:
         """Whether any y depends on a number of the data."""
@@ -129,16 +129,16 @@ class Generated:
         # CasADi declares no type for what it takes.
         take: Any = buffer.set_arg
         give: Any = buffer.set_res
-        given = [np.ascontiguousarray(x.reshape(len(x), count).T, float) for x in (u, *others)]
-        found = [np.empty((count, columns, rows)) for rows, columns in sizes]
-        for place, each in enumerate(given):
+        arguments = [np.ascontiguousarray(x.reshape(len(x), count).T, float) for x in (u, *others)]
+        results = [np.empty((count, columns, rows)) for rows, columns in sizes]
+        for place, each in enumerate(arguments):
             if each.size:
                 take(place, each.data)
-        for place, each in enumerate(found):
+        for place, each in enumerate(results):
             give(place, each.data)
         evaluate()
         axes = len(shape) + 1, len(shape), *range(len(shape))
-        return [each.reshape(*shape, *each.shape[1:]).transpose(axes) for each in found]
+        return [each.reshape(*shape, *each.shape[1:]).transpose(axes) for each in results]
 
     @cached_property
     def _mappings(self) -> dict[tuple[str, int], ca.Function]:

@@ -162,10 +162,10 @@ class RowEquations:
 
     def under(self, share: float) -> RowEquations:
         """The same when a share of the change of a static load has come."""
-        found = copy(self)
+        eased = copy(self)
         if self.forces_before is not None:
-            found.forces = self.forces_before.towards(self.forces, share)
-        return found
+            eased.forces = self.forces_before.towards(self.forces, share)
+        return eased
 
     def force(self, x: Array) -> Array:
         """F_t."""

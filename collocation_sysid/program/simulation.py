@@ -158,9 +158,9 @@ def _gauged(
 
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
     """The same experiment with other values (S, 6) at the grasps that have a sensor."""
-    found, grasps = iter(wrenches), []
+    values, grasps = iter(wrenches), []
     for grasp in experiment.grasps:
-        sensor = grasp.wrench and replace(grasp.wrench, values=next(found))
+        sensor = grasp.wrench and replace(grasp.wrench, values=next(values))
         grasps.append(replace(grasp, wrench=sensor))
     return replace(experiment, grasps=grasps)
 

@@ -36,13 +36,13 @@ MISSING = (
 @cache
 def library() -> Any:
     """MKL, or None where it is not installed."""
-    found = []
+    paths = []
     try:
         files = metadata.files("mkl") or []
-        found = [str(each.locate()) for each in files if "mkl_rt" in each.name]
+        paths = [str(each.locate()) for each in files if "mkl_rt" in each.name]
     except metadata.PackageNotFoundError:
-        found = [name for name in [find_library("mkl_rt")] if name]
-    for path in sorted(found):
+        paths = [name for name in [find_library("mkl_rt")] if name]
+    for path in sorted(paths):
         try:
             mkl = ctypes.CDLL(path)
         except OSError:
