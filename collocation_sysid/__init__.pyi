@@ -41,8 +41,10 @@ from .recording import (
     place_markers,
 )
 from .runs.refine import refine
+from .statistics.assumptions import Assumptions
 
 __all__ = [
+    "Assumptions",
     "AugmentedLagrangian",
     "Ball",
     "Body",

@@ -24,6 +24,8 @@ from .runs.result import Result
 from .runs.solving import read_where_found, shared, solve
 from .runs.told import result_of
 from .runs.warm_start import Earlier
+from .statistics.assumptions import assumed
+from .statistics.budget import Sources
 from .statistics.causes import likely_causes
 from .statistics.diagnostics import diagnose
 from .statistics.linearised import linearised_fit
@@ -174,7 +176,12 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> Run:
         )
     except InputError as error:
         raise error.located(problem.path) from error
-    found = replace(found, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
+    say("finding what is assumed is worth")
+    collocation, z = solution.collocation, solution.z
+    changes = assumed(collocation, z, options.assumptions.deviations)
+    sources = Sources.of(fit, changes, collocation.parameters, solution.q)
+    notes = tuple(noise.sentence for noise in noises)
+    found = replace(found, uncertainty=uncertainty, notes=notes, sources=sources)
     estimates = found.noise_estimates
     return replace(found, refinement=step_error(problem, solution, fit, rollouts, estimates))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_type_hints
 
 from pydantic import (
@@ -88,10 +88,14 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
 
 def _options(kind: Any) -> dict[str, Any]:
     types, said = get_type_hints(kind, include_extras=True), documented(kind)
-    return {
-        each.name: (types[each.name], Field(each.default, description=said.get(each.name)))
-        for each in fields(kind)
-    }
+    keys: dict[str, Any] = {}
+    for each in fields(kind):
+        form, default = types[each.name], each.default
+        if isinstance(form, type) and is_dataclass(form):
+            form = section_of(form, f"{form.__name__}Section")
+            default = form()
+        keys[each.name] = (form, Field(default, description=said.get(each.name)))
+    return keys
 
 
 def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:

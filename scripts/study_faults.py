@@ -5,6 +5,8 @@ also fits them and have white noise. Every twin has one fault, drawn at its size
 as a user does who states nothing: with the default nuisance parameters, noise and errors. It is
 solved from the truth. Counted is how often an interval holds the truth; beside it stand the median
 standard errors, and for faultless twins by how much those without nuisance parameters are smaller.
+Where something that is assumed is wrong, drawn from its deviation, counted is also how often the
+whole interval holds it, of a budget that has this assumption, or all of them.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from assumed_twins import wrong
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -31,6 +34,9 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumption, changed_residuals
+from collocation_sysid.statistics.budget import Sources, budget
+from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
 Array = NDArray[np.float64]
@@ -49,6 +55,7 @@ class Outcome:
     Attributes
     ----------
     held : (6,) one where an interval holds the truth, zero where not, NaN without one
+    whole : (6,) the same of the whole interval
     relative : (6,) standard errors over the true values, NaN where there is none
     without : (6,) standard errors without nuisance parameters over the true values, or NaN
     correlated : bool
@@ -57,6 +64,7 @@ class Outcome:
 
     converged: bool
     held: Array
+    whole: Array
     relative: Array
     without: Array
     correlated: bool
@@ -93,7 +101,7 @@ def run(fault: str, seed: Sequence[int]) -> Outcome:
     actual, stated = FAULTS[fault](measured(), rng)
     tracks = actual.markers.positions_m
     tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
-    found, converged = identified(with_markers(stated, tracks))
+    found, whole, converged = identified(with_markers(stated, tracks), ROWS.get(fault, ()))
     without = np.full(len(QUANTITIES), np.nan)
     if actual is stated:
         ideal = replace(with_markers(stated, tracks), nuisance=Nuisance.none())
@@ -101,6 +109,7 @@ def run(fault: str, seed: Sequence[int]) -> Outcome:
     return Outcome(
         converged,
         np.array(held(found)),
+        whole,
         relative_errors(found),
         without,
         found.errors == "autocorrelated",
@@ -120,12 +129,23 @@ def positions_m() -> Array:
     return x.reshape(len(x), -1, 3)
 
 
-def identified(experiment: Experiment) -> tuple[Uncertainty, bool]:
+def identified(
+    experiment: Experiment, assumed: Sequence[Assumption] = ()
+) -> tuple[Uncertainty, Array, bool]:
     """With every option left to its default, from the truth."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
-    found = covariance(solution.collocation, solution.z)
-    return found, solution.status.converged
+    collocation, z = solution.collocation, solution.z
+    found = covariance(collocation, z)
+    changes = changed_residuals(collocation, z, [(row, row.sigma) for row in assumed])
+    fit = linearised_fit(collocation, z)
+    sources = Sources.of(fit, changes, collocation.parameters, solution.q)
+    lines, true = budget(sources, found, {}), truth()
+    whole = [
+        float(lines[n].whole95[0] <= true[n] <= lines[n].whole95[1]) if n in lines else np.nan
+        for n in QUANTITIES
+    ]
+    return found, np.array(whole), solution.status.converged
 
 
 def relative_errors(found: Uncertainty) -> Array:
@@ -232,6 +252,30 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
     return replace(experiment, markers=markers)
 
 
+def drawn(names: Sequence[str]) -> Callable[..., Pair]:
+    """What is assumed is off, each drawn from its deviation; air never drives a body."""
+
+    def fault(experiment: Experiment, rng: Generator) -> Pair:
+        off = {}
+        for row in (row for row in ASSUMPTIONS if row.name in names):
+            for name in row.components:
+                way = rng.standard_normal()
+                off[name] = row.sigma * (abs(way) if row.name in AIR else way)
+        values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
+        return wrong(experiment, values, off), experiment
+
+    return fault
+
+
+AIR = ("air_drag", "added_mass", "buoyancy")
+SINGLE = (
+    *("body_scale", "mass", "density_gradient", "anisotropy", "stiffness_drift", "time_scale"),
+    *AIR,
+)
+# What a budget has of each fault.
+ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE} | {"assumed: all of these": SINGLE}
+ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
+
 FAULTS: dict[str, Callable[[Experiment, Generator], Pair]] = {
     "none": faultless,
     "clock 2 ms late": late(0.002),
@@ -245,7 +289,7 @@ FAULTS: dict[str, Callable[[Experiment, Generator], Pair]] = {
     "one marker 3 times as noisy": loose,
     "places 1 mm": misplaced,
     "places not known": unplaced,
-}
+} | {fault: drawn(names) for fault, names in ASSUMED.items()}
 
 
 # Table --------------------------------------------------------------------------------------------
@@ -263,7 +307,7 @@ def header(twins: int) -> str:
 
 
 def table_head() -> str:
-    columns = [f"{c} {what} %" for what in ("held", "error") for c in COLUMNS]
+    columns = [f"{c} {what} %" for what in ("held", "whole", "error") for c in COLUMNS]
     cells = ["fault", *columns, "correlated %", "lost"]
     return _line(cells) + "\n" + _line(["---"] * len(cells))
 
@@ -271,7 +315,7 @@ def table_head() -> str:
 def table_row(fault: str, outcomes: Sequence[Outcome]) -> str:
     """Shares that are held, and median standard errors over the true values."""
     good = [outcome for outcome in outcomes if outcome.converged]
-    columns = np.array([outcome.held for outcome in good]).T
+    columns = np.array([[*outcome.held, *outcome.whole] for outcome in good]).T
     errors = 100 * np.nanmedian([outcome.relative for outcome in good], axis=0)
     correlated = 100 * np.mean([outcome.correlated for outcome in good])
     lost = len(outcomes) - len(good)

@@ -65,6 +65,7 @@ def a_result(parameters: Mapping[str, FoundValue] | None = None, **changes: Any)
         parameters={"lambda_pa": value()} if parameters is None else parameters,
         derived={},
         basis=(),
+        budget={},
         places={},
         nuisance={},
         uncertainty=None,

@@ -8,7 +8,7 @@ from fits_small import PARAMETERS, problem
 from scipy.stats import binom, chi2, t
 
 from collocation_sysid.statistics.linearised import LinearisedFit
-from collocation_sysid.statistics.scatter import Disagreement, single_fits
+from collocation_sysid.statistics.scatter import Scatter, single_fits
 from collocation_sysid.statistics.trust import fit_concerns
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
 
@@ -36,7 +36,7 @@ def judged(seed: int, spread: float = 0.0) -> Uncertainty:
     return uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
 
 
-def scatter(found: Uncertainty) -> Disagreement:
+def scatter(found: Uncertainty) -> Scatter:
     assert found.scatter is not None
     return found.scatter
 

@@ -33,7 +33,7 @@ from collocation_sysid.program.collocation import Collocation, Part
 from collocation_sysid.program.marching import march
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.program.wrench_channel import LOW_PASS
-from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 
 
 def at_truth(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Part:
@@ -89,29 +89,14 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     assert relative_error(found[:, 3:], expected) < 1e-2
 
 
-def at_rest(steps: int = 8) -> Experiment:
-    """The hung cube in a hand that does not move."""
-    cube = hung_cube(steps)
-    (grasp,) = cube.grasps
-    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(cube.t_s), 1))
-    still = replace(grasp.poses, positions_m=0 * grasp.poses.positions_m, quaternions_xyzw=turns)
-    return replace(cube, grasps=[replace(grasp, poses=still)])
-
-
-def test_a_tool_behind_the_sensor_weighs_on_it_as_the_body_does():
-    hung = sensing(replace(at_rest(), nuisance=Nuisance.none(tool_kg=0.02)))
-    collocation = Collocation([hung], Parameters.of(TRUTH))
-    x = march(hung, collocation.segments[0].dynamics.with_theta(as_theta(TRUTH)))
-    (part,) = collocation.parts_at(np.array([1.5]), [x])
-    found = part.sensing.wrenches(x)[0][1:-1]  # nothing is sensed at the ends
-    weight_n = 9.81 * (hung.body.mass_kg + 0.03)
-    np.testing.assert_allclose(found[:, :3], np.tile([0, 0, weight_n], (len(found), 1)), atol=1e-9)
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_body_at_rest_is_carried(scheme: str):
-    still = at_rest()
-    _, found = total_on_grid(at_truth(sensing(still), scheme))
+    still = hung_cube(8)
+    (grasp,) = still.grasps
+    at_rest = replace(grasp, poses=replace(grasp.poses, positions_m=0 * grasp.poses.positions_m))
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(still.t_s), 1))
+    at_rest = replace(at_rest, poses=replace(at_rest.poses, quaternions_xyzw=turns))
+    _, found = total_on_grid(at_truth(sensing(replace(still, grasps=[at_rest])), scheme))
     weight_n = 9.81 * still.body.mass_kg
     np.testing.assert_allclose(found[:, :3], np.tile([0, 0, weight_n], (len(found), 1)), atol=1e-9)
 

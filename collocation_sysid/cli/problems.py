@@ -38,6 +38,8 @@ class Solve(OfProblem, Told):
         A line per iteration.
     strict : bool
         Exit code 1 if the verdict is doubtful.
+    budget : bool
+        What the variance of each estimate is made of, whole.
     """
 
     method: str | None = None
@@ -46,6 +48,7 @@ class Solve(OfProblem, Told):
     scheduler: str | None = None
     verbose: bool = False
     strict: bool = False
+    budget: bool = False
 
 
 @command(
@@ -83,7 +86,7 @@ def solve(options: Solve) -> None:
     if options.as_json:
         typer.echo(as_json(finished.result))
     else:
-        show(summary(finished.result, folder))
+        show(summary(finished.result, folder, options.budget))
     status = finished.solution.status
     if status is Status.INTERRUPTED or finished.missing:
         raise typer.Exit(EXIT_INTERRUPTED)

@@ -33,7 +33,7 @@ from .memory import Past
 from .mesh import TetMesh
 from .node_force import NodeForce, PlacedForce
 from .pattern import Joined, SymmetricPattern
-from .regions import BodyPart, Region, SumOfParts, Theta, parts_of
+from .regions import BodyPart, Model, Region, Theta, parts_of
 from .selection import Selection
 from .stress import Stresses
 
@@ -150,6 +150,7 @@ class Body(Discretisation):
         super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
         # (3n,) of each part.
         self._lumped_m3 = [np.repeat(self._lumped(part), 3) for part in self.parts]
+        self.has_stated_mass = mass_kg is not None
         self.node_mass: Array = self._weighed([p.density_kg_m3 for p in self.parts])[::3]
 
     def __repr__(self) -> str:
@@ -184,7 +185,7 @@ class Body(Discretisation):
         other = copy(self)
         for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
             vars(other).pop(name, None)
-        SumOfParts.__init__(other, free, self.forces)
+        Model.__init__(other, free, self.forces)
         other._evaluators = {}
         return other
 

@@ -18,16 +18,16 @@ from .memory import Past, PointLayout
 from .mesh import Nodes, TetMesh
 from .node_force import NodeForce
 from .pattern import SymmetricPattern, element_destinations, in_ascending_order
-from .regions import BodyPart, SumOfParts, Theta
+from .regions import BodyPart, Model, Theta
 from .selection import Selection
 
 
-class Discretisation(SumOfParts):
+class Discretisation(Model):
     """A mesh of elements with quadrature points, and evaluators of what is summed over them.
 
     Parameters
     ----------
-    parts, forces : see `SumOfParts`
+    parts, forces : see `Model`
     mesh, element, evaluator, threads : see `Body`
     """
 

@@ -226,7 +226,7 @@ def _cells(mesh: TetMesh, given: Selection | ArrayLike) -> Index:
 Theta = Sequence[float] | Array
 
 
-class SumOfParts:
+class Model:
     """A sum of terms, part by part.
 
     Parameters

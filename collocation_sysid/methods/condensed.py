@@ -216,20 +216,20 @@ class Condensed(Collocation):
 
     def whole_variables(self, z: Array) -> Array:
         """Those of the program given."""
-        whole = np.empty(self.whole.variables)
-        whole[self._kept[0]] = z
+        found = np.empty(self.whole.variables)
+        found[self._kept[0]] = z
         for each, (positions, _) in zip(self.left_out, self._held(z), strict=True):
-            whole[each.variables] = positions
-        return whole
+            found[each.variables] = positions
+        return found
 
     def whole_multipliers(self, z: Array, loss_weight: float, multipliers: Array) -> Array:
         """Those of the program given, whose slopes by the held dofs they balance."""
-        at, whole = self.whole_variables(z), np.zeros(self.whole.constraints)
-        whole[self._kept[1]] = multipliers
-        slope = loss_weight * self.whole.gradient(at) + self.whole.jacobian(at).T @ whole
+        at, found = self.whole_variables(z), np.zeros(self.whole.constraints)
+        found[self._kept[1]] = multipliers
+        slope = loss_weight * self.whole.gradient(at) + self.whole.jacobian(at).T @ found
         for each in self.left_out:
-            whole[each.rows] = -slope[each.variables]
-        return whole
+            found[each.rows] = -slope[each.variables]
+        return found
 
     def _held(self, z: Array) -> Iterator[tuple[Array, Array]]:
         p = self.parameters_of(z)
@@ -341,12 +341,12 @@ class Condensed(Collocation):
         values[layout.places[0]] = whole[layout.kept]
         parts = zip(self.left_out, layout.places[1:], layout.through, self._held(z), strict=True)
         for each, places, through, (_, slopes) in parts:
-            products = through.times(whole, slopes)
+            found = through.times(whole, slopes)
             held, phi = (np.searchsorted(through.rows, a) for a in (each.variables, each.phi))
             # An entry of φ by φ comes twice, from either side; one of the diagonal once.
-            products[phi] += slopes.T @ products[held] / 2
-            products[phi, np.arange(len(phi))] *= 2
-            np.add.at(values, places, products[number[through.rows] >= 0].ravel())
+            found[phi] += slopes.T @ found[held] / 2
+            found[phi, np.arange(len(phi))] *= 2
+            np.add.at(values, places, found[number[through.rows] >= 0].ravel())
         return values
 
     def _whole_hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> Array:
@@ -362,11 +362,11 @@ class Condensed(Collocation):
         nearest[self.whole.of_phi] = p[self.nq :]
         if np.array_equal(nearest, z):
             return self.whole.hessian_values(z, loss_weight, multipliers)
-        values = self.whole.hessian_values(nearest, loss_weight, None)
+        found = self.whole.hessian_values(nearest, loss_weight, None)
         if multipliers is not None:
-            values += self.whole.hessian_values(z, loss_weight, multipliers)
-            values -= self.whole.hessian_values(z, loss_weight, None)
-        return values
+            found += self.whole.hessian_values(z, loss_weight, multipliers)
+            found -= self.whole.hessian_values(z, loss_weight, None)
+        return found
 
 
 def _entries(structure: tuple[Index, Index]) -> tuple[Index, Index]:

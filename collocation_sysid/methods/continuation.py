@@ -73,12 +73,12 @@ class Continuation(Options):
         """
         if not isinstance(self.stage, Mapping):
             return self.stage
-        options = dict(self.stage)
-        name = options.pop("method", InteriorPoint.name)
+        given = dict(self.stage)
+        name = given.pop("method", InteriorPoint.name)
         if name not in STAGES:
             known = f"expected one of {', '.join(STAGES)}{hint_at(str(name), STAGES)}"
             raise InputError(f"found {name!r}; {known}", None, "stage.method")
-        return built(STAGES[name], options, "stage")
+        return built(STAGES[name], given, "stage")
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -133,9 +133,9 @@ class _Climb:
             number, time_s = line.number + before, line.time_s + elapsed_s
             recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
-        solution = self.method(part, follow, start)
-        self._learn(solution, share)
-        return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
+        found = self.method(part, follow, start)
+        self._learn(found, share)
+        return found.status not in (Status.INTERRUPTED, Status.REFUSED)
 
     def answer(self) -> Solution:
         """The last stage's answer as one of the whole problem."""
@@ -149,17 +149,17 @@ class _Climb:
         counts = self.iterations, self.evaluations
         return recorder.solution(last.status, last.message, z, multipliers, *counts)
 
-    def _learn(self, solution: Solution, share: float) -> None:
-        self.last, part = solution, solution.collocation
-        self.known = part.unpack(solution.z)
-        self.iterations += solution.iterations
-        self.evaluations += solution.evaluations
-        spent = solution.timing
+    def _learn(self, found: Solution, share: float) -> None:
+        self.last, part = found, found.collocation
+        self.known = part.unpack(found.z)
+        self.iterations += found.iterations
+        self.evaluations += found.evaluations
+        spent = found.timing
         self.recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in solution.parameters.items())
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in found.parameters.items())
         self.recorder.notes.append(
-            f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} "
-            f"after {solution.iterations} iterations, {values}"
+            f"{100 * share:.3g} % of the samples by {found.method}: {found.status.value} after "
+            f"{found.iterations} iterations, {values}"
         )
 
 

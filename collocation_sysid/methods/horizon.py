@@ -174,12 +174,12 @@ class Horizon:
         """
         known, beside = x or self._all(None), near.trajectories if near else self._all(None)
         common = self.solvers, self.segments, self._own(p)
-        ends = self.workers.each(reached, *common, known, beside)
+        found = self.workers.each(reached, *common, known, beside)
         failures = []
-        for failure, spent in self.workers.fetch(self.workers.each(_end, ends)):
+        for failure, spent in self.workers.fetch(self.workers.each(_end, found)):
             self.stopwatch.add(*spent)
             failures += [failure] if failure else []
-        return ends, failures[0] if failures else None
+        return found, failures[0] if failures else None
 
     def moved(self, point: Iterate, step: Array) -> list[Any]:
         """Trajectories after a step of the parameters."""
@@ -187,8 +187,8 @@ class Horizon:
 
     def seen(self, p: Array, x: Sequence[Any]) -> list[Seen]:
         """How trajectories fit that were not swept."""
-        kept = self.workers.each(seen, self.segments, self._own(p), x)
-        return self.workers.fetch(kept)
+        found = self.workers.each(seen, self.segments, self._own(p), x)
+        return self.workers.fetch(found)
 
     def lengths(self, x: Sequence[Any]) -> list[int]:
         """Rows of each trajectory."""
@@ -207,17 +207,17 @@ class Horizon:
         return [value] * len(self.rows)
 
 
-def _report(kept: Swept) -> SweepReport:
-    return kept.report
+def _report(found: Swept) -> SweepReport:
+    return found.report
 
 
-def _rows(kept: Swept | Reached | Array) -> int:
-    return len(positions(kept))
+def _rows(found: Swept | Reached | Array) -> int:
+    return len(positions(found))
 
 
-def _end(end: Reached) -> tuple[SimulationError | None, tuple[float, float, float]]:
-    return end.failure, end.spent
+def _end(found: Reached) -> tuple[SimulationError | None, tuple[float, float, float]]:
+    return found.failure, found.spent
 
 
-def _first(kept: Swept | Reached | Array, count: int) -> Array:
-    return positions(kept)[:count]
+def _first(found: Swept | Reached | Array, count: int) -> Array:
+    return positions(found)[:count]

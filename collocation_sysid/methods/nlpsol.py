@@ -77,8 +77,8 @@ def solve(
         start = recorder.start(start)
         functions = NlpFunctions(program, hessian, errors)
         monitor = Monitor(recorder, program, errors)
-        options = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
-        solver = _nlpsol(plugin, functions, options)
+        given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
+        solver = _nlpsol(plugin, functions, given)
     began = carried_over(start, collocation, program)
     z, multipliers, said, count = _run(solver, program.bounds(), began, monitor)
     if errors and not isinstance(errors[0], _LeftBehind):
@@ -126,7 +126,7 @@ def _run(
 ) -> tuple[Array, Array, str, int]:
     """Variables, multipliers, what the solver said, and its iterations."""
     lower, upper = bounds
-    outcomes: list[tuple[Array, Array, str, int]] = []
+    found: list[tuple[Array, Array, str, int]] = []
 
     def search() -> None:
         try:
@@ -134,17 +134,17 @@ def _run(
             stats = solver.stats()
         except RuntimeError as error:  # of its own, or what a callback's failure makes of it
             said = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
-            outcomes.append((np.full(len(start), np.nan), np.zeros(0), said, 0))
+            found.append((np.full(len(start), np.nan), np.zeros(0), said, 0))
             return
         z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
         count = int(stats.get("iter_count") or 0)
-        outcomes.append((z, multipliers, str(stats["return_status"]), count))
+        found.append((z, multipliers, str(stats["return_status"]), count))
 
     if threading.current_thread() is threading.main_thread():
         _on_a_thread(search, monitor)
     else:
         search()
-    return outcomes[0] if outcomes else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
+    return found[0] if found else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
 
 
 def _on_a_thread(search: Callable[[], None], monitor: Monitor) -> None:

@@ -30,20 +30,20 @@ class Options:
 
     def __post_init__(self) -> None:
         for name, adapter in _adapters(type(self)).items():
-            value = getattr(self, name)
+            found = getattr(self, name)
             try:
-                object.__setattr__(self, name, adapter.validate_python(value))
+                object.__setattr__(self, name, adapter.validate_python(found))
             except ValidationError as error:
-                raise _refusal(name, value, error.errors(include_url=False)[0]) from error
+                raise _refusal(name, found, error.errors(include_url=False)[0]) from error
 
 
-def built(kind: type[T], stated: Mapping[str, Any], where: str) -> T:
+def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
     """A method from its options by name.
 
     Parameters
     ----------
     kind : type
-    stated : mapping
+    given : mapping
     where : str
         The key under which the options were given, for messages.
 
@@ -53,12 +53,12 @@ def built(kind: type[T], stated: Mapping[str, Any], where: str) -> T:
         For an unknown option, with the nearest that there is, or a value that it cannot have.
     """
     known = [field.name for field in fields(kind)]
-    for name in stated:
+    for name in given:
         if name not in known:
             has = f"it has {', '.join(known)}{hint_at(name, known)}"
             raise InputError(f"{kind.name!r} has no option {name!r}; {has}", None, where)
     try:
-        return kind(**stated)
+        return kind(**given)
     except InputError as error:
         raise InputError(error.message, None, f"{where}.{error.where}") from error
 
@@ -69,16 +69,16 @@ def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
     return {field.name: TypeAdapter(types[field.name]) for field in fields(kind)}
 
 
-def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
+def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
     """The error for a value, or for an entry of the table that it is."""
     for part in fault["loc"]:
-        if isinstance(value, Mapping) and part in value:
-            name, value = f"{name}.{part}", value[part]
+        if isinstance(found, Mapping) and part in found:
+            name, found = f"{name}.{part}", found[part]
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, name)
     choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
-    hint = hint_at(str(value), choices)
-    return InputError(f"found {value!r}; expected {expected(fault)}{hint}", None, name)
+    hint = hint_at(str(found), choices)
+    return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)
 
 
 # Fewest samples, or rows of a grid, of a first part.

@@ -66,10 +66,10 @@ class Recorder:
         """Whether the time is over."""
         return self.elapsed_s > self.max_time_s
 
-    def start(self, known: Array | None) -> Array:
+    def start(self, given: Array | None) -> Array:
         """The variables given, or those of a simulation at the guess."""
-        if known is not None:
-            return known
+        if given is not None:
+            return given
         z, notes = initial_variables(self.collocation)
         self.notes += notes
         return z

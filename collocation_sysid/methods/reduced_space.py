@@ -74,10 +74,10 @@ class ReducedSpace(SearchOptions):
         search = ReducedSearch(self, recorder, start, workers)
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
-        solved = search.x and workers.fetch(workers.each(positions, search.x))
-        z = completed(collocation, search.p, solved)
+        found = search.x and workers.fetch(workers.each(positions, search.x))
+        z = completed(collocation, search.p, found)
         rows = [segment.grid_rows for segment in collocation.segments]
-        reached = solved is not None and [len(x) for x in solved] == rows
+        reached = found is not None and [len(x) for x in found] == rows
         recorder.notes += _notes(collocation, search.indefinite, z, status)
         multipliers = None if reached else np.zeros(collocation.constraints)
         return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)

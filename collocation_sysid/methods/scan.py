@@ -102,8 +102,8 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
     """
     unguessed = collocation.parameters.unguessed
     if any(is_modulus(name) for name in unguessed):
-        scanned = scan(collocation, whole=whole)
-        return replace(collocation, parameters=scanned.parameters), scanned
+        found = scan(collocation, whole=whole)
+        return replace(collocation, parameters=found.parameters), found
     if unguessed:
         usual = usual_parameters(collocation.parameters, STIFFEST_PA)
         collocation = replace(collocation, parameters=usual)
@@ -116,12 +116,12 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
         reason = "at the guess the measurements are missed by more than an undeformed body would"
-    scanned = rescue(collocation, reason, whole)
-    if scanned is None:
+    found = rescue(collocation, reason, whole)
+    if found is None:
         return collocation, None  # the method will tell what it needs
-    if failure is None and misfit <= scanned.misfit[scanned.best]:
+    if failure is None and misfit <= found.misfit[found.best]:
         return collocation, None
-    return replace(collocation, parameters=scanned.parameters), scanned
+    return replace(collocation, parameters=found.parameters), found
 
 
 def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan | None:
@@ -253,13 +253,13 @@ def _residuals(part: Part) -> Array:
     Nothing else tells these beforehand, and the residuals are nearly linear in them; what they are
     in their deviations counts too.
     """
-    residuals, slopes = [], []
+    found, slopes = [], []
     still = part.sensing.still(part.x)
     for reading, (residual, slope) in zip(part.segment.readings, still, strict=True):
-        there = reading.there(len(part.looked[len(residuals)]))[: len(residual)]
-        residuals.append(residual[there])
+        there = reading.there(len(part.looked[len(found)]))[: len(residual)]
+        found.append(residual[there])
         slopes.append(slope[there] * reading.has_offsets)
-    residual, slope = np.concatenate(residuals), np.concatenate(slopes)
+    residual, slope = np.concatenate(found), np.concatenate(slopes)
     own = slope[:, slope.any(axis=0)]
     priors = np.eye(own.shape[1])
     residual, own = np.append(residual, np.zeros(len(priors))), np.concatenate([own, priors])
@@ -352,8 +352,8 @@ class _Tried:
         first, *others = ([*same] for _, same in groupby(young_pa, self.trial.key))
         for young in (first[-1], *(same[0] for same in others)):
             misfit = self._try(young)
-            misfits = [m for m in self.misfits.values() if np.isfinite(m)]
-            is_lost = bool(misfits) and not misfit <= WORSE * min(misfits)
+            found = [m for m in self.misfits.values() if np.isfinite(m)]
+            is_lost = bool(found) and not misfit <= WORSE * min(found)
             lost = lost + 1 if is_lost else 0
             if lost == LOST:
                 self.lost = True

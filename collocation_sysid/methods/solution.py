@@ -218,12 +218,12 @@ class Solution:
     @cached_property
     def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:
         """RMS of force [N] and torque [N m] of the sensors of each fitted experiment."""
-        by_name = {}
+        found = {}
         for segment in self.collocation.segments:
             if segment.sensors:
                 readings = self.wrenches[segment.experiment.name]
-                by_name[segment.experiment.name] = wrench_rms(segment.experiment, readings)
-        return by_name
+                found[segment.experiment.name] = wrench_rms(segment.experiment, readings)
+        return found
 
     @cached_property
     def readings(self) -> dict[str, dict[str, Array]]:
@@ -244,12 +244,12 @@ class Solution:
     @cached_property
     def rms_by_experiment_m(self) -> dict[str, float]:
         """The same of each fitted experiment."""
-        by_name = {}
+        found = {}
         for segment, readings in zip(self.collocation.segments, self.readings_m, strict=True):
             markers = segment.experiment.markers
             squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
-            by_name[segment.experiment.name] = root_mean(squares)
-        return by_name
+            found[segment.experiment.name] = root_mean(squares)
+        return found
 
     @cached_property
     def max_violation_n(self) -> float:
@@ -300,8 +300,8 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
     """The same of all fitted experiments, which count alike."""
     squares, counts = np.zeros(2), np.zeros(2)
     for segment in solution.collocation.segments:
-        rms = solution.wrench_rms.get(segment.experiment.name, (None, None))
-        for k, value in enumerate(rms):
+        found = solution.wrench_rms.get(segment.experiment.name, (None, None))
+        for k, value in enumerate(found):
             if value is not None:
                 squares[k], counts[k] = squares[k] + value**2, counts[k] + 1
     force, torque = (
@@ -358,8 +358,8 @@ def constraint_multipliers(
         y = segment.force_n * solver.backward(part.x, part.setting, gradient)
         return segment.of_rows(y)
 
-    of_parts = side_by_side(of, collocation.parts(z), collocation.threads)
-    multipliers = np.concatenate(of_parts)
+    found = side_by_side(of, collocation.parts(z), collocation.threads)
+    multipliers = np.concatenate(found)
     if any(segment.grasp_rows.any() for segment in collocation.segments):
         _add_grasps(collocation, z, multipliers)
     return multipliers

@@ -116,9 +116,9 @@ class Reached:
     spent: tuple[float, float, float]
 
 
-def positions(kept: Swept | Reached | Array) -> Array:
+def positions(found: Swept | Reached | Array) -> Array:
     """The positions (rows, 3n) of what was found."""
-    return kept if isinstance(kept, np.ndarray) else kept.x
+    return found if isinstance(found, np.ndarray) else found.x
 
 
 def swept(
@@ -174,14 +174,14 @@ def tried(
     return swept(solver, segment, huber, p, x, before=before)
 
 
-def reread(solver: Sweep, segment: Segment, huber: float | None, p: Array, point: Swept) -> Swept:
+def reread(solver: Sweep, segment: Segment, huber: float | None, p: Array, found: Swept) -> Swept:
     """A trajectory whose recording is read elsewhere."""
-    return _read(_part(segment, p, point.x), huber, point.tangent, None, solver.stopwatch.taken())
+    return _read(_part(segment, p, found.x), huber, found.tangent, None, solver.stopwatch.taken())
 
 
-def moved(segment: Segment, point: Swept, step: Array) -> Array:
+def moved(segment: Segment, found: Swept, step: Array) -> Array:
     """The trajectory after a step of the parameters."""
-    return point.x + point.tangent.step + point.tangent.by_p @ step[segment.moving]
+    return found.x + found.tangent.step + found.tangent.by_p @ step[segment.moving]
 
 
 def reached(
@@ -217,8 +217,8 @@ def _read(
 ) -> Swept:
     """Everything after the feasibility step."""
     response = part.sensing.looked_along(tangent.by_p, tangent.held)
-    readings = part.sensing.linearised(part.x, response, tangent.step)
-    pairs = [as_squares(*each, huber) for each in readings]
+    found = part.sensing.linearised(part.x, response, tangent.step)
+    pairs = [as_squares(*each, huber) for each in found]
     residual = np.concatenate([values.ravel() for values, _ in pairs])
     slope = np.concatenate([by.reshape(values.size, by.shape[-1]) for values, by in pairs])
     report = SweepReport(

@@ -181,10 +181,10 @@ def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 def _require_package(client: Any) -> None:
     """Refuse workers without this version."""
     ours = version("collocation-sysid")
-    versions = client.run(_version, on_error="return")
-    if not versions:
+    found = client.run(_version, on_error="return")
+    if not found:
         raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
-    for address, theirs in versions.items():
+    for address, theirs in found.items():
         if theirs != ours:
             raise _refusal(
                 f"found {theirs!r} on the worker {address}; expected collocation-sysid {ours}"

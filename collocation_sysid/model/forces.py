@@ -58,8 +58,8 @@ class Forces:
         )
         further = (*potentials, *point_forces(experiment.body, times))
         unknown = np.full(len(experiment.body.constants), np.nan)
-        forces = cls(Weight.of(experiment, times), further, experiment.joined, unknown)
-        return forces if theta is None else forces.with_theta(theta)
+        found = cls(Weight.of(experiment, times), further, experiment.joined, unknown)
+        return found if theta is None else found.with_theta(theta)
 
     @classmethod
     def on(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
@@ -106,14 +106,14 @@ class Forces:
 
     def at(self, u: Array) -> Forces:
         """The same at inputs (T, U)."""
-        known = self.with_theta(u[0, : self._ends[0]])
+        found = self.with_theta(u[0, : self._ends[0]])
         if self._ends[0] == self._ends[-1]:
-            return known
+            return found
         weight, *further = (
             term.at(u[:, start:stop])
-            for term, start, stop in zip(known.terms, self._ends, self._ends[1:], strict=False)
+            for term, start, stop in zip(found.terms, self._ends, self._ends[1:], strict=False)
         )
-        return replace(known, weight=weight, further=tuple(further))
+        return replace(found, weight=weight, further=tuple(further))
 
     def rows(self, rows: slice) -> Forces:
         """The same at some of the times."""
@@ -139,11 +139,11 @@ class Forces:
 
     def total(self, xi: Array, nu: Array, carried: Past | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
-        total_n = self.body.force(xi, nu, self.theta, self.mass.tied, carried)
+        found = self.body.force(xi, nu, self.theta, self.mass.tied, carried)
         states = self._states(xi, nu)
         for term in self.terms:
-            total_n = total_n + term.force(states)
-        return total_n
+            found = found + term.force(states)
+        return found
 
     def linearise(
         self, xi: Array, nu: Array, out: Array | None = None, carried: Past | None = None

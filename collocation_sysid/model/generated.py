@@ -56,9 +56,9 @@ class Generated:
     def depends(self) -> NDArray[np.bool_]:
         """(k,) whether any y depends on each of u."""
         u, _, y = self._symbols
-        depends = np.zeros(self.inputs, dtype=bool)
-        depends[ca.jacobian(y, u).sparsity().get_col()] = True
-        return depends
+        found = np.zeros(self.inputs, dtype=bool)
+        found[ca.jacobian(y, u).sparsity().get_col()] = True
+        return found
 
     def takes(self, datum: int) -> bool:
         """Whether any y depends on a number of the data."""
@@ -129,16 +129,16 @@ class Generated:
         # CasADi declares no type for what it takes.
         take: Any = buffer.set_arg
         give: Any = buffer.set_res
-        arguments = [np.ascontiguousarray(x.reshape(len(x), count).T, float) for x in (u, *others)]
-        results = [np.empty((count, columns, rows)) for rows, columns in sizes]
-        for place, each in enumerate(arguments):
+        given = [np.ascontiguousarray(x.reshape(len(x), count).T, float) for x in (u, *others)]
+        found = [np.empty((count, columns, rows)) for rows, columns in sizes]
+        for place, each in enumerate(given):
             if each.size:
                 take(place, each.data)
-        for place, each in enumerate(results):
+        for place, each in enumerate(found):
             give(place, each.data)
         evaluate()
         axes = len(shape) + 1, len(shape), *range(len(shape))
-        return [each.reshape(*shape, *each.shape[1:]).transpose(axes) for each in results]
+        return [each.reshape(*shape, *each.shape[1:]).transpose(axes) for each in found]
 
     @cached_property
     def _mappings(self) -> dict[tuple[str, int], ca.Function]:

@@ -82,10 +82,10 @@ class Grasping:
         pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._poses[0]), weights)
         of_nodes = np.zeros_like(self._points.T)
         np.add.at(of_nodes, self._node, pulled)
-        curvature = np.zeros((len(self.nuisance.moving),) * 2)
+        found = np.zeros((len(self.nuisance.moving),) * 2)
         second = self.nuisance.in_grasps.curvature(self._own(phi), self._points, of_nodes.T)
-        curvature[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
-        return curvature
+        found[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
+        return found
 
     def _own(self, phi: Array) -> Array:
         """The φ of the grasps."""
@@ -99,14 +99,14 @@ class Grasping:
     @cached_property
     def _zeros(self) -> Array:
         """(N, g, m) by how much goals move with the zeros of displacements."""
-        slopes = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
+        found = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
         for number, grasp in enumerate(self.experiment.grasps):
             rows = np.flatnonzero(grasp.holds(self.t_s))
             for axis, place in zip(grasp.zero, self.nuisance.zero(number), strict=False):
                 along = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.moving == place)
-                slopes[np.ix_(rows, along, column)] = self.nuisance.scales[place]
-        return slopes
+                found[np.ix_(rows, along, column)] = self.nuisance.scales[place]
+        return found
 
     @cached_property
     def _nodes(self) -> tuple[Index, Index]:

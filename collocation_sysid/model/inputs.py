@@ -83,14 +83,14 @@ class Inputs:
 
     def curvature(self, p: Array, weights: Array) -> Array:
         """Σ weights[t] · ∂²u_t/∂p² (m, m), for weights (N, U)."""
-        total, first = np.zeros((self.parameters,) * 2), 0
+        found, first = np.zeros((self.parameters,) * 2), 0
         for each, generated in zip(self.inputs, self._generated, strict=True):
             own = weights[:, first : first + each.size].T
             if each.data.shape[1] == 1:
                 own = own.sum(axis=1, keepdims=True)
-            total += generated.curvature(p, each.data, own).sum(axis=2)
+            found += generated.curvature(p, each.data, own).sum(axis=2)
             first += each.size
-        return total
+        return found
 
     @cached_property
     def _generated(self) -> list[Generated]:
@@ -99,11 +99,11 @@ class Inputs:
     @cached_property
     def by_state(self) -> Array:
         """(m,) which parameters change forces together with the state."""
-        depends = np.zeros(self.parameters, dtype=bool)
+        found = np.zeros(self.parameters, dtype=bool)
         for each, generated in zip(self.inputs, self._generated, strict=True):
             if each.by_state:
-                depends |= generated.depends
-        return depends
+                found |= generated.depends
+        return found
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
@@ -150,10 +150,10 @@ def inputs_of(
 
         return Input(1, driven, actuator.course.at(evaluated_s)[None])
 
-    inputs = [Input(len(experiment.body.constants), theta, still)]
+    found = [Input(len(experiment.body.constants), theta, still)]
     if len(nuisance.of_gravity):
-        inputs.append(Input(3, gravity, still, by_state=False))
+        found.append(Input(3, gravity, still, by_state=False))
     joining = zip(nuisance.places(JOINING).tolist(), nuisance.timed, strict=True)
-    inputs += [share(phi, timed) for phi, timed in joining]
-    inputs += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
-    return Inputs(inputs, nq + len(nuisance.moving), len(evaluated_s))
+    found += [share(phi, timed) for phi, timed in joining]
+    found += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
+    return Inputs(found, nq + len(nuisance.moving), len(evaluated_s))

@@ -150,7 +150,7 @@ class NuisanceMap:
         steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         held = held_nodes(experiment.grasps)
-        made = cls(
+        found = cls(
             entries,
             tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
             scales,
@@ -165,8 +165,8 @@ class NuisanceMap:
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
         for row in experiment.nuisance.own:
-            made._require_smooth(row)
-        return made
+            found._require_smooth(row)
+        return found
 
     def _require_smooth(self, row: NuisanceRow) -> None:
         """Refuse an expression of a user's own that cannot be read with, or has no slopes."""
@@ -180,8 +180,8 @@ class NuisanceMap:
             raise InputError(f"the {what} of {row.name} failed: {reason(error)}") from error
         wanted = (3, 1) if row.reading else (1, 1)
         if made.shape != wanted:
-            refused = f"the {what} of {row.name} has the shape {made.shape}"
-            raise InputError(f"{refused}; expected {wanted}")
+            found = f"the {what} of {row.name} has the shape {made.shape}"
+            raise InputError(f"{found}; expected {wanted}")
         slopes = ca.Function("slopes", [y, values, t_s], [made, ca.jacobian(made, values)])
         at = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
         if not all(np.isfinite(part.full()).all() for part in at):
@@ -217,19 +217,19 @@ class NuisanceMap:
 
     def drive_places(self, number: int) -> tuple[int, int]:
         """Positions in φ of the factor and of what is lost of an actuator, −1 where it has none."""
-        places = [-1, -1]
+        found = [-1, -1]
         for k in self.of_drives:
             if self.entries[k].number == number:
-                places[self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)] = int(k)
-        return places[0], places[1]
+                found[self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)] = int(k)
+        return found[0], found[1]
 
     def drives(self, phi: Array) -> Array:
         """F and b (A, 2) of tensions and pressures."""
-        off, values = self.stated_off.copy(), phi * self.scales
-        for number in range(len(off)):
+        found, values = self.stated_off.copy(), phi * self.scales
+        for number in range(len(found)):
             for column, place in enumerate(self.drive_places(number)):
-                off[number, column] += 0.0 if place < 0 else values[place]
-        return off
+                found[number, column] += 0.0 if place < 0 else values[place]
+        return found
 
     # What markers read --------------------------------------------------------------------------
 
@@ -273,10 +273,10 @@ class NuisanceMap:
 
     def zero_m(self, number: int, grasp: Grasp, phi: Array) -> Array:
         """(3,) by how much a grasp is off."""
-        shift_m = np.zeros(3)
+        found = np.zeros(3)
         for place in self.zero(number):
-            shift_m[self.entries[place].axis] = phi[place] * self.scales[place]
-        return shift_m
+            found[self.entries[place].axis] = phi[place] * self.scales[place]
+        return found
 
     def limits(self, samples: int) -> tuple[Array, Array]:
         """Lowest and highest φ (k,), where samples are read about this many whole ones away."""
@@ -359,10 +359,10 @@ class NuisanceMap:
 
     def _values(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
         """By row, of φ at some places, with units."""
-        sized, by_row = phi * self.scales[places][:, None], {}
+        sized, found = phi * self.scales[places][:, None], {}
         for at, k in enumerate(places):
-            by_row.setdefault(self.entries[k].row, []).append(sized[at])
-        return {row: ca.vertcat(*each) for row, each in by_row.items()}
+            found.setdefault(self.entries[k].row, []).append(sized[at])
+        return {row: ca.vertcat(*each) for row, each in found.items()}
 
     def _tilted(self, angles: ca.SX) -> ca.SX:
         size = float(np.linalg.norm(self.gravity_m_s2))
@@ -426,8 +426,8 @@ def _axes(
         wrench = _wrenches(experiment)[number]
         own = np.flatnonzero(wrench.measured).tolist()
         return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in own]
-    axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
-    return [each for each in axes if row != ZERO or each[1] in experiment.grasps[number].zero]
+    found = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
+    return [each for each in found if row != ZERO or each[1] in experiment.grasps[number].zero]
 
 
 def _wrenches(experiment: Experiment) -> list[Wrench]:

@@ -165,7 +165,7 @@ class Parameter:
         return value if self.scale == "log" else self.unit
 
 
-def parameter(name: str, stated: Unknown | Tied | float) -> Parameter:
+def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
     """A parameter as stated, completed by what its constant says.
 
     Raises
@@ -175,17 +175,17 @@ def parameter(name: str, stated: Unknown | Tied | float) -> Parameter:
         and of which no usual value is known.
     """
     constant = constant_named(name)
-    if isinstance(stated, Tied):
-        return Parameter(name, 0.0, tied=stated)
-    if not isinstance(stated, Unknown):
-        return Parameter(name, float(stated), fixed=True)
-    scale = stated.scale or constant.scale
+    if isinstance(given, Tied):
+        return Parameter(name, 0.0, tied=given)
+    if not isinstance(given, Unknown):
+        return Parameter(name, float(given), fixed=True)
+    scale = given.scale or constant.scale
     low, high = constant.bounds
     if scale == "linear" and constant.scale == "log":
         low = -high
     if scale == "log" and low <= 0:
         low = 1e-9 * high
-    if stated.guess is None and stated.prior is None and usual_value(name, 1.0) is None:
+    if given.guess is None and given.prior is None and usual_value(name, 1.0) is None:
         raise InputError(
             "no guess is given and no usual value is known of it; expected guess = a value",
             None,
@@ -193,12 +193,12 @@ def parameter(name: str, stated: Unknown | Tied | float) -> Parameter:
         )
     # The size of a modulus without a guess follows from the scan.
     size = np.nan if is_modulus(name) else 0.0
-    size = size if stated.guess is None else abs(stated.guess)
-    typical = stated.typical or constant.typical or size
+    size = size if given.guess is None else abs(given.guess)
+    typical = given.typical or constant.typical or size
     if scale == "linear" and typical == 0:
-        guessed = "no guess" if stated.guess is None else "guess = 0"
+        found = "no guess" if given.guess is None else "guess = 0"
         raise InputError(
-            f"{guessed} of a linear parameter does not tell its size; expected typical, what it "
+            f"{found} of a linear parameter does not tell its size; expected typical, what it "
             "may change by in a step",
             None,
             name,
@@ -206,15 +206,15 @@ def parameter(name: str, stated: Unknown | Tied | float) -> Parameter:
     try:
         return Parameter(
             name,
-            None if stated.guess is None else float(stated.guess),
-            low if stated.lower is None else float(stated.lower),
-            high if stated.upper is None else float(stated.upper),
-            prior=stated.prior,
+            None if given.guess is None else float(given.guess),
+            low if given.lower is None else float(given.lower),
+            high if given.upper is None else float(given.upper),
+            prior=given.prior,
             scale=scale,
             unit=float(typical) if scale == "linear" else 1.0,
         )
     except InputError as error:
-        if stated.lower is not None and stated.upper is not None:
+        if given.lower is not None and given.upper is not None:
             raise
         message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
         raise InputError(message, None, name) from error
@@ -251,9 +251,9 @@ class Parameters:
         return f"Parameters({', '.join(map(_stated, self.items))})"
 
     @classmethod
-    def of(cls, stated: Mapping[str, Unknown | Tied | float]) -> Parameters:
+    def of(cls, given: Mapping[str, Unknown | Tied | float]) -> Parameters:
         """Parameters by name; a number is a fixed value."""
-        return cls(tuple(parameter(name, value) for name, value in stated.items()))
+        return cls(tuple(parameter(name, value) for name, value in given.items()))
 
     def fixed_at(self, values: Mapping[str, float]) -> Parameters:
         """Those of these names, all with these values."""
@@ -303,23 +303,23 @@ class Parameters:
 
     def expressions(self, q: ca.SX) -> dict[str, ca.SX]:
         """Every parameter as an expression in q, by name."""
-        by_name = {item.name: ca.SX(item.guess or 0.0) for item in self.items}
+        found = {item.name: ca.SX(item.guess or 0.0) for item in self.items}
         for k, item in enumerate(self.free):
-            by_name[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
+            found[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
         for item in self.items:
             if item.tied is not None:
-                by_name[item.name] = item.tied.ratio * by_name[item.tied.to]
-        return by_name
+                found[item.name] = item.tied.ratio * found[item.tied.to]
+        return found
 
     def values(self, q: Sequence[float] | Array) -> dict[str, float]:
         """Every parameter at q, by name."""
-        by_name = {item.name: float(item.guess or 0.0) for item in self.items}
+        found = {item.name: float(item.guess or 0.0) for item in self.items}
         for item, coordinate in zip(self.free, q, strict=True):
-            by_name[item.name] = item.value(float(coordinate))
+            found[item.name] = item.value(float(coordinate))
         for item in self.items:
             if item.tied is not None:
-                by_name[item.name] = item.tied.ratio * by_name[item.tied.to]
-        return by_name
+                found[item.name] = item.tied.ratio * found[item.tied.to]
+        return found
 
     @property
     def guesses(self) -> dict[str, float]:
@@ -491,7 +491,7 @@ def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str,
 
 
 def theta_of(
-    body: Body, values: Parameters | Mapping[str, float] | Sequence[float] | Array
+    body: Body, given: Parameters | Mapping[str, float] | Sequence[float] | Array
 ) -> Array:
     """Constants of a body from guesses, values by name, or θ itself.
 
@@ -500,14 +500,14 @@ def theta_of(
     InputError
         If names or numbers are missing, or unknown.
     """
-    if isinstance(values, Parameters):
-        return body.theta(values.guesses)
-    if isinstance(values, Mapping):
-        Parameters.of(values).fit([body])
-        return body.theta(values)
-    if len(values) != len(body.constants):
+    if isinstance(given, Parameters):
+        return body.theta(given.guesses)
+    if isinstance(given, Mapping):
+        Parameters.of(given).fit([body])
+        return body.theta(given)
+    if len(given) != len(body.constants):
         raise InputError(
-            f"{len(values)} parameters given, expected {len(body.constants)}: "
+            f"{len(given)} parameters given, expected {len(body.constants)}: "
             f"{', '.join(body.constants)}"
         )
-    return np.array(values, dtype=float)
+    return np.array(given, dtype=float)

@@ -92,12 +92,12 @@ SCHEMES: dict[str, Scheme] = {
 }
 
 
-def as_scheme(named: str | Scheme, start_rule: str = "standard") -> Scheme:
+def as_scheme(given: str | Scheme, start_rule: str = "standard") -> Scheme:
     """A scheme from a name in `SCHEMES` or itself, with the start rule of its first step.
 
     Parameters
     ----------
-    named : str or Scheme
+    given : str or Scheme
     start_rule : {"standard", "paper"}
         "paper" drops the inertia of the first step (a = 0); only for backward Euler.
 
@@ -106,9 +106,9 @@ def as_scheme(named: str | Scheme, start_rule: str = "standard") -> Scheme:
     InputError
         For unknown names and combinations.
     """
-    if isinstance(named, str) and named not in SCHEMES:
-        raise InputError(f"no scheme {named!r}; available: {', '.join(SCHEMES)}")
-    scheme = SCHEMES[named] if isinstance(named, str) else named
+    if isinstance(given, str) and given not in SCHEMES:
+        raise InputError(f"no scheme {given!r}; available: {', '.join(SCHEMES)}")
+    scheme = SCHEMES[given] if isinstance(given, str) else given
     if start_rule == "standard":
         return scheme
     if start_rule != "paper":

@@ -81,11 +81,11 @@ class Setting:
         """∂(M a)/∂p, (…, k, m), of rows at accelerations (…, k) of dofs."""
         if not self.mass_moves:
             return 0.0
-        slopes = np.zeros((*acceleration.shape, len(self.p)))
+        found = np.zeros((*acceleration.shape, len(self.p)))
         for place, mass in self.dynamics.forces.mass_by_input.items():
             by_p = self._of_rows[0 if self._steady else rows, place][..., None, :]
-            slopes += (mass[dofs] * acceleration)[..., None] * by_p
-        return slopes
+            found += (mass[dofs] * acceleration)[..., None] * by_p
+        return found
 
     def curvature(self, x: Array, of_forces: Curvature, row_weights: Array) -> tuple[Array, Array]:
         """Second derivatives of Σ weights · c by (x, p), (N, 3n, m), and by p, (m, m).

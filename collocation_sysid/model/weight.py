@@ -132,15 +132,15 @@ class Weight(ForceTerm):
         """The same at inputs (T, size)."""
         if not self.size:
             return self
-        turned = replace(self, gravity_m_s2=u[0, :3]) if self.turns else self
+        found = replace(self, gravity_m_s2=u[0, :3]) if self.turns else self
         if not len(self.joining_kg):
-            return turned
+            return found
         share = u[:, 3 * self.turns :]
         change = share - self.share
         tied_kg = self.mass.tied_kg + change @ self.joining_kg
         applied_n = self.applied_n + np.einsum("tl,ltd->td", change, self.joining_n)
         mass = replace(self.mass, tied_kg=tied_kg)
-        return replace(turned, mass=mass, applied_n=applied_n, share=share)
+        return replace(found, mass=mass, applied_n=applied_n, share=share)
 
     def rows(self, rows: slice) -> Self:
         """The same at some of the times."""

@@ -8,6 +8,7 @@ from typing import Literal
 
 from ..checked import Positive, Text
 from ..methods.options import Options
+from ..statistics.assumptions import Assumptions
 from ..statistics.uncertainty import ErrorsOption, NoiseOption
 
 
@@ -40,12 +41,15 @@ class UncertaintyOptions(Options):
         List of the parameters whose profile likelihood is wanted.
     numerical : bool
         Solve again with half the step and on a finer mesh: the numerical error.
+    assumptions : Assumptions
+        How far off what is assumed may be.
     """
 
     noise: NoiseOption = "auto"
     errors: ErrorsOption = "auto"
     profile: tuple[Text, ...] = ()
     numerical: bool = False
+    assumptions: Assumptions = field(default_factory=Assumptions)
 
 
 @dataclass(frozen=True)

@@ -182,9 +182,9 @@ def later(seen: Array, t_s: Array, lag_s: float) -> Array:
     at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
     low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
     share = (at - low)[:, None, None]
-    delayed = (1 - share) * seen[:, low] + share * seen[:, low + 1]
-    delayed[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
-    return delayed
+    found = (1 - share) * seen[:, low] + share * seen[:, low + 1]
+    found[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
+    return found
 
 
 def _acceleration(x: Array, step_s: float) -> Array:
@@ -206,7 +206,7 @@ def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_res
     of_rise = (of_constant - step_s) / (root * step_s)
     pushes = of_constant * loads[:-1, None] + of_rise * np.diff(loads, axis=0)[:, None]
     at_rest = -root.conj() * loads[0] / omega**2
-    states = [at_rest if from_rest else np.zeros_like(root)]
+    found = [at_rest if from_rest else np.zeros_like(root)]
     for push in pushes:
-        states.append(fading * states[-1] + push)
-    return np.imag(np.stack(states, axis=1)) / damped[:, None]
+        found.append(fading * found[-1] + push)
+    return np.imag(np.stack(found, axis=1)) / damped[:, None]

@@ -202,10 +202,10 @@ class _Slab:
         codes = block.columns * width + block.rows
         sorter = np.argsort(codes)
         wanted = np.asarray(columns) * width + rows
-        order = sorter[np.minimum(np.searchsorted(codes, wanted, sorter=sorter), len(codes) - 1)]
-        if (codes[order] != wanted).any():
+        found = sorter[np.minimum(np.searchsorted(codes, wanted, sorter=sorter), len(codes) - 1)]
+        if (codes[found] != wanted).any():
             raise IndexError("an entry lies outside the block")
-        return self.places(k)[order]
+        return self.places(k)[found]
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,8 +107,8 @@ class _RefinedFactor:
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        solution = correction = self.symmetric.solve(right)
-        size = last = np.abs(solution).max(axis=0, initial=TINY)
+        found = correction = self.symmetric.solve(right)
+        size = last = np.abs(found).max(axis=0, initial=TINY)
         shrinks = 1.0
         # What the next correction would be is not worth another solution.
         while (shrinks * last > ACCURACY * size).any():
@@ -118,8 +118,8 @@ class _RefinedFactor:
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
                 return self.whole().solve(right, transposed)
-            solution, last = solution + correction, length
-        return solution
+            found, last = found + correction, length
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,9 +125,9 @@ class LeastSquares:
         # So that no eigenvalue is zero up to rounding; much faster.
         if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(SINGULAR):
             return _trtri(square)[0] / units[:, None], np.zeros(size, dtype=bool)
-        _, squares, vectors = np.linalg.svd(square)
+        _, found, vectors = np.linalg.svd(square)
         values = np.zeros(len(units))
-        values[: len(squares)] = squares
+        values[: len(found)] = found
         known = values**2 > SINGULAR
         root = vectors[known].T / values[known] / units[:, None]
         return root, np.asarray((np.abs(vectors[~known]) > NEGLIGIBLE).any(axis=0))
@@ -142,10 +142,10 @@ class LeastSquares:
             independent and of size one.
         """
         root, lost = self.root, self.undetermined
-        covariance = root @ root.T if of_score is None else root @ of_score @ root.T
-        covariance[lost] = covariance[:, lost] = np.nan
-        covariance[lost, lost] = np.inf
-        return covariance
+        found = root @ root.T if of_score is None else root @ of_score @ root.T
+        found[lost] = found[:, lost] = np.nan
+        found[lost, lost] = np.inf
+        return found
 
     @cached_property
     def errors(self) -> Array:

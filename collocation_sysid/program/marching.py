@@ -162,10 +162,10 @@ class RowEquations:
 
     def under(self, share: float) -> RowEquations:
         """The same when a share of the change of a static load has come."""
-        eased = copy(self)
+        found = copy(self)
         if self.forces_before is not None:
-            eased.forces = self.forces_before.towards(self.forces, share)
-        return eased
+            found.forces = self.forces_before.towards(self.forces, share)
+        return found
 
     def force(self, x: Array) -> Array:
         """F_t."""

@@ -215,7 +215,7 @@ class ReleasedGrasps:
 def _dropped(
     dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
 ) -> list[_Dropped]:
-    tables, step_s, dropped = dynamics.tables, dynamics.step_s, []
+    tables, step_s, found = dynamics.tables, dynamics.step_s, []
     rows, columns, source = pattern.full
     for k in range(dynamics.first_row, dynamics.rows):
         for j in range(1, min(dynamics.reach, dynamics.rows - 1 - k) + 1):
@@ -231,5 +231,5 @@ def _dropped(
                         np.array([k - i]), i + j, place[rows[kept]], columns[kept]
                     )
                     here = positions.ravel(), k - dynamics.first_row
-                    dropped.append(_Dropped(*here, source[kept], kept, a, b))
-    return dropped
+                    found.append(_Dropped(*here, source[kept], kept, a, b))
+    return found

@@ -135,32 +135,32 @@ class Solver:
 
     def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
         """As near to the solution as the kept factor leads fast, and whether that is there."""
-        trial, before, done = x.copy(), None, False
+        found, before, done = x.copy(), None, False
         for _ in range(OFTEN):
-            step = self._step(kept, self._timed(residual, trial))
+            step = self._step(kept, self._timed(residual, found))
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
             if not rate <= 1.0:
                 return x, False
-            trial[self.free] += step
+            found[self.free] += step
             done = self._is_last(rate * step, LEFT)
             if done or (before and rate > FAST):
                 break
             before = length
-        return (trial, done) if self.is_upright(trial) else (x, False)
+        return (found, done) if self.is_upright(found) else (x, False)
 
     def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """The state with the held dofs at their goal, to first order in equilibrium."""
-        trial, way = x.copy(), np.zeros_like(x)
+        found, way = x.copy(), np.zeros_like(x)
         way[self.held] = goal - x[self.held]
-        trial[self.held] = goal
+        found[self.held] = goal
         if not self._is_last(way):
             self._require_upright(x)
             value, *matrix = self._timed(linearise, x)
             pulled = self.pattern.products(matrix[0][None], way[None])[0]
             factor = self._factorise(matrix, x, keep_definite=False)
-            trial[self.free] += self._step(factor, value - pulled)
-        return trial
+            found[self.free] += self._step(factor, value - pulled)
+        return found
 
     def _backtrack(
         self,
@@ -256,14 +256,14 @@ def followed(
     while reached < 1.0:
         step = min(increment, 1.0 - reached)
         try:
-            solved = solve(x + step * rate, reached + step)
+            found = solve(x + step * rate, reached + step)
         except NewtonFailure:
             # What fails costs many times what succeeds: better short steps that grow.
             increment, easy = step / 4, False
             if increment < 0.5**halvings:
                 raise
         else:
-            x, rate, reached = solved, (solved - x) / step, reached + step
+            x, rate, reached = found, (found - x) / step, reached + step
             # One step as long as that which failed would fail again.
             increment, easy = (2 * step if easy else step), True
     return x

@@ -668,14 +668,14 @@ class Segment:
         in_z, moving = np.concatenate([of_x, of_phi]), of_phi[self.nuisance.moving]
         states, pairs = moving[self.by_state - self.nq], np.triu_indices(len(of_phi))
         rows, columns = self.local_loss.structure
-        entries = [
+        found = [
             (in_z[rows], in_z[columns]),
             (np.repeat(np.arange(self.nq), len(moving)), np.tile(moving, self.nq)),
             (np.repeat(of_x, len(states)), np.tile(states, len(of_x))),
             (of_phi[pairs[0]], of_phi[pairs[1]]),
         ]
         # Experiments that share a φ need not have them in the same order.
-        return [(np.minimum(*each), np.maximum(*each)) for each in entries]
+        return [(np.minimum(*each), np.maximum(*each)) for each in found]
 
     @cached_property
     def _loss_scale(self) -> Array:

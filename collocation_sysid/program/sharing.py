@@ -50,14 +50,14 @@ def locals_of(experiments: Sequence[Experiment], first: int) -> list[Local]:
     InputError
         Where recordings share what is not the same in them.
     """
-    local, known, leaders = [], dict[Any, tuple[int, Entry, Experiment]](), dict[Any, Experiment]()
+    found, known, leaders = [], dict[Any, tuple[int, Entry, Experiment]](), dict[Any, Experiment]()
     for experiment in experiments:
         nuisance, scopes = NuisanceMap.of(experiment), experiment.nuisance.scope
         places, before = np.zeros(nuisance.size, dtype=np.int64), first
         for k, entry in enumerate(nuisance.entries):
             scope = scopes.get(entry.row.name)
             # What is not shared is nobody else's.
-            which = (len(local), k) if scope is None else (scope, entry.label)
+            which = (len(found), k) if scope is None else (scope, entry.label)
             places[k], other, of = known.setdefault(which, (first, entry, experiment))
             first += places[k] == first
             leader = leaders.setdefault((scope, entry.row), experiment)
@@ -66,8 +66,8 @@ def locals_of(experiments: Sequence[Experiment], first: int) -> list[Local]:
                 _require_alike((of, other), (experiment, entry))
         leader = leaders.get((scopes.get(TURN.name), TURN), experiment)
         pivot_m = None if leader is experiment else NuisanceMap.of(leader).pivot_m
-        local.append(Local(places, places >= before, pivot_m))
-    return local
+        found.append(Local(places, places >= before, pivot_m))
+    return found
 
 
 def _require_same(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
@@ -109,7 +109,7 @@ def _refusal(experiment: Experiment, row: NuisanceRow, found: str, expected: str
 
 def shared_charts(locals_: Iterable[tuple[Local, NuisanceMap, Chart]]) -> list[Chart]:
     """The charts, those of shared places and clocks as the first that shares them has them."""
-    leaders, samples, charts = dict[int, tuple[Chart, int]](), dict[int, int](), []
+    leaders, samples, found = dict[int, tuple[Chart, int]](), dict[int, int](), []
     for local, nuisance, chart in locals_:
         taken = []
         for k in nuisance.places(PLACE):
@@ -126,5 +126,5 @@ def shared_charts(locals_: Iterable[tuple[Local, NuisanceMap, Chart]]) -> list[C
                 for number, leader, theirs in taken:
                     values[number] = getattr(leader, name)[theirs]
             chart = replace(chart, **own)
-        charts.append(chart)
-    return charts
+        found.append(chart)
+    return found

@@ -158,9 +158,9 @@ def _gauged(
 
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
     """The same experiment with other values (S, 6) at the grasps that have a sensor."""
-    values, grasps = iter(wrenches), []
+    found, grasps = iter(wrenches), []
     for grasp in experiment.grasps:
-        sensor = grasp.wrench and replace(grasp.wrench, values=next(values))
+        sensor = grasp.wrench and replace(grasp.wrench, values=next(found))
         grasps.append(replace(grasp, wrench=sensor))
     return replace(experiment, grasps=grasps)
 

@@ -63,8 +63,8 @@ class Instability:
 
 def instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
     """Those of the motions at z, one for each experiment that has unstable states."""
-    worst = (_instability(part) for part in collocation.parts(z))
-    return tuple(each for each in worst if each is not None)
+    found = (_instability(part) for part in collocation.parts(z))
+    return tuple(each for each in found if each is not None)
 
 
 def _instability(part: Part) -> Instability | None:
@@ -109,8 +109,8 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
         for lower in lowers
     )
     noise = SHIFT * np.sqrt(stiffness.diagonal().max())
-    fastest = _fastest(stiffness, damping)
-    return fastest if fastest > noise else 0.0
+    found = _fastest(stiffness, damping)
+    return found if found > noise else 0.0
 
 
 def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
@@ -181,8 +181,8 @@ def _near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float
     """The same of sparse ones, about as fast as σ."""
     turning = _Turned(stiffness, damping, sigma)
     try:
-        start = np.random.default_rng(0).normal(size=turning.shape[0])
-        turned = np.asarray(eigs(turning, 4, v0=start, ncv=60)[0])
+        found = eigs(turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60)
+        turned = np.asarray(found[0])
     except ArpackNoConvergence as stopped:
         turned = np.asarray(stopped.eigenvalues)
     exponents = sigma * (turned + 1) / (turned - 1)

@@ -36,13 +36,13 @@ MISSING = (
 @cache
 def library() -> Any:
     """MKL, or None where it is not installed."""
-    paths = []
+    found = []
     try:
         files = metadata.files("mkl") or []
-        paths = [str(each.locate()) for each in files if "mkl_rt" in each.name]
+        found = [str(each.locate()) for each in files if "mkl_rt" in each.name]
     except metadata.PackageNotFoundError:
-        paths = [name for name in [find_library("mkl_rt")] if name]
-    for path in sorted(paths):
+        found = [name for name in [find_library("mkl_rt")] if name]
+    for path in sorted(found):
         try:
             mkl = ctypes.CDLL(path)
         except OSError:

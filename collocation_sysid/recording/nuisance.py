@@ -84,6 +84,8 @@ class NuisanceRow:
     clock : callable, optional
         ``clock(values, t_s, data)``, how much later than at t_s a marker was seen [s]; samples are
         read up to two away.
+    considered : float, optional
+        Its deviation in the budget of the error bars, where it is not estimated.
     """
 
     name: str
@@ -107,6 +109,7 @@ class NuisanceRow:
     same: Callable[[Any], dict[str, Any]] = lambda experiment: {}
     reading: Callable[[Any, Any, Any, Any], Any] | None = None
     clock: Callable[[Any, Any, Any], Any] | None = None
+    considered: float | None = None
 
     def __post_init__(self) -> None:
         if not self.label:
@@ -116,7 +119,7 @@ class NuisanceRow:
     @property
     def prior(self) -> str:
         """Key of the deviation in the problem file."""
-        unit = {"1": "", "σ": "_sigmas"}.get(self.unit, f"_{self.unit.lower()}")
+        unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(self.unit, f"_{self.unit.lower()}")
         return f"prior{unit}"
 
     @property
@@ -145,6 +148,11 @@ def _turned(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 
 def _shifted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     return y + values
+
+
+def _distorted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+    away = y - ca.DM(data.pivot_m)
+    return y + values * ca.sumsqr(away) * away
 
 
 def _moves(experiment: Any) -> bool:
@@ -177,6 +185,21 @@ OFFSET = NuisanceRow("camera_offset_m", "m", None, key="camera_offsets", of="mar
     reach=FREELY, by="length",
     label="camera offset of {which}, {axis}", told="camera offsets up to {size}",
     said="a constant offset of each marker in the cameras' frame", reading=_shifted)
+CALIBRATION_SCALE = NuisanceRow("calibration_scale", "1", None, key="calibration_scale",
+    considered=2e-3,
+    label="scale of the cameras", told="cameras see lengths {signed}",
+    said="a factor on all lengths that the cameras see, how far from one",
+    reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)))
+CALIBRATION_DISTORTION = NuisanceRow("calibration_distortion_1_m2", "1/m²", None,
+    key="calibration_distortion", considered=0.02,
+    label="distortion of the cameras", told="cameras' distortion {signed}",
+    said="radial distortion of first order about the body's middle: a factor 1 + k r²",
+    reading=_distorted)
+CLOCK_RATE = NuisanceRow("clock_rate", "1", None, key="clock_rate", considered=1e-4,
+    changes=("clock",), applies=_moves,
+    label="rate of the markers' clock", told="the markers' clock {signed} slow",
+    said="how much slower than the grasps' clock that of the markers goes",
+    clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]))
 TIME = NuisanceRow("time_shift_s", "s", 5e-3, key="time_shift", changes=("clock",), applies=_moves,
     label="time shift", told="markers seen {size} {way} than their times say{limit}",
     said="how much later than their times say markers were seen, on the grasps' clock",
@@ -256,7 +279,20 @@ GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
 
 # In the order of φ; neighbours of one component stand together.
 ROWS = (
-    *(PLACE, OFFSET, TIME, TURN, SHIFT, TILT, GRASP_TURN, GRASP_SHIFT, ZERO),
+    *(
+        PLACE,
+        OFFSET,
+        CALIBRATION_SCALE,
+        CALIBRATION_DISTORTION,
+        TIME,
+        CLOCK_RATE,
+        TURN,
+        SHIFT,
+        TILT,
+        GRASP_TURN,
+        GRASP_SHIFT,
+        ZERO,
+    ),
     *(TENSION_FACTOR, TENSION_LOST, PRESSURE_FACTOR, PRESSURE_LOST, JOINING),
     *(TARE, SENSOR_TIME, SENSOR_LAG, TOOL_MASS, TOOL_CENTRE),
 )

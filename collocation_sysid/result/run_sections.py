@@ -27,6 +27,7 @@ from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import is_own
 from ..recording.nuisance import in_unit_for_people
 from ..runs.result import FoundValue, Result, SimulatedExperiment
+from ..statistics.budget import worded
 from ..statistics.numerical import NumericalError
 from ..statistics.trust import Concern
 from ..tree import content
@@ -43,6 +44,8 @@ FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
 WORST, APART = 8, 5
 SHOWN_DIAGNOSES = 2
+# Of the budget: estimates and sources; the page has all above a share.
+SHOWN_BUDGETS, SHOWN_SOURCES, LITTLE = 3, 3, 0.01
 
 CAPTIONS = {
     "shapes": "The body at times of the recording; orange: measured markers.",
@@ -54,6 +57,7 @@ CAPTIONS = {
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % confidence ellipses of pairs of parameters, for the noise.",
     "correlation": "Correlation of the estimates.",
+    "budget": "What the variance of each estimate is made of.",
     "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
     "scan": "Scan of the stiffness for a start: misfit of the first part of the recordings.",
     "elements": "Size and quality of the elements.",
@@ -61,12 +65,13 @@ CAPTIONS = {
 }
 
 
-def summary(result: Result, folder: Path) -> list[Shown]:
-    """A run on one screen."""
+def summary(result: Result, folder: Path, budget: bool = False) -> list[Shown]:
+    """A run on one screen, with all of its budget where that is asked for."""
     largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (_ended(result), *answer(result), _fit(result), _notes(result))
-    return [*flat(sections), *ended, f"written to {folder}"]
+    tables = [budget_table(result)] if budget and result.budget else []
+    return [*flat(sections), *tables, *ended, f"written to {folder}"]
 
 
 def answer(result: Result) -> list[Shown]:
@@ -142,7 +147,7 @@ def _parameters(result: Result) -> Section:
     """Values with their intervals, what these hold, and what the values rest on."""
     values, holds = result.values, result.holds
     rows = tuple((with_unit(name), *_cells(each)) for name, each in values.items())
-    heads = ("", "value", "±", "95 % interval", "guess", "")
+    heads = ("", "value", "±", "95 % interval", "whole interval", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
     if holds:
@@ -150,6 +155,8 @@ def _parameters(result: Result) -> Section:
         left = [f"the {k}" for k in ("step", "mesh")[not moving :] if k not in holds]
         said = f"intervals cover {listed(f'the {kind}' for kind in holds)}"
         parts.append(said + (f", not {listed(left)}: see refine" if left else ""))
+    if result.budget:
+        parts.append("whole intervals also cover what is assumed, see docs/howto/budget.md")
     if "mesh" in holds:
         parts.append(refinement_table(result.numerical_errors))
     elif moved := [
@@ -158,7 +165,38 @@ def _parameters(result: Result) -> Section:
         if values[name].value and values[name].std_error is not None
     ]:
         parts.append(f"the step moves, to first order: {', '.join(moved)}")
-    return Section("Parameters", (*parts, *result.basis))
+    return Section("Parameters", (*parts, *_most_assumed(result), *result.basis))
+
+
+def _most_assumed(result: Result) -> list[str]:
+    """Of the estimates that assumptions make most uncertain, what does so."""
+    wider = {
+        name: ratio
+        for name, each in result.values.items()
+        if each.ci95 and each.whole95 and (ratio := _width(each.whole95) / _width(each.ci95)) > 1.5
+    }
+    names = sorted(wider, key=lambda name: -wider[name])[:SHOWN_BUDGETS]
+    said = []
+    for name in names:
+        shares = list(result.budget[name].items())[:SHOWN_SOURCES]
+        sources = ", ".join(f"{worded(s)} {share:.0%}" for s, share in shares if share > LITTLE)
+        said.append(f"{symbol_of(name)}'s whole interval is mostly {sources}")
+    return said
+
+
+def _width(interval: tuple[float, float]) -> float:
+    return max(interval[1] - interval[0], 1e-300)
+
+
+def budget_table(result: Result) -> Table:
+    """What the variance of each estimate is made of, in percent."""
+    lines = result.budget
+    largest: dict[str, float] = {}
+    for source, share in (each for line in lines.values() for each in line.items()):
+        largest[source] = max(share, largest.get(source, 0.0))
+    shown = sorted((s for s in largest if largest[s] >= LITTLE), key=lambda s: -largest[s])
+    rows = [(worded(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values())) for s in shown]
+    return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
 
 
 def _cells(value: FoundValue) -> tuple[str, ...]:
@@ -171,7 +209,8 @@ def _cells(value: FoundValue) -> tuple[str, ...]:
     guess = "" if value.guess is None else f"{value.guess:.5g}"
     if value.fixed:
         guess = "tied" if value.tied else "fixed"
-    return f"{value.value:.5g}", spread, interval, guess, value.reason or ""
+    whole = "" if value.whole95 is None else "{:.4g} … {:.4g}".format(*value.whole95)
+    return f"{value.value:.5g}", spread, interval, whole, guess, value.reason or ""
 
 
 def refinement_table(errors: Mapping[str, NumericalError]) -> Table:
@@ -277,6 +316,8 @@ def _error_bars(result: Result) -> Iterator[Shown]:
             f"Error bars for {known.errors} errors, noise {known.noise}; reduced χ² "
             f"{number(known.reduced_chi_squared, 3)}."
         )
+    if result.budget:
+        yield budget_table(result)
 
 
 def _places(result: Result) -> Iterator[Section]:

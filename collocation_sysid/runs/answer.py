@@ -15,6 +15,7 @@ from ..fem.constants import unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
+from ..statistics.budget import BudgetLine, Sources, budget
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.hypothesis import Hypothesis
@@ -51,6 +52,8 @@ class Answer:
         does, to first order, from finer forward simulations; None where these are missing.
     missing : str
         What Ctrl-C left out after there was an answer.
+    sources : Sources or None
+        What moves the estimates beside the noise, where there are error bars.
     """
 
     problem: Problem
@@ -63,6 +66,7 @@ class Answer:
     causes: tuple[Hypothesis, ...] = ()
     refinement: Refinement | None = None
     missing: str = ""
+    sources: Sources | None = None
 
     def __repr__(self) -> str:
         solution = self.solution
@@ -102,11 +106,21 @@ class Answer:
                 ci95_holds=() if ci95 is None else self.interval_holds,
                 ci95_noise=by_noise.ci95,
                 numerical_error=error,
+                whole95=self.budget[name].whole95 if name in self.budget else None,
                 guess=np.nan if item and guess is None else guess,
                 fixed=item and (item.fixed or tied),
                 tied=tied or None,
             )
         return values
+
+    @cached_property
+    def budget(self) -> dict[str, BudgetLine]:
+        """What the variance of each estimate is made of, by name; empty without error bars."""
+        if self.uncertainty is None or self.sources is None:
+            return {}
+        errors = {} if self.refinement is None else self.refinement.errors
+        linear = [item.name for item in self.started_from.items if item.scale == "linear"]
+        return budget(self.sources, self.uncertainty, errors, linear)
 
     @property
     def interval_holds(self) -> tuple[str, ...]:

@@ -28,11 +28,14 @@ class FoundValue(Estimate):
         What `ci95` allows for: "noise", and of "step" and "mesh" what is known.
     ci95_noise : (lower, upper) or None
         The interval for the noise alone.
+    whole95 : (lower, upper) or None
+        The interval that also holds what is assumed, see `statistics.budget`.
     """
 
     ci95_holds: tuple[str, ...] = ()
     ci95_noise: tuple[float, float] | None = None
     numerical_error: NumericalError | None = None
+    whole95: tuple[float, float] | None = None
     guess: float | None = optional()
     fixed: bool | None = optional()
     tied: bool | None = optional()
@@ -206,7 +209,8 @@ class Provenance:
 class Result:
     """The content of ``result.json``, whose names are its keys.
 
-    `basis` says what the values rest on: the law of the damping, and what sets the scale.
+    `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
+    has each source's share of an estimate's variance.
     """
 
     schema: int
@@ -220,6 +224,7 @@ class Result:
     parameters: Mapping[str, FoundValue]
     derived: Mapping[str, FoundValue]
     basis: tuple[str, ...]
+    budget: Mapping[str, Mapping[str, float]]
     places: Mapping[str, Mapping[str, Place]]
     nuisance: Mapping[str, Mapping[str, FoundNuisance]]
     uncertainty: FoundUncertainty | None

@@ -59,6 +59,7 @@ def result_of(answer: Answer) -> Result:
         parameters={item.name: values[item.name] for item in answer.started_from.items},
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_basis(problem)),
+        budget={name: line.shares for name, line in answer.budget.items()},
         places=answer.places,
         nuisance=_nuisance(answer),
         uncertainty=_uncertainty(answer),

@@ -22,7 +22,7 @@ from ..model.parameters import Parameter, Parameters
 from .autocorrelation import Dependence
 from .linearised import Derived, LinearisedFit
 from .noise import Noise, NoiseLevel
-from .scatter import Disagreement
+from .scatter import Scatter
 
 Mask = NDArray[np.bool_]
 
@@ -323,7 +323,7 @@ def correlation_notes(asked: str, errors: str, found: Dependence) -> list[str]:
     ]
 
 
-def scatter_notes(fit: LinearisedFit, scatter: Disagreement | None) -> list[str]:
+def scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
     """Recordings that disagree."""
     if scatter is None:
         return []

@@ -27,16 +27,17 @@ with the p-th power of their number.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
 
 from ..arrays import Array
 from ..fem.constants import bare
+from ..program.least_squares import LeastSquares
 from .estimates import Estimate
-from .linearised import FitBlock, LinearisedFit, best_step
+from .linearised import FitBlock, LinearisedFit
 
 # Roache's factor of safety for an observed order.
 OBSERVED = 1.25
@@ -190,14 +191,14 @@ def numerical_error(
     linear : bool
         Whether the parameter is its own coordinate.
     """
-    lowest = min(estimate.value, *(estimate.ci95 or ()), *by_step, *by_mesh, np.inf)
-    at = _Coordinate(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
-    x = at.of(estimate.value)
-    step = _Limit.of([x, *map(at.of, by_step)], step_order, step_order / 2)
-    mesh = _Limit.of([x, *map(at.of, by_mesh)], MESH_ORDER, LEAST_ORDER)
+    known = (estimate.value, *(estimate.ci95 or ()), *by_step, *by_mesh)
+    at = Coordinate.of(name, known, linear)
+    x = at.at(estimate.value)
+    step = _Limit.of([x, *map(at.at, by_step)], step_order, step_order / 2)
+    mesh = _Limit.of([x, *map(at.at, by_mesh)], MESH_ORDER, LEAST_ORDER)
     limit, interval = x + step.way + mesh.way, None
     if estimate.ci95 is not None:
-        low, high = map(at.of, estimate.ci95)
+        low, high = map(at.at, estimate.ci95)
         down = float(np.hypot((high - low) / 2, step.below + mesh.below))
         up = float(np.hypot((high - low) / 2, step.above + mesh.above))
         interval = at.value(limit - down), at.value(limit + up)
@@ -236,19 +237,33 @@ def numerical_errors(
 
 
 @dataclass(frozen=True)
-class _Coordinate:
+class Coordinate:
     """In which an interval is symmetric, see `estimates`; what may be negative is its own."""
 
     odds: bool
     linear: bool
 
-    def of(self, value: float) -> float:
+    @classmethod
+    def of(cls, name: str, values: Iterable[float], linear: bool) -> Coordinate:
+        """That of an estimate, of these values and ends of intervals."""
+        lowest = min(values)
+        return cls(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
+
+    def slope(self, value: float) -> float:
+        """Its derivative by the value."""
+        if self.odds:
+            return 0.5 / (value * (0.5 - value))
+        return 1.0 if self.linear else 1 / value
+
+    def at(self, value: float) -> float:
+        """Where it is."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.odds:
                 return float(np.log(value / (0.5 - value)))
             return value if self.linear else float(np.log(value))
 
     def value(self, x: float) -> float:
+        """The value there."""
         if self.odds:
             return float(0.5 / (1 + np.exp(-x)))
         return x if self.linear else float(np.exp(x))
@@ -262,22 +277,28 @@ def changes_towards(fit: LinearisedFit, apart: Sequence[Array]) -> Array:
     fit : LinearisedFit
     apart : of each block (T, M, 3), in units of σ
     """
-    free = np.flatnonzero(~fit.at_bound)
-    blocks = tuple(
-        replace(block, residual=way * _weight(block), slope=block.slope[..., free])
-        for block, way in zip(fit.blocks, apart, strict=True)
-    )
-    change = np.zeros(len(fit.names))
-    change[free] = best_step(
-        replace(
-            fit,
-            blocks=blocks,
-            names=tuple(fit.names[k] for k in free),
-            prior_residual=np.zeros(len(free)),
-            prior_slope=fit.prior_slope[free],
-        )
-    )
-    return change
+    return shifts(fit, [each[..., None] for each in apart])[:, 0]
+
+
+def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
+    """(p, a) how the estimates follow changes of the residuals; those at a bound stay.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+    changes : of each block (T, M, 3, a), in units of σ
+    """
+    free, count = np.flatnonzero(~fit.at_bound), changes[0].shape[-1] if changes else 0
+    known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
+    score = np.zeros((len(free), count))
+    for block, change in zip(fit.blocks, changes, strict=True):
+        slope = block.slope[..., free].reshape(-1, len(free))
+        known = known.add(np.zeros(len(slope)), slope)
+        apart = change * _weight(block)[..., None] * block.seen[..., None]
+        score += slope.T @ apart.reshape(len(slope), count)
+    found = np.zeros((len(fit.names), count))
+    found[free] = -known.root @ (known.root.T @ score)
+    return found
 
 
 def _weight(block: FitBlock) -> Array:

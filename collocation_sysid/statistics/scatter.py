@@ -32,7 +32,7 @@ TELLING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Disagreement:
+class Scatter:
     """What single recordings say, in the solver's coordinates.
 
     Attributes
@@ -116,13 +116,11 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, 
         )
 
 
-def scatter_of(
-    names: Sequence[str], steps: Sequence[Array], variances: Sequence[Array]
-) -> Disagreement:
+def scatter_of(names: Sequence[str], steps: Sequence[Array], variances: Sequence[Array]) -> Scatter:
     """Compare recordings by their steps (nq,) from the joint answer, and variances (nq,) of q."""
     deviations = np.sqrt(np.array(variances))
     told = deviations < TELLING
-    return Disagreement(
+    return Scatter(
         tuple(names),
         np.where(told, np.array(steps), np.nan),
         np.where(told, deviations, np.nan),

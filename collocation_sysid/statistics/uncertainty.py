@@ -49,7 +49,7 @@ from .estimates import (
 from .linearised import Information, LinearisedFit, information, linearised_fit
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
 from .pose_noise import pose_noise_draws
-from .scatter import Disagreement, recordings_of, scatter_of, single_fits
+from .scatter import Scatter, recordings_of, scatter_of, single_fits
 
 NoiseOption = Literal["auto", "given", "estimated"]
 Errors = Literal["independent", "autocorrelated"]
@@ -95,7 +95,7 @@ class Uncertainty:
         Measurements less parameters; one that a prior determines counts in part.
     notes : tuple of str
         What the user should know.
-    scatter : Disagreement or None
+    scatter : Scatter or None
         What the recordings say one by one, where there are several.
     outliers : tuple of Outlier
         Samples that spoil what the residuals tell; `dependence` leaves them out.
@@ -116,7 +116,7 @@ class Uncertainty:
     chi_squared: float
     degrees_of_freedom: float
     notes: tuple[str, ...]
-    scatter: Disagreement | None = None
+    scatter: Scatter | None = None
     outliers: tuple[Outlier, ...] = ()
 
     @property
@@ -286,7 +286,7 @@ def _known(
     return told, bounded
 
 
-def _widened(of_q: Array, quantiles: Array, scatter: Disagreement | None) -> tuple[Array, Array]:
+def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Array, Array]:
     """Covariance and quantiles, both larger where recordings disagree."""
     if scatter is None:
         return of_q, quantiles
@@ -304,7 +304,7 @@ def _scatter(
     noise: NoiseOption,
     errors: ErrorsOption,
     extra: Extra | None,
-) -> Disagreement | None:
+) -> Scatter | None:
     """What recordings say one by one, with error bars of their own."""
     if len(recordings_of(fit)) < 2:
         return None

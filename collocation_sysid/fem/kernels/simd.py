@@ -76,7 +76,7 @@ class SimdEvaluator:
         if kernel.carried:
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         self._run = CompiledFunction(
-            lambda: _KernelEmitter(kernel, self._points, lanes).emit(),
+            lambda: _Emitter(kernel, self._points, lanes).emit(),
             "run",
             key,
             signature,
@@ -137,7 +137,7 @@ class _Layout:
         ]
 
 
-class _KernelEmitter:
+class _Emitter:
     """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out, …)``.
 
     What points carry comes last: the length of its row, where its numbers are, and itself.

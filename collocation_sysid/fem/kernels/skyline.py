@@ -149,15 +149,15 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
 
 @cache
 def _compiled(name: str, sides: int) -> CompiledFunction:
-    emit: Callable[[_SkylineEmitter], ir.Module] = getattr(_SkylineEmitter, name)
+    emit: Callable[[_Emitter], ir.Module] = getattr(_Emitter, name)
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
     signature = [ctypes.c_int64] * integers + [ctypes.c_void_p] * sum(arrays)
     key = f"skyline {name} {sides} {lanes}"
-    return CompiledFunction(lambda: emit(_SkylineEmitter(lanes, sides)), name, key, signature)
+    return CompiledFunction(lambda: emit(_Emitter(lanes, sides)), name, key, signature)
 
 
-class _SkylineEmitter:
+class _Emitter:
     """Loops over vectors of the matrix's rows, by their numbers."""
 
     def __init__(self, lanes: int, sides: int) -> None:

@@ -150,18 +150,18 @@ def minimise(
             return ended("converged", k)
         average.add(f)
         line = _Line(counted, x, f, g, d, average.error, average.approximate, options)
-        trial = line.search(_first_step(x, f, g) if k == 0 else _next_step(line, step, change))
-        if trial is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
+        found = line.search(_first_step(x, f, g) if k == 0 else _next_step(line, step, change))
+        if found is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
             d = -g
             line = _Line(counted, x, f, g, d, average.error, average.approximate, options)
-            trial = line.search(_first_step(x, f, g))
-        if trial is None:
+            found = line.search(_first_step(x, f, g))
+        if found is None:
             return ended("line-search", k)
-        change = abs(trial.value - f)
+        change = abs(found.value - f)
         average.judge(change)
-        step, slope = trial.step, line.slope
-        y, before = trial.gradient - g, g
-        x, f, g = x + step * d, trial.value, trial.gradient
+        step, slope = found.step, line.slope
+        y, before = found.gradient - g, g
+        x, f, g = x + step * d, found.value, found.gradient
         reached_along = d
         d = _direction(d, before, g, y, options.truncation)
         state = CgState(k + 1, x, f, g, reached_along, slope, step)

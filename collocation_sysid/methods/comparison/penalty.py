@@ -131,8 +131,8 @@ class Stages(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.last_rho < self.rho:
-            limits = f"found {self.rho_max:g} with rho = {self.rho:g}"
-            raise InputError(f"{limits}; expected no less than rho", None, "rho_max")
+            found = f"found {self.rho_max:g} with rho = {self.rho:g}"
+            raise InputError(f"{found}; expected no less than rho", None, "rho_max")
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None

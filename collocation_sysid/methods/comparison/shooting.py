@@ -162,7 +162,7 @@ class _Search:
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        answer = least_squares(
+        found = least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
             self._slope,  # pyright: ignore[reportArgumentType]
@@ -173,8 +173,8 @@ class _Search:
             ftol=ROUNDING,
             gtol=self.options.tolerance,
         )
-        status = Status.ITERATION_LIMIT if answer.status == 0 else Status.CONVERGED
-        return status, f"{status.sentence} (SciPy: {answer.message})"
+        status = Status.ITERATION_LIMIT if found.status == 0 else Status.CONVERGED
+        return status, f"{status.sentence} (SciPy: {found.message})"
 
     def _residual(self, step: Array) -> Array:
         shot = self._try(self.first + step)
@@ -187,7 +187,7 @@ class _Search:
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        answer = minimize(
+        found = minimize(
             self._objective,
             self.first,
             method="L-BFGS-B",
@@ -206,9 +206,9 @@ class _Search:
         projected = np.clip(p - slope, self.lower, self.upper) - p
         flat = np.abs(projected).max() <= max(FLAT, self.options.tolerance)
         status = Status.ACCEPTABLE if flat else Status.STALLED
-        if answer.success:
+        if found.success:
             status = Status.CONVERGED
-        return status, f"{status.sentence} (SciPy: {answer.message})"
+        return status, f"{status.sentence} (SciPy: {found.message})"
 
     def _objective(self, p: Array) -> tuple[float, Array]:
         shot = self._try(p)

@@ -14,6 +14,7 @@ from ...recording.wrench import COMPONENTS, UNITS
 from ...runs.result import Result
 from ..replay import Replay, read_run, reading_run
 from ..style import RESOLUTION_DPI
+from .budget import budget_picture
 from .confidence import Confidence, confidence_ellipses, correlation_matrix
 from .mesh import elements_picture, mesh_picture
 from .over_time import error_over_time, readings_picture, tracks
@@ -43,6 +44,8 @@ def album(
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
+    if found.budget:
+        pictures["budget"] = budget_picture(found.budget)
     if replays:
         body = replays[0]
         pictures["mesh"] = mesh_picture(body)

@@ -1,0 +1,561 @@
+"""What is assumed about a recording without being estimated, and what it would do if it were wrong.
+
+An assumption is a row of `ASSUMPTIONS`: how far off it may be, and what that changes in the
+equations of motion, c = Σ w F − M a, in the goals of grasped dofs, or in what is carried by every
+dof. Trajectories follow by one sweep forward with a column for each, and residuals from these, so
+that the effect of all together costs about as much as one linearisation of the fit.
+
+What changes only what cameras and clocks say is a nuisance parameter, see `recording.nuisance`,
+and has its slopes from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, make_dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, Index
+from ..checked import Positive
+from ..fem.body import Body, Linearisation
+from ..fem.constants import GAMMA_R, bare
+from ..methods.options import Options
+from ..model.dynamics import Dynamics
+from ..model.parameters import Parameters
+from ..program.channel import Forced, Motion
+from ..program.collocation import Collocation, Part
+from ..program.lapack import one_blas_thread
+from ..program.reaction import HeldForces, forces_on, reactions
+from ..program.sweep import Columns, Forward, GraspMotion, Sweep
+from ..recording.experiment import Experiment
+from ..recording.nuisance import ROWS
+from ..section import ByForm
+from .linearised import linearised_fit
+
+# Differences by a scale.
+SMALL = 1e-4
+AIR_KG_M3 = 1.2
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What an assumption changes, if it is off by one deviation.
+
+    Attributes
+    ----------
+    force_n : (N, 3n), optional
+        Forces at the evaluations.
+    mass_kg : (3n,), optional
+        What moves with every dof and is not in `force_n`: its inertia alone.
+    stretched : float
+        By how much times are longer, of one, as inertia sees it.
+    moved_m : (N, g), optional
+        The goals of grasped dofs.
+    """
+
+    force_n: Array | None = None
+    mass_kg: Array | None = None
+    stretched: float = 0.0
+    moved_m: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """One experiment at the answer, as assumptions look at it."""
+
+    part: Part
+    parameters: Parameters
+
+    @property
+    def body(self) -> Body:
+        """What moves."""
+        return self.part.segment.body
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Its equations of motion."""
+        return self.part.setting.dynamics
+
+    @property
+    def theta(self) -> Array:
+        """(k,)"""
+        return self.dynamics.theta
+
+    @property
+    def gravity(self) -> Array:
+        """(3n,)"""
+        return self.dynamics.forces.weight.gravity
+
+    @cached_property
+    def own_mass_kg(self) -> Array:
+        """(3n,) of the body, without what is tied to it."""
+        return self.body.mass_of_dofs(self.theta)
+
+    @cached_property
+    def volume_m3(self) -> Array:
+        """(3n,) of every dof."""
+        return np.sum(self.body._lumped_m3, axis=0)
+
+    @cached_property
+    def acceleration(self) -> Array:
+        """(N, 3n) of the rows."""
+        return self.dynamics.acceleration(self.part.x)
+
+    @cached_property
+    def states(self) -> tuple[Array, Array]:
+        """ξ and ν (N, 3n) at the evaluations."""
+        xi, nu = self.dynamics.evaluation_states(self.part.x)
+        return self.of_rows(xi), self.of_rows(nu)
+
+    def of_rows(self, evaluated: Array) -> Array:
+        """Rows (N, 3n) of those that are evaluated, zero before."""
+        return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
+
+    def internal_n(
+        self, scale: float = 1.0, slower: float = 1.0, theta: Array | None = None
+    ) -> Array:
+        """(N, 3n) what the material gives where space, or time, is scaled; without γ_m."""
+        still = (self.theta if theta is None else theta).copy()
+        still[list(self.body.tied_shares)] = 0.0
+        dynamics = self.dynamics.with_theta(still)
+        carried = dynamics.carried(dynamics.history(self.part.x))
+        xi, nu = dynamics.evaluation_states(self.part.x)
+        return self.of_rows(
+            self.body.force(xi / scale, nu / (scale * slower), still, carried=carried)
+        )
+
+    def weight_of(self, mass_kg: Array) -> Array:
+        """(N, 3n) what gravity and γ_m do to mass (3n,)."""
+        return mass_kg * (self.gravity - self.body.tied_drag(self.theta) * self.states[1])
+
+    @cached_property
+    def grasp_force_n(self) -> Array:
+        """(N, g) what the grasps give the grasped dofs."""
+        dofs, x = self.part.setting.held.dofs, self.part.x
+        force = forces_on(self.dynamics, x, dofs)
+        mass = self.dynamics.mass.kg[:, dofs]
+        given = reactions(self.dynamics, mass, force, self.acceleration[:, dofs])
+        return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, given)
+
+    @cached_property
+    def proportional_s(self) -> Array:
+        """(E,) γ_r of elements whose damping is γ_r K(x) v, zero of others."""
+        gamma_r_s = np.zeros(len(self.body.cells))
+        for part, start in zip(self.body.parts, self.body.starts, strict=False):
+            if GAMMA_R in part.damping.constants and part.damping.stress is None:
+                gamma_r_s[part.cells] = self.theta[start + part.constants.index(GAMMA_R)]
+        return gamma_r_s
+
+    @cached_property
+    def young_pa(self) -> float:
+        """Of the softest part, at small strain."""
+        moduli = self.body.lame(self.theta).values()
+        return min(mu * (3 * lam + 2 * mu) / (lam + mu) for lam, mu in moduli)
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """Something that is taken as it is stated.
+
+    Attributes
+    ----------
+    name : str
+    unit : str
+        Of its deviation.
+    sigma : float
+        The deviation, as a careful laboratory has it.
+    said : str
+        What it is.
+    effect : callable
+        Of an experiment at the answer and the number of its axis: what it changes, if it is off by
+        one of its unit; None where there is no such thing.
+    axes : str
+        Names of its components, which are off independently; one without.
+    """
+
+    name: str
+    unit: str
+    sigma: float
+    said: str
+    effect: Callable[[Fitted, int], Effect | None]
+    axes: str = ""
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names with their axes."""
+        return tuple(f"{self.name} {a}" for a in self.axes.split()) or (self.name,)
+
+
+# What each changes ------------------------------------------------------------------------------
+
+
+def _size(at: Fitted, _: int) -> Effect:
+    """The body is larger by a share: f = s² f(x/s, v/s), its goals about the middle of its grasp.
+
+    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths.
+    """
+    larger, smaller = 1 + SMALL, 1 - SMALL
+    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
+    grasping = at.part.segment.grasping
+    turns: Array = np.nan_to_num(grasping._poses[0])
+    off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
+    moved = np.einsum("tgj,gj->tg", turns, off)
+    return Effect(force / (2 * SMALL) + at.weight_of(mass), mass, moved_m=moved)
+
+
+def _mass(at: Fitted, _: int) -> Effect | None:
+    """All of the body is heavier by a share."""
+    if any(part.free_density for part in at.body.parts):
+        return None
+    return Effect(at.weight_of(at.own_mass_kg), at.own_mass_kg)
+
+
+def _density_gradient(at: Fitted, axis: int) -> Effect:
+    """Heavier at one end of the body, lighter at the other, by a share of its density."""
+    place = at.body.nodes_m[:, axis]
+    middle = np.average(place, weights=at.own_mass_kg[::3])
+    mass = at.own_mass_kg * np.repeat((place - middle) / np.abs(place - middle).max(), 3)
+    return Effect(at.weight_of(mass), mass)
+
+
+def _anisotropy(at: Fitted, axis: int) -> Effect:
+    """Stiffer along one axis by a share of E: the energy ½ E e² of the strain e along it.
+
+    Damping that is K(x) v has its slope by time.
+    """
+    body, (xi, nu) = at.body, at.states
+    count, points = body.geometry.shape[:2]
+    slopes = body.geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
+    weight, force = at.young_pa * body.geometry[..., -1], np.zeros_like(xi)
+    gamma = at.proportional_s[:, None, None]
+    for x, v, own in zip(xi, nu, force, strict=True):
+        stretch, rate = (
+            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
+        )
+        strain = 0.5 * (np.sum(stretch**2, axis=2, keepdims=True) - 1)
+        pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
+        pull = weight[..., None] * (pull + gamma * strain * rate)
+        np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
+    force[: at.dynamics.first_row] = 0.0
+    return Effect(force)
+
+
+def _drift(at: Fitted, _: int) -> Effect:
+    """Stiffer at the end than at the beginning, by a share."""
+    t_s = at.dynamics.evaluated_s
+    since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
+    return Effect(at.internal_n() * since[:, None])
+
+
+def _pace(at: Fitted, _: int) -> Effect | None:
+    """All clocks are fast by a share: less time passes than they say."""
+    if at.part.segment.experiment.static:
+        return None
+    slower, faster = at.internal_n(slower=1 + SMALL), at.internal_n(slower=1 - SMALL)
+    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.kg * at.states[1]
+    return Effect((faster - slower) / (2 * SMALL) - drag, stretched=-1.0)
+
+
+def _poisson(at: Fitted, _: int) -> Effect | None:
+    """Poisson's ratio is larger where it is stated, not estimated."""
+    stated = [
+        i for i in at.parameters.items if bare(i.name) == "poisson" and i not in at.parameters.free
+    ]
+    if not stated:
+        return None
+    q = at.part.q
+    values = at.parameters.values(q)
+    step = {i.name: 1e-5 for i in stated}
+    ends = [
+        at.internal_n(
+            theta=at.body.theta({n: v + sign * step.get(n, 0.0) for n, v in values.items()})
+        )
+        for sign in (1, -1)
+    ]
+    return Effect((ends[0] - ends[1]) / 2e-5)
+
+
+def _grip(at: Fitted, _: int) -> Effect | None:
+    """Grip and what it touches give way like so much more of the body, in its thickness."""
+    held = at.part.setting.held
+    if not len(held.dofs):
+        return None
+    area_m2 = at.volume_m3[held.dofs] ** (2 / 3)
+    return Effect(moved_m=-at.grasp_force_n / (at.young_pa * area_m2))
+
+
+def _machine(at: Fitted, _: int) -> Effect | None:
+    """A test bench gives way: its displacement is measured behind its frame."""
+    experiment, held = at.part.segment.experiment, at.part.setting.held
+    if not experiment.static or not len(held.dofs):
+        return None
+    moved = np.zeros_like(at.grasp_force_n)
+    for grasp in experiment.grasps:
+        for axis in range(3):
+            here = np.flatnonzero(np.isin(held.dofs, grasp.dofs) & (held.dofs % 3 == axis))
+            moved[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+    return Effect(moved_m=moved)
+
+
+def _platen_friction(at: Fitted, _: int) -> Effect | None:
+    """Friction against the way that grasped nodes slide along what holds them across."""
+    experiment, held = at.part.segment.experiment, at.part.setting.held
+    sliding = [grasp for grasp in experiment.grasps if 0 < len(grasp.axes) < 3]
+    if not sliding:
+        return None
+    force, x = np.zeros_like(at.part.x), at.part.x
+    start = at.body.nodes_m.ravel()
+    for grasp in sliding:
+        across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
+        for node in grasp.nodes:
+            normal = np.isin(held.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
+            press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
+            dofs = [3 * node + k for k in across]
+            way = x[:, dofs] - start[dofs]
+            length = np.linalg.norm(way, axis=1, keepdims=True)
+            force[:, dofs] -= press[:, None] * way / np.maximum(length, 1e-9)
+    return Effect(force)
+
+
+def _buoyancy(at: Fitted, _: int) -> Effect:
+    """The air that the body displaces."""
+    return Effect(np.broadcast_to(-AIR_KG_M3 * at.volume_m3 * at.gravity, at.part.x.shape))
+
+
+def _added_mass(at: Fitted, _: int) -> Effect | None:
+    """Half the air that the body displaces moves with it, as with a sphere."""
+    if at.part.segment.experiment.static:
+        return None
+    return Effect(mass_kg=0.5 * AIR_KG_M3 * at.volume_m3)
+
+
+def _air_drag(at: Fitted, _: int) -> Effect | None:
+    """−½ ρ c_d a |v| v at the body's surface, c_d being one; a quarter of it faces the way it goes.
+
+    That is what a convex body shows on average (Cauchy).
+    """
+    if at.part.segment.experiment.static:
+        return None
+    mesh, shape = at.body.mesh, at.states[1].shape
+    a, b, c = np.moveaxis(mesh.points_m[mesh.surface], 1, 0)
+    thirds = np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6, 3)
+    area_m2 = np.bincount(mesh.surface.ravel(), thirds, minlength=len(at.body.nodes_m))
+    v = at.states[1].reshape(shape[0], -1, 3)
+    drag = -0.125 * AIR_KG_M3 * area_m2[:, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
+    return Effect(drag.reshape(shape))
+
+
+# fmt: off
+ASSUMPTIONS = (
+    Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
+    Assumption("mass", "1", 0.01, "mass of the body, where it is not estimated", _mass),
+    Assumption("density_gradient", "1", 0.05,
+        "density at one end of the body over that in its middle", _density_gradient, "x y z"),
+    Assumption("anisotropy", "1", 0.05,
+        "stiffness along one axis over that across", _anisotropy, "x y z"),
+    Assumption("stiffness_drift", "1", 0.02,
+        "stiffness at the end over that at the beginning", _drift),
+    Assumption("time_scale", "1", 1e-4, "pace of all clocks", _pace),
+    Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
+    Assumption("grip_layer_m", "m", 2e-4,
+        "what grip and skin give way, as thickness of the body's own material", _grip),
+    Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
+    Assumption("platen_friction", "", 0.1,
+        "friction of what holds nodes across and lets them slide", _platen_friction),
+    Assumption("buoyancy", "1", 1.0, "air that the body displaces, in 1.2 kg/m³", _buoyancy),
+    Assumption("added_mass", "1", 1.0, "air that moves with it, in half of that", _added_mass),
+    Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),
+)
+# fmt: on
+
+
+# Their effect on the residuals ---------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Changed(Columns):
+    """Columns by changes of forces and of rows."""
+
+    forces_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
+    rows_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
+
+    def sides(
+        self,
+        rows: slice,
+        at: Linearisation,
+        acceleration: Array,
+        residual: Array | None,
+        free: Index,
+    ) -> tuple[Array, Array]:
+        return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
+
+
+Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+_SAID = """How far off what is assumed may be: standard deviations, or "none" of what is exact.
+
+Nuisance parameters of recordings, by their names, count where they are not estimated.
+
+Attributes
+----------
+"""
+_FIELDS = [(row.name, row.sigma, f"{row.said} [{row.unit or 1}]") for row in ASSUMPTIONS]
+_FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in ROWS]
+
+
+class _Stated(Options):
+    """What `Assumptions` does with its fields."""
+
+    @property
+    def deviations(self) -> dict[str, float | None]:
+        """By name; None of what is known exactly."""
+        return {name: None if s == "none" else s for name, s in vars(self).items()}
+
+
+if TYPE_CHECKING:
+
+    @dataclass(frozen=True, init=False)
+    class Assumptions(_Stated):
+        """Made from the tables."""
+
+        def __init__(self, **deviations: float | Literal["none"]) -> None: ...
+
+else:
+    Assumptions = make_dataclass(
+        "Assumptions",
+        [(name, Deviation, field(default=sigma or "none")) for name, sigma, _ in _FIELDS],
+        bases=(_Stated,),
+        frozen=True,
+        kw_only=True,
+        namespace={
+            "__module__": __name__,
+            "__doc__": _SAID + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
+        },
+    )
+
+
+class Changes(NamedTuple):
+    """How the residuals of a fit change where what is assumed is off by its deviation.
+
+    Attributes
+    ----------
+    names : (a,) of assumptions, with their components
+    blocks : of each block of `LinearisedFit` (T, M, 3, a) in standard deviations
+    """
+
+    names: tuple[str, ...]
+    blocks: list[Array]
+
+
+def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float | None]) -> Changes:
+    """The changes by all that a fit assumes.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) a point that satisfies the equations of motion
+    deviations : mapping of the name of an assumption, or nuisance parameter, to its deviation
+        In place of those of the tables; None for what is known exactly.
+    """
+    rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
+    of_bodies = changed_residuals(collocation, z, [(row, s) for row, s in rows if s is not None])
+    of_nuisances = considered(collocation, z, deviations)
+    both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
+    blocks = [np.concatenate(each, axis=3) for each in both]
+    return Changes(of_bodies.names + of_nuisances.names, blocks)
+
+
+def considered(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> Changes:
+    """Those by nuisance parameters that are not estimated, see `assumed`."""
+
+    def widened(experiment: Experiment) -> Experiment:
+        nuisance = experiment.nuisance
+        sigmas = {row: deviations.get(row.name, row.considered) for row in ROWS}
+        more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
+        return replace(experiment, nuisance=replace(nuisance, **more))
+
+    wide = replace(collocation, experiments=[widened(e) for e in collocation.experiments])
+    p, positions = collocation.unpack(z)
+    known = dict(zip(collocation.names, p.tolist(), strict=True))
+    at = wide.pack(np.array([known.get(name, 0.0) for name in wide.names]), positions)
+    new = np.array([k for k, name in enumerate(wide.names) if name not in known], dtype=np.int64)
+    names: dict[int, str] = {}
+    for segment in wide.segments:
+        own = zip(segment.places[wide.nq :], segment.nuisance.entries, strict=True)
+        names |= {int(place): entry.row.name for place, entry in own}
+    blocks = [block.slope[..., new] for block in linearised_fit(wide, at).blocks]
+    return Changes(tuple(names[k] for k in new.tolist()), blocks)
+
+
+@one_blas_thread()
+def changed_residuals(
+    collocation: Collocation, z: Array, assumptions: Sequence[tuple[Assumption, float]]
+) -> Changes:
+    """Those by assumptions, each with its deviation, see `assumed`."""
+    names = tuple(name for row, _ in assumptions for name in row.components)
+    changes: list[Array] = []
+    for part in collocation.parts(z):
+        at = Fitted(part, collocation.parameters)
+        effects = [
+            (row.effect(at, axis), sigma)
+            for row, sigma in assumptions
+            for axis in range(len(row.components))
+        ]
+        changes += _changes(at, effects)
+    return Changes(names, changes)
+
+
+def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iterator[Array]:
+    part, count = at.part, len(effects)
+    segment, held, x = part.segment, part.setting.held, part.x
+    forces, rows = np.zeros((*x.shape, count)), np.zeros((*x.shape, count))
+    moved = np.zeros((*held.positions_m.shape, count))
+    for k, (effect, sigma) in enumerate(effects):
+        if effect is None:
+            continue
+        if effect.force_n is not None:
+            forces[..., k] = sigma * effect.force_n
+        if effect.mass_kg is not None:
+            rows[..., k] -= sigma * effect.mass_kg * at.acceleration
+        if effect.stretched:
+            mass = at.dynamics.mass.kg
+            rows[..., k] += 2 * sigma * effect.stretched * mass * at.acceleration
+        if effect.moved_m is not None:
+            moved[..., k] = sigma * np.where(np.isnan(held.positions_m), 0.0, effect.moved_m)
+    forces[: at.dynamics.first_row] = rows[: at.dynamics.first_row] = 0.0
+    sensed = HeldForces.nothing(len(x), len(segment.sensed_dofs), count)
+    solver = Sweep(segment)
+    columns = _Changed(
+        part.setting,
+        count,
+        by_p=False,
+        grasped=GraspMotion.along(solver, held.dofs, moved),
+        forces_n=forces,
+        rows_n=rows,
+    )
+    response = part.sensing.read_along(Forward(solver, columns, held=sensed).rows(x), sensed)
+    of_sensed = rows[:, segment.sensed_dofs]
+    for reading, motion in zip(
+        segment.readings, part.sensing.moving(x, response, by_p=False), strict=True
+    ):
+        motion = _with_inertia(motion, of_sensed)
+        numbers, size = np.arange(count), count + len(part.phi)
+        looked, slopes = reading.channel.linearised(motion, part.phi, numbers, size)
+        yield reading.changes(looked, slopes.by[..., :count], part.phi)
+
+
+def _with_inertia(motion: Motion, rows_n: Array) -> Motion:
+    """Reactions are what the rows of grasped dofs lack, with their own change."""
+
+    def forced() -> Forced:
+        lacking = motion.forced
+        assert lacking.reaction_by is not None  # along columns
+        return replace(lacking, reaction_by=lacking.reaction_by - rows_n)
+
+    return Motion(motion.x, forced, motion.by)

@@ -1,0 +1,141 @@
+"""The whole interval holds what is assumed, and its budget says what each assumption is worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from problem_files import pictures_drawn, run_command, write_problem
+from problems_small import GUESS, cube_with_nuisance, hung_cube, measured
+
+from collocation_sysid import Problem, UncertaintyOptions, run, solve, with_markers
+from collocation_sysid.display import plain_text
+from collocation_sysid.recording.nuisance import ROWS
+from collocation_sysid.result.run_sections import summary
+from collocation_sysid.runs.result import Result
+from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumptions, assumed, considered
+from collocation_sysid.statistics.budget import Sources, worded
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.numerical import shifts
+
+NOTHING = {name: "none" for name in Assumptions().deviations}
+
+
+def problem(**stated) -> Problem:
+    options = UncertaintyOptions(assumptions=Assumptions(**stated))
+    return Problem([measured(hung_cube(20))], GUESS, uncertainty=options)
+
+
+@pytest.fixture(scope="module")
+def finished():
+    return run(problem(), seek_causes=False)
+
+
+def test_the_shares_of_a_budget_sum_to_one_largest_first(finished):
+    assert set(finished.budget) == set(finished.estimates)
+    for line in finished.budget.values():
+        shares = list(line.shares.values())
+        assert sum(shares) == pytest.approx(1.0)
+        assert shares == sorted(shares, reverse=True)
+
+
+def test_the_whole_interval_holds_the_other(finished):
+    for name, line in finished.budget.items():
+        low, high = finished.estimates[name].ci95
+        assert line.whole95[0] < low < high < line.whole95[1]
+        assert finished.estimates[name].whole95 == line.whole95
+
+
+def test_where_nothing_is_assumed_both_are_the_same():
+    exact = run(problem(**NOTHING), seek_causes=False)
+    for name, line in exact.budget.items():
+        assert line.whole95 == pytest.approx(exact.estimates[name].ci95)
+        assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
+
+
+def test_one_assumption_alone_has_its_own_variance(finished):
+    heavy = run(problem(**NOTHING | {"mass": 0.05}), seek_causes=False)
+    # Markers that swing tell moduli over density: E follows the mass.
+    low, high = heavy.budget["mu_pa"].whole95
+    least, most = heavy.estimates["mu_pa"].ci95
+    wider = np.log(high / low) ** 2 - np.log(most / least) ** 2
+    assert np.sqrt(wider) / 2 / 1.96 == pytest.approx(0.05, rel=1e-3)
+    assert max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get) == "mass"
+
+
+def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it():
+    experiment = measured(hung_cube(20))
+    first = solve(Problem([experiment], GUESS))
+    collocation, off = first.collocation, 2e-4
+    changes = considered(collocation, first.z, {"calibration_scale": off})
+    assert changes.names == ("calibration_scale", "calibration_distortion_1_m2", "clock_rate")
+    told = -shifts(linearised_fit(collocation, first.z), changes.blocks)[: len(first.q), 0]
+    pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
+    tracks = pivot + (1 + off) * (experiment.markers.positions_m - pivot)
+    again = solve(Problem([with_markers(experiment, tracks)], GUESS))
+    np.testing.assert_allclose(again.q - first.q, told, atol=0.03 * np.abs(told).max())
+
+
+def test_what_is_estimated_is_not_considered():
+    experiment = measured(cube_with_nuisance(8))
+    wide = replace(experiment, nuisance=replace(experiment.nuisance, calibration_scale=0.01))
+    solution = solve(Problem([wide], GUESS))
+    names = considered(solution.collocation, solution.z, Assumptions().deviations).names
+    assert "calibration_scale" not in names
+    assert "clock_rate" in names
+
+
+def test_a_nuisance_that_moves_the_body_may_be_considered():
+    solution = solve(Problem([measured(hung_cube(12))], GUESS))
+    stated = Assumptions(gravity_rad=0.02).deviations
+    changes = assumed(solution.collocation, solution.z, stated)
+    here = [k for k, name in enumerate(changes.names) if name == "gravity_rad"]
+    assert len(here) == 2
+    assert all(np.abs(changes.blocks[0][..., k]).max() > 0.1 for k in here)
+
+
+def test_every_assumption_has_a_key_a_default_and_words():
+    assert set(Assumptions().deviations) == {row.name for row in (*ASSUMPTIONS, *ROWS)}
+    assert all(row.said and worded(row.name) for row in ASSUMPTIONS)
+    assert worded("grip_layer_m") == "grip layer"
+
+
+def test_sources_need_no_nuisance_parameters():
+    solution = solve(Problem([measured(hung_cube(12))], GUESS))
+    fit = linearised_fit(solution.collocation, solution.z)
+    changes = assumed(solution.collocation, solution.z, Assumptions().deviations)
+    sources = Sources.of(fit, changes, GUESS, solution.q)
+    assert sources.of_noise(np.eye(len(solution.q))[0]) == 1.0
+
+
+def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
+    with pictures_drawn():
+        folder = finished.save(tmp_path / "run", frames=False)
+    assert (folder / "budget.png").exists()
+    told = Result.read(folder)
+    assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
+    short, whole = (plain_text(summary(told, folder, budget=b)) for b in (False, True))
+    assert "whole interval" in short
+    assert "% of the variance" not in short
+    assert "% of the variance" in whole
+    assert run_command("report", folder).code == 0
+    page = next(folder.glob("*.html")).read_text()
+    assert "% of the variance" in page
+    assert "What the variance of each estimate is made of" in page
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("mass", "-0.1", "uncertainty.assumptions.mass: found -0.1; expected"),
+        ("weight", "0.1", "uncertainty.assumptions.weight: unknown key"),
+        ("air_drag", '"off"', "uncertainty.assumptions.air_drag: found 'off'; expected"),
+    ],
+)
+def test_what_cannot_be_assumed_is_one_message(tmp_path, key, value, said):
+    file = write_problem(tmp_path, {"swing": 8})
+    file.write_text(file.read_text() + f"\n[uncertainty.assumptions]\n{key} = {value}\n")
+    outcome = run_command("check", file)
+    assert outcome.code == 2
+    assert said in " ".join(outcome.err.split())
