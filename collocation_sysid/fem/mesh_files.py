@@ -103,11 +103,15 @@ def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray
     """
     metres = length_in_metres(length_unit)
     with _reading(path) as data:
-        fans = [
-            np.asarray(block.data, dtype=np.int64)[:, [0, corner, corner + 1]]
+        faces = [
+            np.asarray(block.data, dtype=np.int64)
             for block in data.cells
             if block.type in ("triangle", "quad", "polygon") and len(block.data)
-            for corner in range(1, block.data.shape[1] - 1)
+        ]
+        # A face of fewer than three corners, of which there is nothing to join, is a damaged file.
+        fans = [
+            np.concatenate([face[:, [0, k, k + 1]] for k in range(1, face.shape[1] - 1)])
+            for face in faces
         ]
         if not fans:
             raise InputError(f"no triangles in this file, found {_listed(_cell_counts(data))}")

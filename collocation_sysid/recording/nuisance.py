@@ -155,6 +155,10 @@ def _distorted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     return y + values * ca.sumsqr(away) * away
 
 
+def _seen(experiment: Any) -> bool:
+    return bool(experiment.markers.names)
+
+
 def _moves(experiment: Any) -> bool:
     return not experiment.static
 
@@ -162,8 +166,7 @@ def _moves(experiment: Any) -> bool:
 def _seen_in_grasp(experiment: Any) -> bool:
     # Nothing but what markers see tells how the body is off in its grasp, and a start that is
     # given tells where it is.
-    marked = bool(experiment.markers.names) and experiment.start == "equilibrium"
-    return bool(experiment.grasps) and marked
+    return bool(experiment.grasps) and _seen(experiment) and experiment.start == "equilibrium"
 
 
 def _edges(experiment: Any) -> float:
@@ -189,14 +192,14 @@ CALIBRATION_SCALE = NuisanceRow("calibration_scale", "1", None, key="calibration
     considered=2e-3,
     label="scale of the cameras", told="cameras see lengths {signed}",
     said="a factor on all lengths that the cameras see, how far from one",
-    reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)))
+    applies=_seen, reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)))
 CALIBRATION_DISTORTION = NuisanceRow("calibration_distortion_1_m2", "1/m²", None,
-    key="calibration_distortion", considered=0.02,
+    key="calibration_distortion", considered=0.02, applies=_seen,
     label="distortion of the cameras", told="cameras' distortion {signed}",
     said="radial distortion of first order about the body's middle: a factor 1 + k r²",
     reading=_distorted)
 CLOCK_RATE = NuisanceRow("clock_rate", "1", None, key="clock_rate", considered=1e-4,
-    changes=("clock",), applies=_moves,
+    changes=("clock",), applies=lambda experiment: _moves(experiment) and _seen(experiment),
     label="rate of the markers' clock", told="the markers' clock {signed} slow",
     said="how much slower than the grasps' clock that of the markers goes",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]))
