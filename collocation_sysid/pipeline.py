@@ -24,9 +24,9 @@ from .runs.result import Result
 from .runs.solving import read_where_found, shared, solve
 from .runs.told import result_of
 from .runs.warm_start import Earlier
-from .statistics.assumptions import assumed
 from .statistics.budget import Sources
 from .statistics.causes import likely_causes
+from .statistics.considered import assumed
 from .statistics.diagnostics import diagnose
 from .statistics.linearised import linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS

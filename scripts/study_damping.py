@@ -50,7 +50,7 @@ def swung(speed_rad_s: float, seed: int) -> Experiment:
     body = bar("kelvin-voigt")
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     places = body.nodes_m[body.nodes_m[:, 2] > 0.05][::3]
-    markers = Markers(t_s, np.zeros((len(t_s), len(places), 3)), NOISE_M, None, places)
+    markers = Markers(t_s, np.zeros((len(t_s), len(places), 3)), NOISE_M, places_m=places)
     poses = PoseSequence(t_s, np.zeros((len(t_s), 3)), turns.as_quat())
     experiment = Experiment(
         body, t_s, [Grasp(held, poses)], markers, name="swing", nuisance=Nuisance.none()

@@ -34,8 +34,9 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
-from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumption, changed_residuals
+from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumption
 from collocation_sysid.statistics.budget import Sources, budget
+from collocation_sysid.statistics.considered import changed_residuals
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 

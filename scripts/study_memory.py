@@ -109,7 +109,7 @@ def recording(branches: int) -> Experiment:
     held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     seen = np.flatnonzero(body.nodes_m[:, 0] > 0.049)
     nowhere = np.zeros((len(t_s), len(seen), 3))
-    markers = Markers(t_s, nowhere, NOISE_M, None, body.nodes_m[seen])
+    markers = Markers(t_s, nowhere, NOISE_M, places_m=body.nodes_m[seen])
     experiment = Experiment(
         body, t_s, [Grasp(held, poses)], markers, name="block", nuisance=Nuisance.none()
     )

@@ -50,7 +50,7 @@ def still(name: str, rng: np.random.Generator) -> tuple[Problem, dict[str, float
     held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
     free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
-    markers = Markers(t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, None, places)
+    markers = Markers(t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, places_m=places)
     grasp = Grasp(held, random_poses(t_s, rng))
     moved = Experiment(body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none())
     truth = drawn(name, rng)

@@ -167,7 +167,7 @@ def swung(seed: int) -> tuple[Problem, dict[str, float]]:
         np.unique(body.mesh.surface), np.flatnonzero(nodes[:, 2] < 0.3 * length_m)
     )
     places = nodes[rng.choice(outside, 8, replace=False)]
-    markers = Markers(t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, None, places)
+    markers = Markers(t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, places_m=places)
     grasp = Grasp(held, random_poses(t_s, rng))
     experiment = Experiment(body, t_s, [grasp], markers, name="swing")
     tracks = simulate(experiment, truth).markers_m

@@ -107,7 +107,7 @@ def recording() -> Experiment:
     poses = PoseSequence(t_s, np.outer(share, [0.01, 0.02, 0.03]), quaternions)
     held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     seen = np.flatnonzero(body.nodes_m[:, 0] > 0.09)
-    markers = Markers(t_s, np.zeros((len(t_s), len(seen), 3)), NOISE_M, None, body.nodes_m[seen])
+    markers = Markers(t_s, np.zeros((len(t_s), len(seen), 3)), NOISE_M, places_m=body.nodes_m[seen])
     sensor = Wrench(t_s, np.zeros((len(t_s), 6)), NOISE_N, NOISE_NM, frame="grasp")
     grasp = Grasp(held, poses, sigma_m=0.0, sigma_rad=0.0, wrench=sensor)
     nuisance = Nuisance.none(tare=10.0)

@@ -63,7 +63,7 @@ def twin(
     held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
     free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
-    markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, None, places)
+    markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, places_m=places)
     experiment = Experiment(body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing")
     tracks = simulate(experiment, truth, integrator).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)

@@ -16,8 +16,8 @@ from collocation_sysid.statistics.assumptions import (
     AIR_KG_M3,
     ASSUMPTIONS,
     Fitted,
-    changed_residuals,
 )
+from collocation_sysid.statistics.considered import changed_residuals
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

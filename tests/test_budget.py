@@ -14,8 +14,9 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.recording.nuisance import ROWS
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.result import Result
-from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumptions, assumed, considered
+from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumptions
 from collocation_sysid.statistics.budget import Sources, worded
+from collocation_sysid.statistics.considered import assumed, considered
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.numerical import shifts
 

@@ -239,7 +239,7 @@ class Body(Discretisation):
     @cached_property
     def placed_forces(self) -> tuple[PlacedForce, ...]:
         """Those of users, where they are."""
-        volume, first, found = np.sum(self._lumped_m3, axis=0)[::3], self.starts[-1], []
+        volume, first, found = self.dof_volume_m3[::3], self.starts[-1], []
         for force in self.forces:
             columns = first + np.arange(len(force.constants))
             first += len(columns)
@@ -247,6 +247,11 @@ class Body(Discretisation):
             chosen = self.select(chosen) if isinstance(chosen, Selection) else np.unique(chosen)
             found.append(PlacedForce.on(force, self.nodes, chosen, volume, columns))
         return tuple(found)
+
+    @property
+    def dof_volume_m3(self) -> Array:
+        """(3n,) lumped volume of every degree of freedom."""
+        return np.sum(self._lumped_m3, axis=0)
 
     @cached_property
     def dof_mass(self) -> Array:

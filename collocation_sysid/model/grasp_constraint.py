@@ -63,7 +63,7 @@ class Grasping:
         if not self.nuisance.moves_grasps:
             return self._fixed
         places, slopes = self.places(phi)
-        turns, shifts = self._poses
+        turns, shifts = self.poses
         by_phi = self._zeros + np.einsum("tgj,gjk->tgk", turns, slopes)
         positions = np.einsum("tgj,gj->tg", turns, places) + shifts
         positions += self._zeros @ phi[self.nuisance.moving]
@@ -79,7 +79,7 @@ class Grasping:
 
     def curvature(self, phi: Array, weights: Array) -> Array:
         """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
-        pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self._poses[0]), weights)
+        pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self.poses[0]), weights)
         of_nodes = np.zeros_like(self._points.T)
         np.add.at(of_nodes, self._node, pulled)
         found = np.zeros((len(self.nuisance.moving),) * 2)
@@ -129,7 +129,7 @@ class Grasping:
         return Held(self.dofs, held[:, self.dofs], np.zeros((len(held), len(self.dofs), 0)))
 
     @cached_property
-    def _poses(self) -> tuple[Array, Array]:
+    def poses(self) -> tuple[Array, Array]:
         """Of each dof its row of U_t, (N, g, 3) and (N, g), NaN while free."""
         turns, shifts = (np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ()))
         for grasp in self.experiment.grasps:

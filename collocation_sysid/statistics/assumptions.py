@@ -1,39 +1,31 @@
 """What is assumed about a recording without being estimated, and what it would do if it were wrong.
 
 An assumption is a row of `ASSUMPTIONS`: how far off it may be, and what that changes in the
-equations of motion, c = Σ w F − M a, in the goals of grasped dofs, or in what is carried by every
-dof. Trajectories follow by one sweep forward with a column for each, and residuals from these, so
-that the effect of all together costs about as much as one linearisation of the fit.
-
-What changes only what cameras and clocks say is a nuisance parameter, see `recording.nuisance`,
-and has its slopes from there.
+equations of motion, c = Σ w F − M a, or in the goals of grasped dofs; `considered` finds what that
+does to the residuals. What changes only what cameras and clocks say is a nuisance parameter, see
+`recording.nuisance`, and has its slopes from there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, make_dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from ..arrays import Array, Index
+from ..arrays import Array
 from ..checked import Positive
-from ..fem.body import Body, Linearisation
+from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..methods.options import Options
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
-from ..program.channel import Forced, Motion
-from ..program.collocation import Collocation, Part
-from ..program.lapack import one_blas_thread
-from ..program.reaction import HeldForces, forces_on, reactions
-from ..program.sweep import Columns, Forward, GraspMotion, Sweep
-from ..recording.experiment import Experiment
+from ..program.collocation import Part
+from ..program.reaction import forces_on, reactions
 from ..recording.nuisance import ROWS
 from ..section import ByForm
-from .linearised import linearised_fit
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -94,11 +86,6 @@ class Fitted:
     def own_mass_kg(self) -> Array:
         """(3n,) of the body, without what is tied to it."""
         return self.body.mass_of_dofs(self.theta)
-
-    @cached_property
-    def volume_m3(self) -> Array:
-        """(3n,) of every dof."""
-        return np.sum(self.body._lumped_m3, axis=0)
 
     @cached_property
     def acceleration(self) -> Array:
@@ -202,7 +189,7 @@ def _size(at: Fitted, _: int) -> Effect:
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
     mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
     grasping = at.part.segment.grasping
-    turns: Array = np.nan_to_num(grasping._poses[0])
+    turns: Array = np.nan_to_num(grasping.poses[0])
     off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
     moved = np.einsum("tgj,gj->tg", turns, off)
     return Effect(force / (2 * SMALL) + at.weight_of(mass), mass, moved_m=moved)
@@ -285,7 +272,7 @@ def _grip(at: Fitted, _: int) -> Effect | None:
     held = at.part.setting.held
     if not len(held.dofs):
         return None
-    area_m2 = at.volume_m3[held.dofs] ** (2 / 3)
+    area_m2 = at.body.dof_volume_m3[held.dofs] ** (2 / 3)
     return Effect(moved_m=-at.grasp_force_n / (at.young_pa * area_m2))
 
 
@@ -324,14 +311,14 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
 
 def _buoyancy(at: Fitted, _: int) -> Effect:
     """The air that the body displaces."""
-    return Effect(np.broadcast_to(-AIR_KG_M3 * at.volume_m3 * at.gravity, at.part.x.shape))
+    return Effect(np.broadcast_to(-AIR_KG_M3 * at.body.dof_volume_m3 * at.gravity, at.part.x.shape))
 
 
 def _added_mass(at: Fitted, _: int) -> Effect | None:
     """Half the air that the body displaces moves with it, as with a sphere."""
     if at.part.segment.experiment.static:
         return None
-    return Effect(mass_kg=0.5 * AIR_KG_M3 * at.volume_m3)
+    return Effect(mass_kg=0.5 * AIR_KG_M3 * at.body.dof_volume_m3)
 
 
 def _air_drag(at: Fitted, _: int) -> Effect | None:
@@ -372,27 +359,6 @@ ASSUMPTIONS = (
     Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),
 )
 # fmt: on
-
-
-# Their effect on the residuals ---------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Changed(Columns):
-    """Columns by changes of forces and of rows."""
-
-    forces_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
-    rows_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
-
-    def sides(
-        self,
-        rows: slice,
-        at: Linearisation,
-        acceleration: Array,
-        residual: Array | None,
-        free: Index,
-    ) -> tuple[Array, Array]:
-        return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
 Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
@@ -436,126 +402,3 @@ else:
             "__doc__": _SAID + "\n".join(f"{name}\n    {said}." for name, _, said in _FIELDS),
         },
     )
-
-
-class Changes(NamedTuple):
-    """How the residuals of a fit change where what is assumed is off by its deviation.
-
-    Attributes
-    ----------
-    names : (a,) of assumptions, with their components
-    blocks : of each block of `LinearisedFit` (T, M, 3, a) in standard deviations
-    """
-
-    names: tuple[str, ...]
-    blocks: list[Array]
-
-
-def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float | None]) -> Changes:
-    """The changes by all that a fit assumes.
-
-    Parameters
-    ----------
-    collocation : Collocation
-    z : (variables,) a point that satisfies the equations of motion
-    deviations : mapping of the name of an assumption, or nuisance parameter, to its deviation
-        In place of those of the tables; None for what is known exactly.
-    """
-    rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
-    of_bodies = changed_residuals(collocation, z, [(row, s) for row, s in rows if s is not None])
-    of_nuisances = considered(collocation, z, deviations)
-    both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
-    blocks = [np.concatenate(each, axis=3) for each in both]
-    return Changes(of_bodies.names + of_nuisances.names, blocks)
-
-
-def considered(
-    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
-) -> Changes:
-    """Those by nuisance parameters that are not estimated, see `assumed`."""
-
-    def widened(experiment: Experiment) -> Experiment:
-        nuisance = experiment.nuisance
-        sigmas = {row: deviations.get(row.name, row.considered) for row in ROWS}
-        more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
-        return replace(experiment, nuisance=replace(nuisance, **more))
-
-    wide = replace(collocation, experiments=[widened(e) for e in collocation.experiments])
-    p, positions = collocation.unpack(z)
-    known = dict(zip(collocation.names, p.tolist(), strict=True))
-    at = wide.pack(np.array([known.get(name, 0.0) for name in wide.names]), positions)
-    new = np.array([k for k, name in enumerate(wide.names) if name not in known], dtype=np.int64)
-    names: dict[int, str] = {}
-    for segment in wide.segments:
-        own = zip(segment.places[wide.nq :], segment.nuisance.entries, strict=True)
-        names |= {int(place): entry.row.name for place, entry in own}
-    blocks = [block.slope[..., new] for block in linearised_fit(wide, at).blocks]
-    return Changes(tuple(names[k] for k in new.tolist()), blocks)
-
-
-@one_blas_thread()
-def changed_residuals(
-    collocation: Collocation, z: Array, assumptions: Sequence[tuple[Assumption, float]]
-) -> Changes:
-    """Those by assumptions, each with its deviation, see `assumed`."""
-    names = tuple(name for row, _ in assumptions for name in row.components)
-    changes: list[Array] = []
-    for part in collocation.parts(z):
-        at = Fitted(part, collocation.parameters)
-        effects = [
-            (row.effect(at, axis), sigma)
-            for row, sigma in assumptions
-            for axis in range(len(row.components))
-        ]
-        changes += _changes(at, effects)
-    return Changes(names, changes)
-
-
-def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iterator[Array]:
-    part, count = at.part, len(effects)
-    segment, held, x = part.segment, part.setting.held, part.x
-    forces, rows = np.zeros((*x.shape, count)), np.zeros((*x.shape, count))
-    moved = np.zeros((*held.positions_m.shape, count))
-    for k, (effect, sigma) in enumerate(effects):
-        if effect is None:
-            continue
-        if effect.force_n is not None:
-            forces[..., k] = sigma * effect.force_n
-        if effect.mass_kg is not None:
-            rows[..., k] -= sigma * effect.mass_kg * at.acceleration
-        if effect.stretched:
-            mass = at.dynamics.mass.kg
-            rows[..., k] += 2 * sigma * effect.stretched * mass * at.acceleration
-        if effect.moved_m is not None:
-            moved[..., k] = sigma * np.where(np.isnan(held.positions_m), 0.0, effect.moved_m)
-    forces[: at.dynamics.first_row] = rows[: at.dynamics.first_row] = 0.0
-    sensed = HeldForces.nothing(len(x), len(segment.sensed_dofs), count)
-    solver = Sweep(segment)
-    columns = _Changed(
-        part.setting,
-        count,
-        by_p=False,
-        grasped=GraspMotion.along(solver, held.dofs, moved),
-        forces_n=forces,
-        rows_n=rows,
-    )
-    response = part.sensing.read_along(Forward(solver, columns, held=sensed).rows(x), sensed)
-    of_sensed = rows[:, segment.sensed_dofs]
-    for reading, motion in zip(
-        segment.readings, part.sensing.moving(x, response, by_p=False), strict=True
-    ):
-        motion = _with_inertia(motion, of_sensed)
-        numbers, size = np.arange(count), count + len(part.phi)
-        looked, slopes = reading.channel.linearised(motion, part.phi, numbers, size)
-        yield reading.changes(looked, slopes.by[..., :count], part.phi)
-
-
-def _with_inertia(motion: Motion, rows_n: Array) -> Motion:
-    """Reactions are what the rows of grasped dofs lack, with their own change."""
-
-    def forced() -> Forced:
-        lacking = motion.forced
-        assert lacking.reaction_by is not None  # along columns
-        return replace(lacking, reaction_by=lacking.reaction_by - rows_n)
-
-    return Motion(motion.x, forced, motion.by)

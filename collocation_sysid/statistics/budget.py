@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.parameters import Parameters
-from .assumptions import Changes
+from .considered import Changes
 from .linearised import LinearisedFit, least_squares
 from .numerical import Coordinate, NumericalError, shifts
 from .uncertainty import Uncertainty
