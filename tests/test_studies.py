@@ -165,8 +165,15 @@ def test_a_twin_with_noisy_poses_is_identified_and_listed():
     assert found.held.sum() >= 3
     (line,) = cells(f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}")
     assert line[0] == "poses"
-    assert float(line[7]) == pytest.approx(100 * found.relative[0], rel=0.05)
+    assert float(line[13]) == pytest.approx(100 * found.relative[0], rel=0.05)
     assert line[-1] == "0"
+
+
+def test_a_twin_of_which_all_that_is_assumed_is_wrong_is_in_the_whole_intervals():
+    found = study_faults.run("assumed: all of these", (0, 1))
+    assert found.converged
+    assert found.held.sum() < found.whole.sum()
+    assert found.whole.sum() >= 5
 
 
 def test_faults_are_as_large_as_they_are_called():
@@ -187,7 +194,7 @@ def test_faults_are_as_large_as_they_are_called():
 
 @pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
 def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.Outcome(True, np.ones(6), np.ones(6), np.ones(6), correlated=False)
+    outcome = study_faults.Outcome(True, *(np.ones(6) for _ in range(4)), correlated=False)
     missed = replace(outcome, held=np.zeros(6))
     row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
     assert cells(f"a\nb\n{row}")[0][1] == shown
