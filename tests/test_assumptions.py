@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from problems_small import EDGE_M, hung_cube
 
-from collocation_sysid import Body, Collocation, Experiment, Unknown, simulate
+from collocation_sysid import Body, Collocation, Experiment, Tied, Unknown, simulate
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.assumptions import (
     AIR_KG_M3,
@@ -48,7 +48,7 @@ def swung() -> Experiment:
     return wrong(replace(experiment, body=body), VALUES, {})
 
 
-def parameters(**stated: float) -> Parameters:
+def parameters(**stated: float | Unknown | Tied) -> Parameters:
     return Parameters.of(VALUES | {"young_pa": Unknown(VALUES["young_pa"], 10.0, 1e6)} | stated)
 
 
@@ -82,3 +82,13 @@ def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
     vars(at)["states"] = (x[None], np.tile([0.0, 2.0, 0.0], len(x) // 3)[None])
     force = BY_NAME["air_drag"].effect(at, 0).force_n[0].reshape(-1, 3).sum(axis=0)
     np.testing.assert_allclose(force, [0, -0.5 * AIR_KG_M3 * 1.5 * EDGE_M**2 * 4.0, 0], atol=1e-9)
+
+
+def test_a_ratio_tied_to_one_that_is_estimated_is_not_stated():
+    estimated = parameters(**{"poisson": Unknown(0.3, 0.1, 0.49), "core.poisson": Tied("poisson")})
+    experiment = swung()
+    collocation = Collocation([experiment], parameters(), "midpoint")
+    x = np.tile(experiment.body.nodes_m.ravel(), (len(experiment.t_s), 1))
+    (part,) = collocation.parts(collocation.pack(collocation.guess_p, [x]))
+    assert BY_NAME["poisson"].effect(Fitted(part, estimated), 0) is None
+    assert BY_NAME["poisson"].effect(Fitted(part, parameters()), 0) is not None

@@ -265,7 +265,7 @@ class PlacedForce:
     ) -> PlacedForce:
         """A force on chosen nodes of a mesh whose nodes have these volumes (n,)."""
         count = len(mesh.points_m)
-        area, normal = _surface_of(mesh)
+        area, normal = surface_of(mesh)
         data = np.vstack([mesh.points_m.T, area, volume_m3, normal.T])
         if force.on == "nodes":
             nodes, data = chosen[:, None], data[:, chosen]
@@ -303,7 +303,7 @@ def _summing(places: Index, size: int) -> sp.csr_array:
     return sp.csr_array(entries, shape=(size, flat.size))
 
 
-def _surface_of(mesh: Nodes) -> tuple[Array, Array]:
+def surface_of(mesh: Nodes) -> tuple[Array, Array]:
     """(n,) area and (n, 3) normal of every node: corners', or of quadratic faces the mid nodes'."""
     faces = mesh.on_faces(mesh.mesh.surface)
     a, b, c = np.moveaxis(mesh.points_m[faces[:, :3]], 1, 0)

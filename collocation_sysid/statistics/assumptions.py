@@ -19,6 +19,8 @@ from ..arrays import Array
 from ..checked import Positive
 from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
+from ..fem.moduli import engineering
+from ..fem.node_force import surface_of
 from ..methods.options import Options
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
@@ -140,8 +142,7 @@ class Fitted:
     @cached_property
     def young_pa(self) -> float:
         """Of the softest part, at small strain."""
-        moduli = self.body.lame(self.theta).values()
-        return min(mu * (3 * lam + 2 * mu) / (lam + mu) for lam, mu in moduli)
+        return min(engineering(*moduli)[0] for moduli in self.body.lame(self.theta).values())
 
 
 @dataclass(frozen=True)
@@ -250,21 +251,20 @@ def _pace(at: Fitted, _: int) -> Effect | None:
 
 def _poisson(at: Fitted, _: int) -> Effect | None:
     """Poisson's ratio is larger where it is stated, not estimated."""
-    stated = [
-        i for i in at.parameters.items if bare(i.name) == "poisson" and i not in at.parameters.free
-    ]
+    items = {item.name: item for item in at.parameters.items}
+    stated = {
+        name
+        for name, item in items.items()
+        if bare(name) == "poisson" and (items[item.tied.to] if item.tied else item).fixed
+    }
     if not stated:
         return None
-    q = at.part.q
-    values = at.parameters.values(q)
-    step = {i.name: 1e-5 for i in stated}
-    ends = [
-        at.internal_n(
-            theta=at.body.theta({n: v + sign * step.get(n, 0.0) for n, v in values.items()})
-        )
-        for sign in (1, -1)
-    ]
-    return Effect((ends[0] - ends[1]) / 2e-5)
+    values = at.parameters.values(at.part.q)
+    larger, smaller = (
+        at.internal_n(theta=at.body.theta({n: v + way * (n in stated) for n, v in values.items()}))
+        for way in (SMALL, -SMALL)
+    )
+    return Effect((larger - smaller) / (2 * SMALL))
 
 
 def _grip(at: Fitted, _: int) -> Effect | None:
@@ -328,10 +328,7 @@ def _air_drag(at: Fitted, _: int) -> Effect | None:
     """
     if at.part.segment.experiment.static:
         return None
-    mesh, shape = at.body.mesh, at.states[1].shape
-    a, b, c = np.moveaxis(mesh.points_m[mesh.surface], 1, 0)
-    thirds = np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6, 3)
-    area_m2 = np.bincount(mesh.surface.ravel(), thirds, minlength=len(at.body.nodes_m))
+    area_m2, shape = surface_of(at.body.nodes)[0], at.states[1].shape
     v = at.states[1].reshape(shape[0], -1, 3)
     drag = -0.125 * AIR_KG_M3 * area_m2[:, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
     return Effect(drag.reshape(shape))

@@ -23,8 +23,6 @@ from .uncertainty import Uncertainty
 # Half a 95 % interval of what is normal, in deviations.
 NORMAL = 1.96
 NOISE, NUISANCES, NUMERICAL = "noise", "nuisance parameters", "step and mesh"
-# Steps of q for slopes of parameters by it.
-SMALL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -130,16 +128,14 @@ def budget(
 
 def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
     """(nq,) derivatives of each estimate by q."""
-    found = {name: np.zeros(len(q)) for name in parameters.values(q)}
-    for k in range(len(q)):
-        ends = []
-        for sign in (1, -1):
-            moved = q.copy()
-            moved[k] += sign * SMALL
-            ends.append(parameters.values(moved))
-        for name, by_q in found.items():
-            by_q[k] = (ends[0][name] - ends[1][name]) / (2 * SMALL)
-    return found | dict(fit.derived.by_q)
+    values = parameters.values(q)
+    slopes = {name: np.zeros(len(q)) for name in values}
+    for k, item in enumerate(parameters.free):
+        slopes[item.name][k] = item.per_value(values[item.name])
+    for item in parameters.items:
+        if item.tied is not None:
+            slopes[item.name] = item.tied.ratio * slopes[item.tied.to]
+    return slopes | dict(fit.derived.by_q)
 
 
 def worded(source: str) -> str:
