@@ -28,7 +28,7 @@ from .statistics.budget import Sources
 from .statistics.causes import likely_causes
 from .statistics.considered import assumed
 from .statistics.diagnostics import diagnose
-from .statistics.linearised import linearised_fit
+from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import pose_noise_draws
 from .statistics.profile import Profile, profile_of
@@ -134,13 +134,16 @@ def run(
     found = Run(problem, solve(problem, method, watch, start, scheduler), {}, None)
     missing = "no forward simulation has checked the answer, and there are no error bars"
     try:
-        found = _checked(problem, found.solution, say)
+        found, fit = _checked(problem, found.solution, say)
         missing = "what comes after the error bars is left out: finer steps, causes of the misfit"
         if problem.substeps == "auto":
-            found = _fine_enough(found, problem.solver(method), watch, say, scheduler)
+            found, fit = _fine_enough(found, fit, problem.solver(method), watch, say, scheduler)
         substeps = found.solution.collocation.substeps
         turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
-        found = replace(found, notes=(*turns, *found.notes), profiles=_profiles(found, say))
+        found = replace(found, notes=(*turns, *found.notes))
+        if found.uncertainty is not None and fit is not None:
+            profiles = _profiles(found, fit, say)
+            found = replace(found, profiles=profiles, sources=_sources(found, fit, say))
         if not seek_causes or found.solution.status is Status.INTERRUPTED:
             return found
         say("looking for causes of the misfit")
@@ -153,22 +156,22 @@ def run(
         return replace(found, rollouts=unsimulated | dict(found.rollouts), missing=missing)
 
 
-def _checked(problem: Problem, solution: Solution, say: Log) -> Run:
-    """A solution simulated forward, with its error bars, where there are any."""
+def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
+    """A solution simulated forward, with its error bars and the fit they are of, where any."""
     say("checking the answer by a forward simulation")
     rollouts = roll_outs(problem, solution)
     if not solution.status.converged:
-        return Run(problem, solution, rollouts, None)
+        return Run(problem, solution, rollouts, None), None
     say("finding the error bars")
     try:
         fit = linearised_fit(solution.collocation, solution.z)
         say("finding what noise of the poses does")
         extra, noises = pose_noise_draws(solution.collocation, solution.z)
     except SimulationError as error:
-        return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",))
+        return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
     found = Run(problem, solution, rollouts, None, diagnose(fit, extra))
     if not solution.collocation.nq:
-        return found
+        return found, fit
     options = problem.uncertainty
     try:
         uncertainty = uncertainty_of(
@@ -176,23 +179,24 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> Run:
         )
     except InputError as error:
         raise error.located(problem.path) from error
+    found = replace(found, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
+    error = step_error(problem, solution, fit, rollouts, found.noise_estimates)
+    return replace(found, refinement=error), fit
+
+
+def _sources(found: Run, fit: LinearisedFit, say: Log) -> Sources:
+    """What moves the estimates beside the noise."""
     say("finding what is assumed is worth")
-    collocation, z = solution.collocation, solution.z
-    changes = assumed(collocation, z, options.assumptions.deviations)
-    sources = Sources.of(fit, changes, collocation.parameters, solution.q)
-    notes = tuple(noise.sentence for noise in noises)
-    found = replace(found, uncertainty=uncertainty, notes=notes, sources=sources)
-    estimates = found.noise_estimates
-    return replace(found, refinement=step_error(problem, solution, fit, rollouts, estimates))
+    solution, stated = found.solution, found.problem.uncertainty.assumptions
+    changes = assumed(solution.collocation, solution.z, stated.deviations)
+    return Sources.of(fit, changes, solution.collocation.parameters, solution.q)
 
 
-def _profiles(found: Run, say: Log) -> tuple[Profile, ...]:
+def _profiles(found: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
     """The profile likelihoods that are asked for."""
-    asked, profiles = found.problem.uncertainty.profile, []
-    if found.uncertainty is None or not asked:
-        return ()
-    fit = linearised_fit(found.solution.collocation, found.solution.z)
-    for name in asked:
+    profiles = []
+    assert found.uncertainty is not None
+    for name in found.problem.uncertainty.profile:
         say(f"profile likelihood of {name}")
         try:
             profiles.append(profile_of(found.solution, fit, found.uncertainty, name))
@@ -202,15 +206,20 @@ def _profiles(found: Run, say: Log) -> tuple[Profile, ...]:
 
 
 def _fine_enough(
-    coarse: Run, solver: Method, watch: Watch | None, say: Log, scheduler: str | None
-) -> Run:
+    coarse: Run,
+    fit: LinearisedFit | None,
+    solver: Method,
+    watch: Watch | None,
+    say: Log,
+    scheduler: str | None,
+) -> tuple[Run, LinearisedFit | None]:
     """The run again from its answer, with as many substeps as its error bars ask for."""
     if coarse.refinement is None:
-        return coarse
+        return coarse, fit
     first, problem = coarse.solution, coarse.problem
     substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
     if substeps == 1:
-        return coarse
+        return coarse, fit
     say(f"solving again with {substeps} steps a sample")
     worst, many = coarse.refinement.worst(coarse.noise_estimates)
     why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
@@ -232,7 +241,7 @@ def _fine_enough(
         raise KeyboardInterrupt  # the first answer is whole
     if finer is None or not finer.status.converged:
         note = f"{why}; with {substeps} it was not solved: {message}"
-        return replace(coarse, notes=(note, *coarse.notes))
+        return replace(coarse, notes=(note, *coarse.notes)), fit
     most = ", the most that are chosen" if substeps == MOST_SUBSTEPS else ""
     said = f"{why}; so it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, said), say)
