@@ -260,7 +260,7 @@ class Body(Discretisation):
 
     def joined_with(self, couplings: Sequence[SymmetricPattern]) -> Joined:
         """The mesh graph, other couplings, and those of the forces of users."""
-        own = (placed.couplings for placed in self.placed_forces)
+        own = (placed.points.couplings for placed in self.placed_forces)
         return Joined.of((self.pattern, *couplings, *own))
 
     # One state ------------------------------------------------------------------------------

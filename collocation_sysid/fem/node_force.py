@@ -16,15 +16,14 @@ from typing import Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError, hint_at
 from ..files import reason
 from .constants import Constant, constant_named
+from .force_points import ForcePoints
 from .mesh import Nodes
-from .pattern import SymmetricPattern, dofs_of
 from .selection import Indices, Selection
 
 Law = Callable[..., ca.SX]
@@ -226,47 +225,24 @@ class PlacedForce:
     Attributes
     ----------
     force : NodeForce
-    nodes : (i, k) of each node or face
+    points : ForcePoints
+        The nodes, or those of each face.
     data : (8, i) what an `AtNode` has behind the time
     columns : (c,) places of its constants in θ
-    couplings : SymmetricPattern of the dofs of each
     """
 
     force: NodeForce
-    nodes: Index
+    points: ForcePoints
     data: Array
     columns: Index
-    couplings: SymmetricPattern
-
-    @cached_property
-    def dofs(self) -> Index:
-        """(i, 3k)."""
-        return dofs_of(self.nodes)
-
-    @cached_property
-    def onto_dofs(self) -> sp.csr_array:
-        """What sums (i, 3k) into (3n,)."""
-        return _summing(self.dofs, self.couplings.size)
-
-    @cached_property
-    def onto_couplings(self) -> tuple[sp.csr_array, Array]:
-        """What sums lower triangles (i, m), column after column, into the couplings' entries.
-
-        And the sign (i, m) of skew ones there, whose dofs may be in another order.
-        """
-        columns, rows = np.triu_indices(self.dofs.shape[1])
-        row, column = self.dofs[:, rows], self.dofs[:, columns]
-        places = self.couplings.position(row.ravel(), column.ravel()).reshape(row.shape)
-        return _summing(places, self.couplings.entries), np.where(row < column, -1.0, 1.0)
 
     @classmethod
     def on(
         cls, force: NodeForce, mesh: Nodes, chosen: Index, volume_m3: Array, columns: Index
     ) -> PlacedForce:
-        """A force on chosen nodes of a mesh whose nodes have these volumes (n,)."""
-        count = len(mesh.points_m)
+        """A force on chosen nodes of a mesh, on a body whose nodes have these volumes (n,)."""
         area, normal = surface_of(mesh)
-        data = np.vstack([mesh.points_m.T, area, volume_m3, normal.T])
+        data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
         if force.on == "nodes":
             nodes, data = chosen[:, None], data[:, chosen]
         else:
@@ -279,7 +255,7 @@ class PlacedForce:
                 )
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
-        return cls(force, nodes, data, columns, SymmetricPattern.of_cells(nodes, count))
+        return cls(force, ForcePoints.of_nodes(nodes, len(volume_m3)), data, columns)
 
 
 def middle(values: ca.SX) -> ca.SX:
@@ -294,13 +270,6 @@ def area_vector(places: Sequence[ca.SX]) -> ca.SX:
     ring = [place - places[0] for pair in pairs for place in pair]
     beside = pairwise(ring)
     return sum((ca.cross(a, b) for a, b in beside), start=ca.SX.zeros(3)) / 2
-
-
-def _summing(places: Index, size: int) -> sp.csr_array:
-    """What sums values at places (i, k) into (size,)."""
-    flat = places.ravel()
-    entries = np.ones(flat.size), (flat, np.arange(flat.size))
-    return sp.csr_array(entries, shape=(size, flat.size))
 
 
 def surface_of(mesh: Nodes) -> tuple[Array, Array]:

@@ -92,7 +92,7 @@ def refined(body: Body) -> Body:
 
 def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
     """A force on the finer mesh: the middle of an edge belongs where both ends do."""
-    chosen = np.isin(np.arange(len(body.nodes_m)), placed.nodes)
+    chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]
     chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])
     if body.element.edges:

@@ -274,7 +274,7 @@ def _only_experiment(problem: Problem) -> Experiment:
     if experiment.readings:
         names = ", ".join(repr(gauge.name) for gauge in experiment.readings)
         raise refused(f"the readings {names}, which frames do not bring,", "none")
-    own = (generated(each.force, each.dofs.shape[1]) for each in experiment.body.placed_forces)
+    own = (generated(each.force, each.points.dofs) for each in experiment.body.placed_forces)
     if any(law.takes(0) for law in own):
         raise refused("a force that depends on time", "one that does not")
     if not experiment.markers.names:
