@@ -32,7 +32,7 @@ from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import pose_noise_draws
 from .statistics.profile import Profile, profile_of
-from .statistics.uncertainty import uncertainty_of
+from .statistics.uncertainty import Uncertainty, uncertainty_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import
@@ -143,7 +143,8 @@ def run(
         found = replace(found, notes=(*turns, *found.notes))
         if found.uncertainty is not None and fit is not None:
             profiles = _profiles(found, fit, say)
-            found = replace(found, profiles=profiles, sources=_sources(found, fit, say))
+            sources = _sources(found, fit, found.uncertainty, say)
+            found = replace(found, profiles=profiles, sources=sources)
         if not seek_causes or found.solution.status is Status.INTERRUPTED:
             return found
         say("looking for causes of the misfit")
@@ -184,12 +185,13 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     return replace(found, refinement=error), fit
 
 
-def _sources(found: Run, fit: LinearisedFit, say: Log) -> Sources:
+def _sources(found: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> Sources:
     """What moves the estimates beside the noise."""
     say("finding what is assumed is worth")
     solution, stated = found.solution, found.problem.uncertainty.assumptions
     changes = assumed(solution.collocation, solution.z, stated.deviations)
-    return Sources.of(fit, changes, solution.collocation.parameters, solution.q)
+    parameters = solution.collocation.parameters
+    return Sources.of(fit, changes, parameters, solution.q, known)
 
 
 def _profiles(found: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:

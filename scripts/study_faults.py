@@ -140,7 +140,7 @@ def identified(
     found = covariance(collocation, z)
     changes = changed_residuals(collocation, z, [(row, row.sigma) for row in assumed])
     fit = linearised_fit(collocation, z)
-    sources = Sources.of(fit, changes, collocation.parameters, solution.q)
+    sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
     lines, true = budget(sources, found, {}), truth()
     whole = [
         float(lines[n].whole95[0] <= true[n] <= lines[n].whole95[1]) if n in lines else np.nan

@@ -7,9 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from problem_files import pictures_drawn, run_command, write_problem
-from problems_small import GUESS, cube_with_nuisance, hung_cube, measured
+from problems_small import GUESS, TRUTH, cube_with_nuisance, hung_cube, measured
 
-from collocation_sysid import Problem, UncertaintyOptions, run, solve, with_markers
+from collocation_sysid import (
+    Problem,
+    Run,
+    UncertaintyOptions,
+    run,
+    simulate,
+    solve,
+    with_markers,
+)
 from collocation_sysid.display import plain_text
 from collocation_sysid.recording.nuisance import ROWS
 from collocation_sysid.result.run_sections import summary
@@ -19,6 +27,7 @@ from collocation_sysid.statistics.budget import Sources, worded
 from collocation_sysid.statistics.considered import assumed, considered
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.numerical import shifts
+from collocation_sysid.statistics.uncertainty import covariance
 
 NOTHING = {name: "none" for name in Assumptions().deviations}
 
@@ -55,14 +64,31 @@ def test_where_nothing_is_assumed_both_are_the_same():
         assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
 
 
+def assumed_deviation(solved: Run, name: str) -> float:
+    """How much wider the whole interval is upwards, as a deviation of the logarithm."""
+    least, most = solved.estimates[name].ci95
+    half = np.log(most / least) / 2
+    above = np.log(solved.budget[name].whole95[1] / least) - half
+    return float(np.sqrt(above**2 - half**2)) / 1.96
+
+
 def test_one_assumption_alone_has_its_own_variance(finished):
     heavy = run(problem(**NOTHING | {"mass": 0.05}), seek_causes=False)
     # Markers that swing tell moduli over density: E follows the mass.
-    low, high = heavy.budget["mu_pa"].whole95
-    least, most = heavy.estimates["mu_pa"].ci95
-    wider = np.log(high / low) ** 2 - np.log(most / least) ** 2
-    assert np.sqrt(wider) / 2 / 1.96 == pytest.approx(0.05, rel=1e-3)
+    assert assumed_deviation(heavy, "mu_pa") == pytest.approx(0.05, rel=1e-3)
     assert max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get) == "mass"
+
+
+def test_what_is_as_large_as_an_estimate_adds_to_it_as_well_as_multiplies_it():
+    airy = run(problem(**NOTHING | {"air_drag": 20.0}), seek_causes=False)
+    deviation = assumed_deviation(airy, "gamma_m_1_s")
+    assert deviation > 0.3
+    # All of what is seen may be the air's.
+    least, most = airy.estimates["gamma_m_1_s"].ci95
+    middle = np.sqrt(least * most)
+    lowest = middle - np.hypot(1.96 * deviation * middle, middle - least)
+    assert airy.budget["gamma_m_1_s"].whole95[0] == pytest.approx(max(0.0, lowest))
+    assert lowest < middle * np.exp(-1.96 * deviation)
 
 
 def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it():
@@ -106,8 +132,37 @@ def test_sources_need_no_nuisance_parameters():
     solution = solve(Problem([measured(hung_cube(12))], GUESS))
     fit = linearised_fit(solution.collocation, solution.z)
     changes = assumed(solution.collocation, solution.z, Assumptions().deviations)
-    sources = Sources.of(fit, changes, GUESS, solution.q)
-    assert sources.of_noise(np.eye(len(solution.q))[0]) == 1.0
+    known = covariance(solution.collocation, solution.z)
+    sources = Sources.of(fit, changes, GUESS, solution.q, known)
+    assert sources.of_noise(np.eye(len(solution.q))[0]) == (1.0, 1.0)
+
+
+def swings(*gamma_r_s: float) -> Problem:
+    """Recordings of the same motion, of bodies that may be damped unlike each other."""
+    rng, recordings = np.random.default_rng(5), []
+    for k, damping in enumerate(gamma_r_s):
+        swing = replace(hung_cube(25), name=f"swing {k}")
+        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint").markers_m
+        noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(markers.shape)
+        recordings.append(with_markers(swing, markers + noise_m))
+    options = UncertaintyOptions(assumptions=Assumptions(**NOTHING), numerical=False)
+    return Problem(recordings, GUESS, uncertainty=options)
+
+
+def test_what_recordings_disagree_on_is_in_the_whole_interval():
+    truths = (4e-3, 9e-3, 14e-3)
+    unlike = run(swings(*truths), seek_causes=False)
+    line = unlike.budget["gamma_r_s"]
+    assert next(iter(line.shares)) == "between recordings"
+    assert line.whole95[0] < truths[0]
+    assert line.whole95[1] > truths[-1]
+
+
+def test_recordings_that_agree_add_nothing():
+    alike = run(swings(9e-3, 9e-3, 9e-3), seek_causes=False)
+    for name, line in alike.budget.items():
+        low, high = alike.estimates[name].ci95
+        assert np.log(line.whole95[1] / line.whole95[0]) < 1.3 * np.log(high / low)
 
 
 def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):

@@ -3,7 +3,9 @@
 With A the information of a fit, J its slopes and J_c how its residuals change where an assumption
 is off by its deviation, estimates of parameters p follow by S = −(JᵀJ)⁻¹ Jᵀ J_c, and have the
 covariance P + S Sᵀ: that of the fit and that of what it assumes (considered parameters: Schmidt,
-NASA TN D-1235, 1962; type B evaluation: JCGM 100:2008, 4.3).
+NASA TN D-1235, 1962; type B evaluation: JCGM 100:2008, 4.3). That one value holds for all
+recordings is assumed too; by how much it does not is seen from them, see `scatter`, and where that
+decides intervals are Student's with their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 from ..arrays import Array
 from ..model.parameters import Parameters
 from .considered import Changes
+from .distributions import student_ppf
 from .linearised import LinearisedFit, least_squares
 from .numerical import Coordinate, NumericalError, shifts
 from .uncertainty import Uncertainty
@@ -23,6 +26,7 @@ from .uncertainty import Uncertainty
 # Half a 95 % interval of what is normal, in deviations.
 NORMAL = 1.96
 NOISE, NUISANCES, NUMERICAL = "noise", "nuisance parameters", "step and mesh"
+BETWEEN = "between recordings"
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,10 @@ class Sources:
     free, known : (nq, nq) covariances of q for noise as given, with nuisance parameters free, and
         with these known
     by_q : mapping of estimate to (nq,), its derivative
+    wider : (nq,) by how much intervals are wider than noise makes them, as recordings disagree
+    between : (nq, b) how q follows what parameters differ by between recordings
+    freedom : int
+        How many recordings tell that, less one.
     """
 
     names: tuple[str, ...]
@@ -58,9 +66,19 @@ class Sources:
     free: Array
     known: Array
     by_q: Mapping[str, Array]
+    wider: Array
+    between: Array
+    freedom: int = 0
 
     @classmethod
-    def of(cls, fit: LinearisedFit, assumed: Changes, parameters: Parameters, q: Array) -> Sources:
+    def of(
+        cls,
+        fit: LinearisedFit,
+        assumed: Changes,
+        parameters: Parameters,
+        q: Array,
+        uncertainty: Uncertainty,
+    ) -> Sources:
         """Those of a fit near its answer q (nq,)."""
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared]
@@ -70,12 +88,34 @@ class Sources:
             inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = shifts(fit, assumed.blocks)[: fit.shared]
-        return cls(assumed.names, moved, all_free, known, _slopes(fit, parameters, q))
+        by_q, scatter = _slopes(fit, parameters, q), uncertainty.scatter
+        between, freedom = np.zeros((fit.shared, 0)), 0
+        if scatter is not None:
+            between, freedom = scatter.between[: fit.shared], len(scatter.recordings) - 1
+        wider = uncertainty.wider
+        return cls(assumed.names, moved, all_free, known, by_q, wider, between, freedom)
 
-    def of_noise(self, by_q: Array) -> float:
-        """Of a variance by noise, the share that there were if nuisances were known."""
-        whole = float(by_q @ self.free @ by_q)
-        return float(np.clip(by_q @ self.known @ by_q / whole, 0.0, 1.0)) if whole > 0 else 1.0
+    def of_noise(self, by_q: Array) -> tuple[float, float]:
+        """Of a variance by noise, the shares if nuisances were known and recordings agreed."""
+        widened = self.wider * by_q
+        known, whole, all_of_it = (
+            float(g @ of_q @ g)
+            for g, of_q in ((by_q, self.known), (by_q, self.free), (widened, self.free))
+        )
+        if not whole > 0:
+            return 1.0, 1.0
+        return float(np.clip(known / whole, 0.0, 1.0)), whole / all_of_it
+
+    def of_recordings(self, by_q: Array, others: float, told: float) -> float:
+        """A variance by what parameters differ by between recordings, beyond what is told of it.
+
+        It is as large as its interval is beside that of all others.
+        """
+        more = max(0.0, float(np.sum((by_q @ self.between) ** 2)) - told)
+        if not more:
+            return 0.0
+        freedom = self.freedom * ((others + more) / more) ** 2
+        return more * float(student_ppf(0.975, freedom) / NORMAL) ** 2
 
     def of_assumed(self, by_q: Array) -> dict[str, float]:
         """Variances by each assumption, of what has this derivative."""
@@ -111,19 +151,40 @@ def budget(
         low, high = map(at.at, estimate.ci95)
         noise = ((high - low) / 2 / NORMAL) ** 2
         low, high = map(at.at, ends)
-        own = sources.of_noise(by_q)
-        parts = {NOISE: noise * own, NUISANCES: noise * (1 - own)}
+        own, agreed = sources.of_noise(by_q)
+        told = noise * (1 - agreed)
+        parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
         parts[NUMERICAL] = max(0.0, ((high - low) / 2 / NORMAL) ** 2 - noise)
-        by_assumption = sources.of_assumed(by_q * at.slope(estimate.value))
-        total = sum(parts.values()) + sum(by_assumption.values())
-        whole = np.hypot((high - low) / 2, NORMAL * np.sqrt(sum(by_assumption.values())))
-        middle = (low + high) / 2
+        in_chart = by_q * at.slope(estimate.value)
+        by_assumption = sources.of_assumed(in_chart)
+        others = sum(parts.values()) + sum(by_assumption.values())
+        more = sources.of_recordings(in_chart, others, told)
+        parts[BETWEEN] = told + more
+        assumed = sum(by_assumption.values()) + more
+        total = others + told + more
         ranked = sorted((parts | by_assumption).items(), key=lambda part: -part[1])
         lines[name] = BudgetLine(
             {source: variance / total for source, variance in ranked if variance > 0},
-            (at.value(middle - whole), at.value(middle + whole)),
+            _whole(at, (low, high), NORMAL * float(np.sqrt(assumed))),
         )
     return lines
+
+
+def _whole(at: Coordinate, ends: tuple[float, float], reach: float) -> tuple[float, float]:
+    """An interval with what is assumed, from its ends and the assumptions' half width.
+
+    Of an effect as large as the estimate itself the first order is true of one chart only: what
+    brakes a body adds to a damping, what makes it heavier multiplies its moduli. So it reaches as
+    far as in the worse of both, the estimate's coordinate and its value.
+    """
+    middle, whole = sum(ends) / 2, float(np.hypot((ends[1] - ends[0]) / 2, reach))
+    centre, low, high = map(at.value, (middle, *ends))
+    below, above = (float(np.hypot(reach / at.slope(centre), end - centre)) for end in (low, high))
+    least, most = at.range
+    return (
+        min(at.value(middle - whole), max(least, centre - below)),
+        max(at.value(middle + whole), min(most, centre + above)),
+    )
 
 
 def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:

@@ -301,9 +301,15 @@ def information(fit: LinearisedFit) -> Information:
 
 def least_squares(fit: LinearisedFit) -> LeastSquares:
     """Residuals and priors by a step of all parameters."""
-    found = LeastSquares.none(len(fit.names)).add(fit.prior_residual, np.diag(fit.prior_slope))
-    for block in fit.blocks:
-        residual, slope, _ = block.channels
+    of_all = rows_of(fit, range(len(fit.blocks)))
+    return of_all.add(fit.prior_residual, np.diag(fit.prior_slope))
+
+
+def rows_of(fit: LinearisedFit, numbers: Iterable[int]) -> LeastSquares:
+    """Residuals of some blocks, without priors."""
+    found = LeastSquares.none(len(fit.names))
+    for k in numbers:
+        residual, slope, _ = fit.blocks[k].channels
         found = found.add(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
     return found
 

@@ -11,24 +11,38 @@ with one degree of freedom less than there are recordings that tell it. If it is
 allows, something but the noise differs among recordings: the model's error. Error bars are then
 √(χ² / f) times as large (Birge 1932), and intervals are Student's. The joint fit may have seen
 that error in its residuals already; not to count it twice, 1 / Σ 1 / v_e widened so is enough.
+
+A parameter that hardly a recording tells alone may look certain because all together tell it. So
+each parameter k in turn is let be another in every recording, where all others are shared: with W
+what the information of everything leaves for these numbers and s their score, they differ by
+
+    Q_k = sᵀP s,   P = W⁺ − 11ᵀ / 1ᵀW1,   E Q_k = E_k + Σ_l τ_l² tr M_klᵀ P M_kl,
+
+E_k being what noise makes of it, as many as there are recordings less one, or more where errors
+hang together; and M_kl what parameter l does to s where it differs itself, by the variance τ_l²
+between recordings. All of these follow by moments, none below zero (DerSimonian & Laird 1986, of
+several parameters and with the recordings' own covariance). Estimates follow by −A⁻¹ (SᵀS)_e.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from ..arrays import Array
 from .distributions import chi2_sf
-from .linearised import LinearisedFit, best_step
+from .linearised import LinearisedFit, best_step, least_squares, rows_of
 
 # Probability that recordings without such an error are said to disagree, for all parameters.
 SIGNIFICANT = 0.01
 # A recording tells a parameter if the deviation of its q is below this; else a step tells nothing.
 TELLING = 0.5
+# Nor does all that is left of its information, where that is rounding.
+SILENT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +54,14 @@ class Scatter:
     recordings : (n,) names
     away : (n, nq) estimates from each less the joint one; NaN where it does not tell
     deviations : (n, nq) their standard deviations; NaN likewise
+    between : (p, nq n) how the joint estimates follow what each parameter is off by in each
+        recording, by the deviation between recordings that these have
     """
 
     recordings: tuple[str, ...]
     away: Array
     deviations: Array
+    between: Array
 
     @property
     def chi_squared(self) -> Array:
@@ -116,12 +133,50 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, 
         )
 
 
-def scatter_of(names: Sequence[str], steps: Sequence[Array], variances: Sequence[Array]) -> Scatter:
-    """Compare recordings by their steps (nq,) from the joint answer, and variances (nq,) of q."""
-    deviations = np.sqrt(np.array(variances))
+def scatter_of(fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]) -> Scatter:
+    """Compare recordings, by name, by what each says alone.
+
+    That are its step (nq,) from the joint answer, and variances (nq,) of q as they are, and as they
+    were if its errors were independent and of the σ given.
+    """
+    steps, variances, independent = (np.array(each) for each in zip(*alone.values(), strict=True))
+    deviations = np.sqrt(variances)
     told = deviations < TELLING
+    with np.errstate(invalid="ignore"):
+        excess = variances / independent
     return Scatter(
-        tuple(names),
-        np.where(told, np.array(steps), np.nan),
+        tuple(alone),
+        np.where(told, steps, np.nan),
         np.where(told, deviations, np.nan),
+        _between(fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)),
     )
+
+
+def _between(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
+    """See `Scatter`; of parameters at a bound nothing."""
+    own = [rows_of(fit, recordings_of(fit)[name]) for name in names]
+    each, scores = np.array([o.information for o in own]), np.array([o.score for o in own])
+    together = least_squares(fit)
+    whole, score = together.information, together.score
+    free = np.flatnonzero(~fit.at_bound)
+    inverse = np.linalg.pinv(whole[np.ix_(free, free)], hermitian=True)
+    shared = free[free < fit.shared]
+    unlike, by_each = np.zeros(len(shared)), np.zeros((len(shared), len(shared)))
+    for row, k in enumerate(shared.tolist()):
+        others = free[free != k]
+        cross = each[:, k, others] @ np.linalg.pinv(whole[np.ix_(others, others)], hermitian=True)
+        own_s = scores[:, k] - cross @ score[others]
+        by_own = [np.diag(each[:, k, l]) - cross @ each[:, others, l].T for l in shared]
+        left = by_own[row]
+        if not left.sum() > SILENT * whole[k, k]:
+            continue
+        apart = np.linalg.pinv(left, rcond=SILENT, hermitian=True) - 1 / left.sum()
+        noise = left * np.sqrt(np.outer(excess[:, k], excess[:, k]))
+        unlike[row] = own_s @ apart @ own_s - np.trace(apart @ noise)
+        by_each[row] = [np.trace(m.T @ apart @ m) for m in by_own]
+    sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
+    variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), unlike / np.sqrt(sizes))[0]
+    moved = np.zeros((len(fit.names), fit.shared, len(names)))
+    for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
+        moved[free, k] = -tau * inverse @ each[:, free, k].T
+    return moved.reshape(len(fit.names), -1)

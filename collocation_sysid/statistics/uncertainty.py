@@ -46,7 +46,7 @@ from .estimates import (
     size_notes,
     user_estimates,
 )
-from .linearised import Information, LinearisedFit, information, linearised_fit
+from .linearised import Information, LinearisedFit, information, least_squares, linearised_fit
 from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
 from .pose_noise import pose_noise_draws
 from .scatter import Scatter, recordings_of, scatter_of, single_fits
@@ -97,6 +97,8 @@ class Uncertainty:
         What the user should know.
     scatter : Scatter or None
         What the recordings say one by one, where there are several.
+    wider : (nq,)
+        By how much intervals are wider because they disagree.
     outliers : tuple of Outlier
         Samples that spoil what the residuals tell; `dependence` leaves them out.
     """
@@ -116,6 +118,7 @@ class Uncertainty:
     chi_squared: float
     degrees_of_freedom: float
     notes: tuple[str, ...]
+    wider: Array
     scatter: Scatter | None = None
     outliers: tuple[Outlier, ...] = ()
 
@@ -196,7 +199,7 @@ def uncertainty_of(
     bars = _error_bars(fit, factored, noise, errors, extra)
     of_all, bounded = _known(bars.covariance, fit, parameters, q)
     scatter = _scatter(fit, parameters, q, noise, errors, extra)
-    of_q, quantiles = _widened(of_all[:shared, :shared], bars.quantiles, scatter)
+    of_q, quantiles, wider = _widened(of_all[:shared, :shared], bars.quantiles, scatter)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
     sizes, deviations = relative_slopes(parameters, q), np.sqrt(np.diag(of_all)[shared:]).tolist()
@@ -223,6 +226,7 @@ def uncertainty_of(
             *scatter_notes(fit, scatter),
         ),
         scatter=scatter,
+        wider=wider,
         outliers=bars.outliers,
     )
 
@@ -286,15 +290,16 @@ def _known(
     return told, bounded
 
 
-def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Array, Array]:
-    """Covariance and quantiles, both larger where recordings disagree."""
+def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Array, Array, Array]:
+    """Covariance and quantiles, larger where recordings disagree, and by what intervals are so."""
     if scatter is None:
-        return of_q, quantiles
+        return of_q, quantiles, np.ones(len(quantiles))
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(scatter.widened(np.diag(of_q)) / np.diag(of_q))
     factors = np.where(scatter.disagreeing, factors, 1.0)
     of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.freedom, 1)))
-    return of_q * np.outer(factors, factors), np.where(scatter.disagreeing, of_few, quantiles)
+    wide = np.where(scatter.disagreeing, of_few, quantiles)
+    return of_q * np.outer(factors, factors), wide, factors * wide / quantiles
 
 
 def _scatter(
@@ -308,17 +313,16 @@ def _scatter(
     """What recordings say one by one, with error bars of their own."""
     if len(recordings_of(fit)) < 2:
         return None
-    names, steps, variances = [], [], []
-    sizes = relative_slopes(parameters, q)
+    known, sizes = {}, relative_slopes(parameters, q)
     for blocks, alone, step in single_fits(fit):
         if alone.measurements <= len(alone.names):
             continue
         own = None if extra is None else [extra[k] for k in blocks]
         found = uncertainty_of(alone, parameters, q, noise, errors, own)
-        names.append(alone.blocks[0].name)
-        steps.append(step)
-        variances.append(np.diag(found.covariance) / sizes**2)
-    return scatter_of(names, steps, variances) if len(names) > 1 else None
+        independent = least_squares(alone).errors[: fit.shared] ** 2
+        variances = np.diag(found.covariance) / sizes**2
+        known[alone.blocks[0].name] = step, variances, independent
+    return scatter_of(fit, known) if len(known) > 1 else None
 
 
 def _no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
