@@ -20,7 +20,7 @@ from pydantic import (
 
 from .checked import Boundless, Finite
 from .errors import located
-from .stated import attributes, documented, keys_of
+from .stated import Key, attributes, documented, keys_of
 
 Vector = tuple[Finite, Finite, Finite]
 Corner = tuple[Boundless, Boundless, Boundless]
@@ -86,6 +86,12 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
     return create_model(title, __base__=base, __doc__=doc, __validators__=checks, **made)
 
 
+def tables(name: str, kind: type) -> Key:
+    """The key of [[tables]], each of which states one of a class."""
+    form = list[section_of(kind, f"{kind.__name__}Section")]
+    return Key(name, form, default=[], tables=kind)
+
+
 def _options(kind: Any) -> dict[str, Any]:
     types, said = get_type_hints(kind, include_extras=True), documented(kind)
     keys: dict[str, Any] = {}
@@ -109,7 +115,7 @@ def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for name, key in keys_of(kind):
         value = getattr(section, key.name)
-        if value is not None and key.constant is None:
+        if value is not None and key.constant is None and key.tables is None:
             with located(where=f"{where}.{key.name}"):
                 fields[name] = key.read(value) if key.read else value
     return fields

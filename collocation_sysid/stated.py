@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import MISSING, Field, dataclass, field, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache, partial
 from typing import Any, TypeVar, dataclass_transform, get_args
 
@@ -38,6 +38,8 @@ class Key:
     said : str, optional
         What it is, where that is not what the field is.
     default : what is meant where the file says nothing; it has to say something without
+    tables : type, optional
+        Where the file has [[tables]] of the key: the class that each of them states.
     """
 
     name: str
@@ -46,6 +48,12 @@ class Key:
     constant: str | None = None
     said: str | None = None
     default: Any = None
+    tables: type | None = None
+
+
+def as_given(value: Any) -> Any:
+    """Where a field is converted as soon as more is known."""
+    return value
 
 
 def key(
@@ -75,37 +83,45 @@ def key(
 def stated(kind: type[T]) -> type[T]:
     """A frozen dataclass whose fields are converted before ``__post_init__`` checks them.
 
-    Where its `place` says what one is called, messages of either begin with that.
+    Where its `place` says what one is called, messages of either begin with that; else they name it
+    by its `called`, or by the class.
     """
-    check = kind.__dict__.get("__post_init__", lambda self: None)
+    check = getattr(kind, "__post_init__", lambda self: None)
 
     def convert(self: T) -> None:
         with located(where=getattr(self, "place", None)):
-            for name, converter in converters.items():
+            for name, converted in conversions.items():
                 if (value := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, converter(value))
+                    object.__setattr__(self, name, converted(self, value))
             check(self)
 
     setattr(kind, "__post_init__", convert)  # noqa: B010 (of a type of the user's)
     made: Any = dataclass(frozen=True, eq=False)(kind)
-    converters = {
-        each.name: each.metadata["converter"] or partial(_checked, made, each)
+    conversions = {
+        each.name: partial(_converted, each)
         for each in fields(made)
         if each.metadata.get("converter") or each.metadata.get("form")
     }
     return made
 
 
-def _checked(kind: type, field: Field[Any], value: Any) -> Any:
-    """A value of a field, which is to be the default or what a file may say."""
+def _converted(field: Field[Any], owner: Any, value: Any) -> Any:
+    """A value of a field; without a converter it is to be the default or what a file may say."""
+    if (converter := field.metadata["converter"]) is not None:
+        return converter(value)
     if value == field.default:
         return value
     try:
         return _adapter(field.metadata["form"]).validate_python(value)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
-        word = re.sub("(?<!^)(?=[A-Z])", " ", kind.__name__).lower()
-        of = field.name if hasattr(kind, "place") else f"{field.name} of a {word}"
+        called = re.sub("(?<!^)(?=[A-Z])", " ", type(owner).__name__).lower()
+        what, word = field.name, getattr(owner, "called", called)
+        for part in fault["loc"]:
+            if isinstance(value, Mapping) and part in value:
+                what, value = f"{what}.{part}", value[part]
+        whose = f"the {word} {owner.name!r}" if hasattr(owner, "name") else f"a {word}"
+        of = what if hasattr(owner, "place") else f"{what} of {whose}"
         shown = f"{value:g}" if isinstance(value, float) else repr(value)
         choices = fault["type"] == "literal_error" and get_args(field.metadata["form"])
         wanted = f"one of {', '.join(choices)}" if choices else expected(fault)
@@ -123,12 +139,24 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
     for each in fields(kind):
         form = each.metadata.get("form")
         if isinstance(form, Key):
-            yield each.name, form
+            text = form.said or said.get(each.name, "")
+            if form.tables is not None:
+                word = f"{kind.__name__.lower()}.{form.name}"
+                text = f"[[{word}]] tables: {text[:1].lower()}{text[1:]}"
+            yield each.name, replace(form, said=text)
         elif form is not None:
             usual = ... if each.default is MISSING else each.default
+            usual = usual if each.default_factory is MISSING else each.default_factory()
             default = None if type(None) in get_args(form) else usual
             read, text = each.metadata["read"], said.get(each.name)
             yield each.name, Key(each.name, form, read, None, text, default)
+
+
+def tables_of(kind: type) -> Iterator[tuple[str, str, type]]:
+    """The fields that [[tables]] of a problem file state: field, key, and class of a table."""
+    for name, key in keys_of(kind):
+        if key.tables is not None:
+            yield name, key.name, key.tables
 
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:

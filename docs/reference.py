@@ -69,7 +69,7 @@ def _tables(name: str, table: Schema, known: Schema, listed: bool = False) -> It
 
 def _default(entry: Schema) -> str:
     value = entry.get("default")
-    return "optional" if value is None or isinstance(value, dict) else f"`{_toml(value)}`"
+    return "optional" if value in (None, []) or isinstance(value, dict) else f"`{_toml(value)}`"
 
 
 def _models(entry: Schema, known: Schema, listed: bool = False) -> Iterator[tuple[Schema, bool]]:

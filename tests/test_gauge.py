@@ -133,7 +133,7 @@ def test_error_bars_and_verdict_know_them():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"sigma": 0.0}, "sigma of the reading 'accelerometer' is 0; expected more than 0"),
+        ({"sigma": 0.0}, "sigma of the reading 'accelerometer' is 0; expected a number above 0"),
         ({"unknowns": {"bias_m_s2": -1.0}}, "bias_m_s2 of the reading 'accelerometer' is -1"),
         ({"points_m": [[0.0, 0.0]]}, "points_m of the reading 'accelerometer'"),
         ({"values": np.full((9, 3), np.nan)}, "has no sample"),

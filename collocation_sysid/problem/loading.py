@@ -15,9 +15,10 @@ from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
+from ..recording import Experiment
 from ..recording.nuisance import NuisanceRow
 from ..recording.selected import selection
-from ..stated import keys_of
+from ..stated import keys_of, tables_of
 from ..statistics.assumptions import Assumptions
 from ..statistics.plausible import oddities
 from .code import load_force, load_function, load_material, load_row
@@ -26,7 +27,7 @@ from .nuisance_schema import OwnRow
 from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file
-from .recording_schema import LOADS, ReadingSection
+from .recording_schema import ReadingSection
 from .schema import (
     CodeSection,
     ObjectSection,
@@ -107,7 +108,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
         for grasp in section.grasps:
             moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
             names += [grasp.poses or moved, sensed]
-        for word, kind in LOADS.items():
+        for _, word, kind in tables_of(Experiment):
             keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
             names += [getattr(table, key) for table in getattr(section, word) for key in keys]
     return tuple(folder / name for name in names if name is not None)

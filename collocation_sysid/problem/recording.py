@@ -37,11 +37,10 @@ from ..recording.nuisance import NuisanceRow
 from ..recording.poses import refuse_untold
 from ..recording.tables import read_gauge, within
 from ..section import Section, stated_in
-from ..stated import keys_of
+from ..stated import keys_of, tables_of
 from ..statistics.modal import doubts
 from .nuisance_schema import OwnRow, nuisance_of
 from .recording_schema import (
-    LOADS,
     ExperimentSection,
     GraspSection,
     MarkersSection,
@@ -52,9 +51,6 @@ from .recording_schema import (
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
 Build = Callable[[Markers], Experiment]
-
-# The field of an experiment that the tables of each word fill.
-LISTS = {"mass": "masses", "force": "forces", "tendon": "tendons", "pressure": "pressures"}
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
@@ -109,7 +105,9 @@ class RecordingReader:
             self._grasp(k, grasp, sequence, t_s)
             for k, (grasp, sequence) in enumerate(zip(section.grasps, poses, strict=True))
         )
-        loads: dict[str, Any] = {name: self._made(word) for word, name in LISTS.items()}
+        loads: dict[str, Any] = {
+            name: self._made(word, kind) for name, word, kind in tables_of(Experiment)
+        }
         readings = [self._reading(k, each, t_s) for k, each in enumerate(section.reading)]
 
         def build(markers: Markers) -> Experiment:
@@ -245,15 +243,11 @@ class RecordingReader:
     def _reading(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
         """What is measured within the experiment's time; to be simulated without a file."""
         key = f"reading.{k}"
-        told: dict[str, Any] = section.model_dump(
-            include={"name", "sigma", "points_m", "unknowns", "frame", "columns"}
-        )
+        told: dict[str, Any] = {"name": section.name, **stated_in(section, Gauge, key)}
         told["expression"] = self.expression_of(section, key)
-        if section.grasp is not None:
-            count, told["grasp"] = len(self.section.grasps), section.grasp - 1
-            if section.grasp > count:
-                message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
-                raise InputError(message, None, f"{key}.grasp")
+        if (told.get("grasp") or 0) >= (count := len(self.section.grasps)):
+            message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
+            raise InputError(message, None, f"{key}.grasp")
         with located(where=key):
             if self.simulation and not (section.file and (self.folder / section.file).exists()):
                 return Gauge(t_s=t_s, values=None, **told)
@@ -265,10 +259,10 @@ class RecordingReader:
             self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
             return Gauge(t_s=at_s[inside], values=values[inside], **told)
 
-    def _made(self, word: str) -> tuple[Any, ...]:
-        """What the tables of a kind state, on the body."""
+    def _made(self, word: str, kind: type) -> tuple[Any, ...]:
+        """What the tables of a word state, on the body."""
         return tuple(
-            self._one_made(LOADS[word], table, f"{word}.{k}", f"{word}_{k + 1}")
+            self._one_made(kind, table, f"{word}.{k}", f"{word}_{k + 1}")
             for k, table in enumerate(getattr(self.section, word))
         )
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
-from ..recording import Experiment, Force, Grasp, PointMass, Pressure, Tendon, Wrench
+from ..recording import Experiment, Gauge, Grasp, Wrench
 from ..recording.poses import QUATERNION_NORM_TOLERANCE
 from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
@@ -288,21 +288,6 @@ def _file_name(name: str) -> str:
     return name
 
 
-# What acts on a body, by the word of its tables.
-LOADS: dict[str, Any] = {
-    "mass": PointMass,
-    "force": Force,
-    "tendon": Tendon,
-    "pressure": Pressure,
-}
-if TYPE_CHECKING:
-    MassSection = ForceSection = TendonSection = PressureSection = Section
-else:
-    MassSection, ForceSection, TendonSection, PressureSection = (
-        section_of(kind, f"{word.title()}Section") for word, kind in LOADS.items()
-    )
-
-
 Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
 
 
@@ -312,7 +297,7 @@ class NamedSection(Section):
     name: Annotated[str, AfterValidator(_file_name)]
 
 
-class ReadingSection(NamedSection):
+class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
     """A reading of the user's own: a Python function of what it looks at and of its unknowns.
 
     Attributes
@@ -323,32 +308,13 @@ class ReadingSection(NamedSection):
         Python file; it is run, which needs --allow-code.
     function : str
         Name of the function in it.
-    sigma : float
-        Standard deviation of the noise of each number, in its unit.
     file : str, optional
         What it said: a column t_s, and one for each number; only `simulate` can do without.
-    columns : list of str
-        Columns of the numbers, in their order; all besides t_s by default.
-    points_m : list
-        Places [x, y, z] on the undeformed body that it looks at.
-    grasp : int, optional
-        In place of points: the number of the grasp, from 1, whose force and torque it looks at.
-    frame : str
-        Axes and origin of these: those of the undeformed body as the grasp carries it, or the
-        poses' world.
-    unknowns : dict
-        Standard deviation of each of its unknowns, about zero, by the argument's name.
     """
 
     code: Text
     function: Text
-    sigma: Positive
     file: Text | None = None
-    columns: list[Text] = Field(default_factory=list)
-    points_m: list[Vector] = Field(default_factory=list)
-    grasp: AtLeastOne | None = None
-    frame: Literal["grasp", "world"] = "grasp"
-    unknowns: dict[str, Positive] = Field(default_factory=dict)
 
 
 class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection)):
@@ -369,14 +335,6 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         Put the markers on this rate; their own times by default.
     every : int
         Use every so-manieth sample of the markers.
-    mass : list of MassSection
-        [[experiment.mass]] tables: point masses tied to the body.
-    force : list of ForceSection
-        [[experiment.force]] tables: forces besides gravity.
-    tendon : list of TendonSection
-        [[experiment.tendon]] tables: tendons in the body.
-    pressure : list of PressureSection
-        [[experiment.pressure]] tables: pressures in cavities or on held patches.
     reading : list of ReadingSection
         [[experiment.reading]] tables: instruments of the user's own.
     nuisance : NuisanceOrNone
@@ -390,10 +348,6 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     window_s: tuple[Boundless, Boundless] | None = None
     resample_hz: Positive | None = None
     every: AtLeastOne = 1
-    mass: list[MassSection] = Field(default_factory=list)
-    force: list[ForceSection] = Field(default_factory=list)
-    tendon: list[TendonSection] = Field(default_factory=list)
-    pressure: list[PressureSection] = Field(default_factory=list)
     reading: list[ReadingSection] = Field(default_factory=list)
     nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import KW_ONLY
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, Index
 from ..checked import Flag, NotNegative
 from ..errors import InputError
-from ..section import Vector
-from ..stated import key, stated
+from ..section import Vector, tables
+from ..stated import as_given, key, stated
 from .actuator import Actuator
 from .arrays import floats, read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
@@ -37,10 +37,6 @@ StartRule = Literal["standard", "paper"]
 
 EARTH_M_S2 = (0.0, 0.0, -9.81)
 AS_IN_A_LABORATORY = Nuisance()
-
-
-def _markers(markers: Markers | None) -> Any:
-    return markers
 
 
 def _state(name: str) -> Callable[[ArrayLike], Array]:
@@ -82,13 +78,13 @@ class Experiment:
     validation : bool
         Not fitted, only predicted.
     masses : sequence of PointMass
-        Tied to the body.
+        Point masses tied to the body.
     forces : sequence of Force
-        On the nodes besides gravity.
+        Forces besides gravity.
     tendons : sequence of Tendon
-        Put on the body by their points.
+        Tendons in the body.
     pressures : sequence of Pressure
-        On faces of the body's boundary.
+        Pressures in cavities or on patches that are held.
     readings : sequence of Gauge
         Instruments of one's own.
     nuisance : Nuisance
@@ -104,7 +100,7 @@ class Experiment:
     body: Body
     t_s: Array = key(converter=floats((None,), "t_s"))
     grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
-    markers: Markers = key(converter=_markers, default=None)
+    markers: Markers = key(converter=as_given, default=None)
     gravity_m_s2: Array = key(Vector, converter=floats((3,), "gravity_m_s2"), default=EARTH_M_S2)
     name: str = "experiment"
     _: KW_ONLY
@@ -115,10 +111,10 @@ class Experiment:
     start_velocities_m_s: Array | None = key(converter=_state("velocities_m_s"), default=None)
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
-    masses: tuple[PointMass, ...] = key(converter=tuple[PointMass, ...], default=())
-    forces: tuple[Force, ...] = key(converter=tuple[Force, ...], default=())
-    tendons: tuple[Tendon, ...] = key(converter=tuple[Tendon, ...], default=())
-    pressures: tuple[Pressure, ...] = key(converter=tuple[Pressure, ...], default=())
+    masses: tuple[PointMass, ...] = key(tables("mass", PointMass), converter=tuple, default=())
+    forces: tuple[Force, ...] = key(tables("force", Force), converter=tuple, default=())
+    tendons: tuple[Tendon, ...] = key(tables("tendon", Tendon), converter=tuple, default=())
+    pressures: tuple[Pressure, ...] = key(tables("pressure", Pressure), converter=tuple, default=())
     readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
     nuisance: Nuisance = AS_IN_A_LABORATORY
 

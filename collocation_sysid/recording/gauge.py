@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, cast, get_args
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
+from ..checked import AtLeastOne, Positive, Text
 from ..errors import InputError
 from ..files import reason
+from ..section import Vector
+from ..stated import Key, as_given, key, stated
 from .arrays import read_only_floats
 from .clock import first_time_fault
 from .wrench import Frame
@@ -41,7 +44,17 @@ OF_POINTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
 OF_GRASP = ("force_n", "torque_nm")
 
 
-@dataclass(frozen=True, eq=False)
+_POINTS = Key("points_m", list[Vector], default=[])
+_COLUMNS = Key("columns", list[Text], default=[])
+_GRASP = Key(
+    "grasp",
+    AtLeastOne | None,
+    lambda number: number - 1,
+    said="In place of points: the number of the grasp, from 1, whose force and torque it looks at.",
+)
+
+
+@stated
 class Gauge:
     """An instrument whose reading is an expression of a few points of the body, or of a grasp.
 
@@ -56,19 +69,19 @@ class Gauge:
     values : (S,) or (S, m) array, or None
         What it said; NaN where missing. None before it is simulated.
     sigma : float
-        Standard deviation of the noise of each number.
+        Standard deviation of the noise of each number, in its unit.
     points_m : (P, 3) array, optional
-        Places on the undeformed body.
+        Places [x, y, z] on the undeformed body that it looks at.
     unknowns : mapping of name to float
-        What is not known of it, about zero, by the standard deviations of its priors.
+        Standard deviation of each of its unknowns, about zero, by the argument's name.
     grasp : int, optional
         In place of points the grasp, by its place among those of the experiment, whose force and
         torque it looks at.
     frame : {"grasp", "world"}
-        Axes and origin of these: those of the undeformed body as the grasp carries it, or those of
-        the poses' world.
+        Axes and origin of these: those of the undeformed body as the grasp carries it, or the
+        poses' world.
     columns : sequence of str, optional
-        Names of its numbers, as files have them.
+        Columns of the numbers, in their order; all besides t_s by default.
 
     Raises
     ------
@@ -77,16 +90,18 @@ class Gauge:
         zero, or the expression cannot be evaluated or is not smooth at rest.
     """
 
+    called: ClassVar[str] = "reading"
+
     name: str
     expression: Callable[..., Any]
     t_s: ArrayLike
     values: ArrayLike | None
-    sigma: float
-    points_m: ArrayLike = ()
-    unknowns: Mapping[str, float] = field(default_factory=dict)
-    grasp: int | None = None
-    frame: Frame = "grasp"
-    columns: Sequence[str] = ()
+    sigma: float = key(Positive)
+    points_m: ArrayLike = key(_POINTS, converter=as_given, default=())
+    unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
+    grasp: int | None = key(_GRASP, converter=as_given, default=None)
+    frame: Frame = key(Frame, default="grasp")
+    columns: Sequence[str] = key(_COLUMNS, converter=as_given, default=())
 
     def __post_init__(self) -> None:
         where, points = f"the reading '{self.name}'", cast(Sequence[Any], self.points_m)
@@ -94,15 +109,9 @@ class Gauge:
         points = read_only_floats(
             points if len(points) else np.zeros((0, 3)), (None, 3), f"points_m of {where}"
         )
-        vars(self).update(t_s=times, points_m=points, unknowns=dict(self.unknowns))
+        vars(self).update(t_s=times, points_m=points)
         if fault := first_time_fault(times):
             raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
-        for what, sigma in {"sigma": self.sigma, **self.unknowns}.items():
-            if not (sigma > 0 and np.isfinite(sigma)):
-                raise InputError(f"{what} of {where} is {sigma:g}; expected more than 0")
-        if self.frame not in get_args(Frame):
-            expected = ", ".join(get_args(Frame))
-            raise InputError(f"frame of {where} is {self.frame!r}; expected one of {expected}")
         if (self.grasp is None) == (not len(points)):
             both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
             raise InputError(f"{where} has {both}; expected one of them to look at")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from ..arrays import Array, Index
 from ..checked import Finite, NotNegative
 from ..errors import InputError
 from ..fem.selection import Selection
-from ..stated import key, stated
+from ..stated import as_given, key, stated
 from .clock import TIME_TOLERANCE_S
 from .poses import PoseSequence
 from .selected import Nodes, on_body, selection, some_nodes
@@ -28,10 +28,6 @@ if TYPE_CHECKING:
 # Of the largest singular value: what is held less than so much of it is not held.
 HELD = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
-
-
-def _poses(motion: PoseSequence | ArrayLike) -> Any:
-    return motion  # matrices stay until there are times
 
 
 @stated
@@ -70,7 +66,7 @@ class Grasp:
     """
 
     nodes: Index = key(Nodes, converter=some_nodes("the grasp"), read=selection)
-    poses: PoseSequence = key(converter=_poses)
+    poses: PoseSequence = key(converter=as_given)  # matrices stay until there are times
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
     sigma_m: float | None = key(NotNegative | None, default=None)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..stated import key, stated
+from ..stated import as_given, key, stated
 from .arrays import floats, read_only_floats, read_only_tracks
 from .placement import Attachment, Placement, Shape, place_markers
 
@@ -24,10 +24,6 @@ __all__ = ["Markers", "Placement", "place_markers"]
 SHOWN = 4
 
 CarriedBack = Callable[[Array, Array], Array]
-
-
-def _placement(placement: Placement | None) -> Any:
-    return placement
 
 
 @stated
@@ -72,7 +68,7 @@ class Markers:
     sigma_m: Array = key(converter=np.asarray)
     names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
     places_m: Array | None = key(converter=np.asarray, default=None)
-    placement: Placement = key(converter=_placement, default=None)
+    placement: Placement = key(converter=as_given, default=None)
     places_sigma_m: Array | None = key(converter=np.asarray, default=None)
     on_surface: bool = False
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
