@@ -15,7 +15,6 @@ from .methods.start import marched
 from .methods.workers import workers_of
 from .model.schemes import as_scheme
 from .problem import Problem
-from .recording.turning import turning_warnings
 from .runs.answer import Answer
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import roll_outs, step_error
@@ -32,6 +31,7 @@ from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import pose_noise_draws
 from .statistics.profile import Profile, profile_of
+from .statistics.trust import turn_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def run(
         if problem.substeps == "auto":
             found, fit = _fine_enough(found, fit, problem.solver(method), watch, say, scheduler)
         substeps = found.solution.collocation.substeps
-        turns = (t for e in problem.experiments for t in turning_warnings(e, substeps))
+        turns = (c.sentence for e in problem.experiments for c in turn_concerns(e, substeps))
         found = replace(found, notes=(*turns, *found.notes))
         if found.uncertainty is not None and fit is not None:
             profiles = _profiles(found, fit, say)

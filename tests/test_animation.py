@@ -23,7 +23,8 @@ from collocation_sysid.result.animation import Film, animate, film_samples
 from collocation_sysid.result.page import surface_strain
 from collocation_sysid.result.replay import headline, read_run
 from collocation_sysid.result.view import frame_files, view
-from collocation_sysid.statistics.trust import Concern, Trust
+from collocation_sysid.statistics.concern import Concern
+from collocation_sysid.statistics.trust import Trust
 
 NODES = 36
 

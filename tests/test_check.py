@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +23,11 @@ from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
 from collocation_sysid.result.check_sections import check_table
 from collocation_sysid.runs.check import Findings, check_problem, glance
-from collocation_sysid.runs.check.body import element_warnings, slenderness, worst_elements
-from collocation_sysid.runs.check.cost import Cost, cost_notes, cost_warnings
+from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
+from collocation_sysid.runs.check.cost import Cost, cost_concerns, cost_notes
 from collocation_sysid.runs.check.derivatives import shortened
-from collocation_sysid.runs.check.motion import ModeFinding, Motion, motion_of, motion_warnings
+from collocation_sysid.runs.check.motion import ModeFinding, Motion, motion_concerns, motion_of
+from collocation_sysid.statistics.concern import Concern
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
 SILICONE = (
@@ -54,6 +56,10 @@ def about(findings: Findings, *words: str) -> str:
     found = [warning for warning in findings.warnings if all(word in warning for word in words)]
     assert len(found) == 1, findings.warnings
     return found[0]
+
+
+def sentences(concerns: Iterable[Concern]) -> list[str]:
+    return [concern.sentence for concern in concerns]
 
 
 # The motion and the time grid -------------------------------------------------------------------
@@ -125,7 +131,7 @@ def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
 def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
     motion = checked_motion(tiny, *SILICONE, "parameters.gamma_r_s.guess=0.02")
     first = replace(motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05)
-    said = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))[0].sentence
+    said = motion_concerns(replace(motion, modes=(first,), duration_s=10.0))[0].sentence
     assert "takes a damping ratio of 0.05 from the first mode" in said
     assert "found will be too high" in said
     assert f"set transcription.substeps = {motion.substeps_needed}" in said
@@ -134,7 +140,7 @@ def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
 def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
     motion = checked(tiny, *SILICONE).motions[0]
     first = replace(motion.modes[0], steps_per_period=5.0, samples_per_period=2.5)
-    found = motion_warnings(replace(motion, modes=(first,), duration_s=10.0))
+    found = motion_concerns(replace(motion, modes=(first,), duration_s=10.0))
     assert [each.topic for each in found] == ["scheme", "information"]
     steps, samples = (each.sentence for each in found)
     assert "only 5.0 steps a period" in steps
@@ -170,7 +176,7 @@ def test_locking_is_warned_of_at_its_very_poisson_ratio(young_pa: float):
         # By way of λ and μ, 0.45 comes back as 0.44999999999999996 for E = 200 kPa.
         shear = young_pa / (2 + 2 * poisson)
         theta = np.array([2 * shear * poisson / (1 - 2 * poisson), shear, 0.0, 0.0])
-        return element_warnings(body, theta, shape, worst)
+        return sentences(element_concerns(body, theta, shape, worst))
 
     (warning,) = warnings(0.45)
     assert "tet10 elements lock from 0.45 on" in warning
@@ -188,8 +194,9 @@ def test_the_worst_element_is_named():
     assert best.aspect_ratio == pytest.approx(np.sqrt(1.5))
     assert worst.aspect_ratio > 20
     body = Body(mesh, density_kg_m3=30.0)
-    warnings = element_warnings(body, COMPRESSIBLE, slenderness(mesh), worst)
-    assert "element 1 is nearly flat" in warnings[0]
+    concern, *_ = element_concerns(body, COMPRESSIBLE, slenderness(mesh), worst)
+    assert concern.code == "mesh/flat"
+    assert "element 1 is nearly flat" in concern.sentence
 
 
 @pytest.mark.parametrize(
@@ -207,7 +214,7 @@ def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, e
     shape = slenderness(mesh)
     assert shape.thickness_m == pytest.approx(min(size_m))
     body = Body(mesh, density_kg_m3=30.0, element=element)
-    warnings = element_warnings(body, COMPRESSIBLE, shape, worst_elements(mesh)[0])
+    warnings = sentences(element_concerns(body, COMPRESSIBLE, shape, worst_elements(mesh)[0]))
     said = [warning for warning in warnings if "too stiff in bending" in warning]
     assert bool(said) == warned
     assert all("of a real body" in each and "not of data simulated with" in each for each in said)
@@ -216,7 +223,7 @@ def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, e
 def test_as_many_elements_across_as_are_needed_are_enough():
     mesh = box_mesh((0.005, 0.005, 0.03), (2, 2, 12))
     body = Body(mesh, density_kg_m3=30.0, element="tet10-p0")
-    assert not element_warnings(body, COMPRESSIBLE, slenderness(mesh), worst_elements(mesh)[0])
+    assert not element_concerns(body, COMPRESSIBLE, slenderness(mesh), worst_elements(mesh)[0])
 
 
 def test_thickness_does_not_depend_on_how_the_body_lies():
@@ -297,10 +304,10 @@ def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):
 def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.cost.machine_memory_mb", lambda: 8000.0)
     small, large = Cost("reduced-space", 500.0, 10.0), Cost("interior-point", 40000.0, 1000.0)
-    (warning,) = cost_warnings(large, (small, large))
+    (warning,) = sentences(cost_concerns(large, (small, large)))
     assert "about 40 GB" in warning
     assert 'set solver.method = "reduced-space"' in warning
-    assert cost_warnings(small, (small, large)) == []
+    assert cost_concerns(small, (small, large)) == []
     assert len(cost_notes(large, (small, large))) == 1
     assert cost_notes(small, (small, large)) == []
 

@@ -273,9 +273,9 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
     shutil.copytree(run_folder, run)
     result = json.loads((run / "result.json").read_text())
     swings = {
-        "code": "residuals/swing",
+        "code": "residuals/shared",
         "grade": "doubtful",
-        "data": {"said": "the residuals swing"},
+        "data": {},
     }
     result["trust"] = {"concerns": [swings]}
     result["parameters"]["mu_pa"]["at_bound"] = True
@@ -283,7 +283,7 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
     ended = run_command("export", run, "--to", to, "--out", tmp_path / "out")
     assert ended.code == 0, ended.err
     written = "".join(file.read_text() for file in (tmp_path / "out").iterdir())
-    for said in ("'doubtful': the residuals swing", "mu_pa = 300 ended at a bound"):
+    for said in ("'doubtful': the residuals are not noise", "mu_pa = 300 ended at a bound"):
         assert "warning: " in ended.out
         assert said in ended.out
         assert said in written

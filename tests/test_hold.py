@@ -10,7 +10,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.runs.check.body import Hold, hold_sentence, hold_warnings, holds_of
+from collocation_sysid.runs.check.body import Hold, hold_concerns, hold_sentence, holds_of
 
 # Layers of nodes are so far apart, so a tenth of an edge is 2 mm.
 EDGE_M = 0.02
@@ -69,7 +69,7 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
 ):
     found = held(region, *moves)
     assert (found.nearly_held, found.nearly_free) == (nearly_held, nearly_free)
-    (said, *more) = hold_warnings(found) or [""]
+    (said, *more) = [each.sentence for each in hold_concerns(found)] or [""]
     assert not more
     assert ("cuts through elements" in said) == bool(nearly_held + nearly_free)
     if said:

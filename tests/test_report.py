@@ -15,10 +15,10 @@ from problem_files import TRUTH, pictures_drawn, run_command, settings, write_pr
 from results_small import ROLLOUT, a_result
 
 from collocation_sysid.display import plain_text
-from collocation_sysid.result.remedies import REMEDIES
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.result import Result, SimulatedExperiment
-from collocation_sysid.statistics.trust import Concern, Trust
+from collocation_sysid.statistics.concern import TOPICS, Concern
+from collocation_sysid.statistics.trust import Trust
 from collocation_sysid.tree import as_json
 
 pytestmark = pytest.mark.long
@@ -228,4 +228,4 @@ def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
 
 def test_every_remedy_names_a_page_that_is_there():
     howto = Path(__file__).parents[1] / "docs" / "howto"
-    assert all((howto / f"{remedy.page}.md").is_file() for remedy in REMEDIES.values())
+    assert all((howto / f"{topic.page}.md").is_file() for topic in TOPICS.values())

@@ -51,7 +51,7 @@ from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import Rollout
-from collocation_sysid.statistics.scale import stillness_notes
+from collocation_sysid.statistics.scale import stillness_concerns
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])
@@ -251,8 +251,10 @@ def replaced(grasps, top):
 
 def test_a_static_problem_tells_nothing_of_damping_before_and_after():
     problem = cs.Problem([noisy(block("xyz", gravity_m_s2=HANGING))], parameters=GUESS)
-    (note,) = stillness_notes(problem.experiments, GUESS)
-    assert note.startswith("'block' is static: no information on damping; fix gamma_r_s and")
+    (note,) = stillness_concerns(problem.experiments, GUESS)
+    assert note.sentence.startswith(
+        "'block' is static: no information on damping; fix gamma_r_s and"
+    )
     found = run(problem)
     assert found.estimates["gamma_r_s"].std_error is None
     assert "these data do not tell gamma_r_s and gamma_m_1_s" in found.trust.reasons

@@ -16,8 +16,9 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.recording.poses import Interpolation
-from collocation_sysid.recording.turning import fastest_turn, turning_warnings
+from collocation_sysid.recording.turning import fastest_turn
 from collocation_sysid.runs.check import check_problem
+from collocation_sysid.statistics.trust import turn_concerns
 
 STEPS, FINEST = 8, 32
 
@@ -74,16 +75,17 @@ def test_the_fastest_turn_is_the_angle_between_the_poses_of_two_grid_times(subst
 
 def test_a_fast_turn_is_warned_of_with_the_substeps_that_cure_it():
     cube = swung(8.0)
-    (warning,) = turning_warnings(cube, 1)
+    (concern,) = turn_concerns(cube, 1)
+    warning = concern.sentence
     assert "turns by 0.08 rad a grid step of 10 ms at t = 0.07 s (7.97 rad" in warning
     assert warning.endswith("set transcription.substeps = 2")
-    assert turning_warnings(cube, 2) == []
-    assert turning_warnings(swung(4.0), 1) == []
+    assert turn_concerns(cube, 2) == []
+    assert turn_concerns(swung(4.0), 1) == []
 
 
 def test_substeps_are_no_remedy_for_poses_that_are_held():
-    (warning,) = turning_warnings(swung(8.0, "hold"), 4)
-    assert 'set interpolation = "smooth"' in warning
+    (concern,) = turn_concerns(swung(8.0, "hold"), 4)
+    assert 'set interpolation = "smooth"' in concern.sentence
     assert fastest_turn(swung(8.0, "hold"), 4).angle_rad == pytest.approx(0.0797, abs=1e-3)
 
 

@@ -21,7 +21,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Grasp
 from collocation_sysid.runs.check import description_causes
-from collocation_sysid.runs.check.body import hold_warnings, holds_of
+from collocation_sysid.runs.check.body import hold_concerns, holds_of
 from collocation_sysid.statistics.causes import likely_causes
 from collocation_sysid.statistics.plausible import odd_material, oddities
 
@@ -178,7 +178,8 @@ def test_a_metal_as_soft_as_rubber_is_odd():
 
     def found(density_kg_m3: float, young_pa: float) -> str | None:
         body = Body(box_mesh((0.1,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
-        return odd_material(body, body.theta(theta | {"young_pa": young_pa}))
+        odd = odd_material(body, body.theta(theta | {"young_pa": young_pa}))
+        return odd and odd.sentence
 
     assert found(1100.0, 5e5) is None
     assert found(7850.0, 2e11) is None
@@ -220,7 +221,7 @@ def test_a_layer_is_held_for_sure():
     (hold,) = holds_of(soft("block").experiments[0], 0.03)
     assert (hold.nodes, hold.nearly_held, hold.nearly_free) == (9, 0, 0)
     assert hold.share == pytest.approx(9 / 36)
-    assert hold_warnings(hold) == []
+    assert hold_concerns(hold) == []
 
 
 def test_nodes_at_the_edge_of_the_box_are_warned_of():
@@ -230,7 +231,7 @@ def test_nodes_at_the_edge_of_the_box_are_warned_of():
     missed = held_of(points_m, 0.0895)
     (hold,) = holds_of(missed, 0.03)
     assert (hold.nodes, hold.nearly_held) == (6, 3)
-    assert "cuts through elements" in hold_warnings(hold)[0]
+    assert "cuts through elements" in hold_concerns(hold)[0].sentence
 
 
 # After solving ------------------------------------------------------------------------------------

@@ -29,9 +29,10 @@ from ..pipeline import Run
 from ..problem import Problem
 from ..program.lapack import one_blas_thread
 from ..program.least_squares import LeastSquares
+from ..statistics.concern import concerned
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
-from ..statistics.trust import GROSS_MISFIT, Trust, concerned
+from ..statistics.trust import GROSS_MISFIT, Trust
 from .budget import Budget
 from .frames import Frame, Pose, as_pose, as_time, as_tracks
 from .intake import LONGEST, Intake
@@ -464,16 +465,16 @@ class Estimator:
         return self._best(track, known)
 
     def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
-        said = None
+        code = ""
         if self.track is None:
-            said = "there is no start yet: the first frame needs a pose"
+            code = "solve/no-start"
         elif self.track.failed:
-            said = "the body cannot be simulated with these parameters"
+            code = "solve/not-simulable"
         elif self.intake.is_lost(t_s):
-            said = "the grasp is lost"
+            code = "solve/grasp-lost"
         elif self.search is not None:
-            said = "a start is still sought"
-        grave = concerned(said is not None, True, "solve/no-start", said=said)
+            code = "solve/seeking"
+        grave = concerned(bool(code), True, code)
         if self.track is None or self.track.failed:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
             return {name: Estimate(value) for name, value in values.items()}, Trust.of(grave)

@@ -10,17 +10,10 @@ import numpy as np
 
 from ..arrays import Array
 from ..program.least_squares import LeastSquares
+from ..statistics.concern import Concern, concerned
 from ..statistics.distributions import chi2_sf, student_ppf
 from ..statistics.estimates import Estimate
-from ..statistics.trust import (
-    GROSS_MISFIT,
-    HARDLY_TAME,
-    MISFIT,
-    PERSISTENT,
-    WILD,
-    Concern,
-    concerned,
-)
+from ..statistics.trust import GROSS_MISFIT, HARDLY_TAME, MISFIT, PERSISTENT, WILD
 
 # Estimates this many standard errors from where all is linearised may still move.
 UNSETTLED = 0.5

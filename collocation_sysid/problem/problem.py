@@ -19,7 +19,7 @@ from ..program.simulation import require_steps
 from ..recording import Experiment
 from ..stated import key, stated
 from ..statistics.plausible import oddities
-from ..statistics.scale import scale_notes, stillness_notes
+from ..statistics.scale import scale_concerns, stillness_concerns
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
@@ -83,10 +83,10 @@ class Problem:
         vars(self)["experiments"] = _weighed(self.experiments, self.parameters)
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
         odd = (oddity.sentence for body in self.bodies for oddity in oddities(body))
-        still = stillness_notes(self.experiments, self.parameters)
+        still = (c.sentence for c in stillness_concerns(self.experiments, self.parameters))
         vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *self.notes)))
         self._check()
-        unscaled = scale_notes(self.experiments, self.parameters)
+        unscaled = (c.sentence for c in scale_concerns(self.experiments, self.parameters))
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:

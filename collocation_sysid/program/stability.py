@@ -52,14 +52,6 @@ class Instability:
     growth_1_s: float
     e_foldings: float
 
-    @property
-    def sentence(self) -> str:
-        """What is said of it."""
-        return (
-            f"'{self.experiment}' is not stable at {self.time_s:.3g} s: disturbances grow by "
-            f"{self.growth_1_s:.2g} 1/s"
-        )
-
 
 def instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
     """Those of the motions at z, one for each experiment that has unstable states."""

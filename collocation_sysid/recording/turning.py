@@ -42,23 +42,6 @@ class Turn:
     remedy: str
 
     @property
-    def brief(self) -> str:
-        """How large it is."""
-        return (
-            f"the grasp of '{self.experiment}' turns by {self.angle_rad:.2g} rad a grid step of "
-            f"{1e3 * self.step_s:.3g} ms"
-        )
-
-    @property
-    def sentence(self) -> str:
-        """What it does, and the remedy."""
-        return (
-            f"{self.brief} at t = {self.time_s:.4g} s ({self.rate_rad_s:.3g} rad/s), "
-            f"which is computed along the chord and spoils what is found, damping most of all: "
-            f"{self.remedy}"
-        )
-
-    @property
     def rate_rad_s(self) -> float:
         """Mean angular velocity within the step."""
         return self.angle_rad / self.step_s
@@ -89,9 +72,3 @@ def fastest_turn(experiment: Experiment, substeps: int) -> Turn:
     # A pose that is held turns by as much at a sample, however many steps there are between.
     remedy = 'set interpolation = "smooth" in the grasp' if held else f"set {_KEY} = {needed}"
     return Turn(experiment.name, largest, time_s, step_s, remedy)
-
-
-def turning_warnings(experiment: Experiment, substeps: int) -> list[str]:
-    """Whether a grasp turns too far within a step."""
-    turn = fastest_turn(experiment, substeps)
-    return [turn.sentence] if turn.angle_rad > FAST else []

@@ -28,10 +28,9 @@ from ..files import is_own
 from ..recording.nuisance import in_unit_for_people
 from ..runs.result import FoundValue, Result, SimulatedExperiment
 from ..statistics.budget import worded
+from ..statistics.concern import Concern, topics_of
 from ..statistics.numerical import NumericalError
-from ..statistics.trust import Concern
 from ..tree import content
-from .remedies import remedies_for
 from .replay import LARGEST, read_arrays, reading_run
 
 MEANINGS = {
@@ -139,7 +138,7 @@ def _verdict(result: Result, linked: bool = False) -> Section:
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
     """The pages that say how to cure what gives concern."""
-    pages = dict.fromkeys(f"docs/howto/{r.page}.md" for r in remedies_for(concerns).values())
+    pages = dict.fromkeys(f"docs/howto/{t.page}.md" for t in topics_of(concerns).values())
     return [Line(f"what to do: {', '.join(pages)}", "quiet")] if pages else []
 
 
@@ -304,10 +303,10 @@ def _cards(result: Result) -> Cards:
 
 
 def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
-    for topic, remedy in remedies_for(concerns).items():
-        about, page = Span(f"{remedy.about}.", "strong"), f"docs/howto/{remedy.page}.md"
-        more = (Span(f" {remedy.cure} More in the how-to page "), Span(page, "code"), Span("."))
-        yield Line((about, *more), name=f"cure-{topic}")
+    for name, topic in topics_of(concerns).items():
+        about, page = Span(f"{topic.about}.", "strong"), f"docs/howto/{topic.page}.md"
+        more = (Span(f" {topic.cure} More in the how-to page "), Span(page, "code"), Span("."))
+        yield Line((about, *more), name=f"cure-{name}")
 
 
 def _error_bars(result: Result) -> Iterator[Shown]:

@@ -16,6 +16,7 @@ from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..statistics.budget import BudgetLine, Sources, budget
+from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.hypothesis import Hypothesis
@@ -23,7 +24,7 @@ from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
 from ..statistics.numerical import Refinement
 from ..statistics.profile import Profile
-from ..statistics.trust import Concern, Trust, cause_concerns, numerical_concerns
+from ..statistics.trust import Trust, cause_concerns, numerical_concerns
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
@@ -152,7 +153,7 @@ class Answer:
         numerical = numerical_concerns(self.estimates, self.refinement)
         if not self.missing:
             return Trust.of((*cause_concerns(self.causes), *found, *numerical))
-        interrupted = Concern("solve/interrupted", "doubtful", {"said": self.missing})
+        interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
         return Trust.of((interrupted, *(found if self.uncertainty is not None else ())))
 
     @cached_property

@@ -12,12 +12,12 @@ from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.stability import instabilities
 from ..recording.nuisance import TIME
-from ..recording.turning import TOO_FAST, fastest_turn
+from ..recording.turning import TOO_FAST
+from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.plausible import odd_material, oddities
-from ..statistics.scale import scale_concern
+from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
-    Concern,
     clock_concerns,
     fit_concerns,
     marker_concerns,
@@ -27,6 +27,7 @@ from ..statistics.trust import (
     rollout_concerns,
     scheme_concerns,
     stability_concerns,
+    turn_concerns,
 )
 from ..statistics.uncertainty import Uncertainty
 from .check.motion import Motion, motion_of
@@ -47,7 +48,7 @@ def concerns(
     status = solution.status
     yield from body_concerns(solution)
     if not status.converged:
-        yield Concern("solve/lost", "doubtful", {"said": solution.message})
+        yield Concern("solve/lost", "doubtful", {"why": solution.message})
         return
     if status is Status.ACCEPTABLE:
         yield Concern("solve/acceptable")
@@ -72,9 +73,7 @@ def concerns(
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation
     for segment in collocation.segments:
-        turn = fastest_turn(segment.experiment, collocation.substeps)
-        if turn.angle_rad > TOO_FAST:
-            yield Concern("scheme/turn", data={"said": turn.brief})
+        yield from turn_concerns(segment.experiment, collocation.substeps, TOO_FAST, "scheme/turn")
     for motion in motions:
         if motion.first is not None and motion.first.damping_ratio < 1:
             yield from scheme_concerns(
@@ -88,15 +87,10 @@ def concerns(
 def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Bodies of a size or a density that is hardly meant, not with the stiffness, or not known."""
     for body in dict.fromkeys(segment.body for segment in solution.collocation.segments):
-        said = [oddity.sentence for oddity in oddities(body)]
-        if not said and (odd := odd_material(body, body.theta(solution.parameters))) is not None:
-            said = [odd]
-        for sentence in said:
-            yield Concern("description/body", "doubtful", {"said": sentence})
+        odd = oddities(body) or [odd_material(body, body.theta(solution.parameters))]
+        yield from (each.concern("doubtful") for each in odd if each is not None)
     experiments = [segment.experiment for segment in solution.collocation.segments]
-    unscaled = scale_concern(experiments, solution.collocation.parameters)
-    if unscaled is not None:
-        yield Concern("scale/unknown", "doubtful", {"said": unscaled})
+    yield from scale_concerns(experiments, solution.collocation.parameters, "doubtful")
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
@@ -125,7 +119,7 @@ def _of_rollout(
         if not fitted and not found and predicted_n is not None and fit_n is not None:
             found = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
         return found
-    return [Concern("roll-out/failed", "doubtful", {"experiment": name, "said": rollout})]
+    return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:

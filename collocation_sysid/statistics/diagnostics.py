@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from .concern import Concern
 from .distributions import beta_sf, chi2_isf, normal_isf
 from .linearised import FitBlock, LinearisedFit, Mask, information
 from .noise import Extra, NoiseLevel, noise_level
@@ -144,9 +145,8 @@ def _diagnose(
         sentence="",
     )
     if name in alone:
-        return replace(
-            found, sentence=f"{name}: {1e3 * found.rms_m:.2g} mm RMS; {alone[name].said}"
-        )
+        said = alone[name].concern.sentence.removeprefix(f"{name}: ")
+        return replace(found, sentence=f"{name}: {1e3 * found.rms_m:.2g} mm RMS; {said}")
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
     said = _suggestion(found, pairs, block, motion, estimated)
@@ -290,18 +290,11 @@ class Outlier:
     first_relaxed: bool
 
     @property
-    def said(self) -> str:
+    def concern(self) -> Concern:
         """What it does, and the remedy."""
-        remedy = "leave it out, or set solver.huber"
-        if self.first_relaxed:
-            remedy = (
-                "the body counts as relaxed at the first sample; let the recording begin before "
-                "the load does, or leave the sample out"
-            )
-        return (
-            f"the sample at t = {self.t_s:.4g} s, off by {self.deviations:.2g} sigma, alone has "
-            f"{100 * self.share:.0f} % of the residuals' power: {remedy}"
-        )
+        code = "residuals/first" if self.first_relaxed else "residuals/outlier"
+        data = {"t_s": self.t_s, "deviations": self.deviations, "percent": 100 * self.share}
+        return Concern(code, data={"of": self.series, **data})
 
 
 def set_apart(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:

@@ -71,8 +71,8 @@ def oddities(body: Body) -> tuple[Hypothesis, ...]:
     return tuple(each for each in tried if each.strength > 1)
 
 
-def odd_material(body: Body, theta: Array) -> str | None:
-    """Why no material is as dense and as soft as a body with constants θ; None where one may be.
+def odd_material(body: Body, theta: Array) -> Hypothesis | None:
+    """That no material is as dense and as soft as a body with constants θ; None where one may be.
 
     Tracks and poses tell the stiffness over the density, so a wrong density leaves no other trace.
     """
@@ -80,11 +80,7 @@ def odd_material(body: Body, theta: Array) -> str | None:
     young_pa = max(float(engineering(*lame)[0]) for lame in body.lame(theta).values())
     if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
         return None
-    return (
-        f"the body is as dense as metal, {density_kg_m3:.4g} kg/m³, and as soft as rubber, "
-        f"E = {young_pa:.3g} Pa: a thousandth of both, if the mass was in g; check "
-        "object.density_kg_m3 or mass_kg"
-    )
+    return Hypothesis("density/metal", data={"density_kg_m3": density_kg_m3, "young_pa": young_pa})
 
 
 def _outside(value: float, limits: tuple[float, float]) -> float:

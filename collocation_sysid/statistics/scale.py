@@ -18,11 +18,11 @@ from ..fem.constants import DENSITY, bare, is_damping, is_density, is_modulus, s
 from ..methods.scan import SOFT_PA, usual_parameters
 from ..model.parameters import Parameters, ThetaMap
 from ..recording.experiment import Experiment
+from .concern import Concern, Grade
 from .distributions import chi2_isf
 
 # What is left over of a change of all constants that parameters cannot bring about.
 LEFT = 1e-8
-REMEDY = "fix a density, give a known mass, or measure a wrench"
 
 
 def open_scale(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
@@ -37,21 +37,12 @@ def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -
     return _moved(experiments, parameters, stated=True)
 
 
-def scale_notes(experiments: Iterable[Experiment], parameters: Parameters) -> list[str]:
-    """What to do about a scale that is open."""
-    found = scale_concern(experiments, parameters)
-    return [] if found is None else [f"{found}; {REMEDY}"]
-
-
-def scale_concern(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
-    """The same of an answer, None where the scale is known."""
+def scale_concerns(
+    experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
+) -> list[Concern]:
+    """A scale that is open."""
     names = open_scale(experiments, parameters)
-    if not names:
-        return None
-    return (
-        f"only the ratios of {listed(names)} can be told (E/ρ): no known force or mass sets their "
-        "scale"
-    )
+    return [Concern("scale/unknown", grade, {"names": names})] if names else []
 
 
 def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
@@ -138,19 +129,13 @@ def motionless(experiment: Experiment) -> bool:
     return bool(np.sum(away**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 
-def stillness_notes(experiments: Iterable[Experiment], parameters: Parameters) -> list[str]:
+def stillness_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
     """What no recording can tell, if nothing moves in those that are to be fitted."""
     fitted = [experiment for experiment in experiments if not experiment.validation]
     damping = [item.name for item in parameters.free if is_damping(item.name)]
     if not fitted or not damping or not all(e.static or motionless(e) for e in fitted):
         return []
-    names = ", ".join(f"'{experiment.name}'" for experiment in fitted)
-    if all(experiment.static for experiment in fitted):
-        return [
-            f"{names} {'is' if len(fitted) == 1 else 'are'} static: no information on damping; fix "
-            f"{' and '.join(damping)}, or add a recording of a motion"
-        ]
-    return [
-        f"nothing moves in {names}: no information on damping, and of the stiffness only what the "
-        f"sag tells; fix {' and '.join(damping)}, or add a recording of a motion"
-    ]
+    code = "static" if all(experiment.static for experiment in fitted) else "still"
+    names, verb = [f"'{e.name}'" for e in fitted], "is" if len(fitted) == 1 else "are"
+    data = {"names": names, "verb": verb, "damping": damping}
+    return [Concern(f"information/{code}", data=data)]

@@ -1,8 +1,5 @@
 """One word on how far an answer can be trusted, with its reasons.
 
-A concern has a code, a grade and data. Sentence and cure are looked up by the code, of which the
-first part is the topic: "noise/larger" is about the noise.
-
 Every function here that ends in "concerns" looks at one thing and returns what gives concern. The
 levels are strict: of answers to faultless data at least 95 % are to be called good, however many
 markers and nuisance parameters there are.
@@ -11,14 +8,16 @@ markers and nuisance parameters there are.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from ..arrays import Array
-from ..errors import listed
 from ..program.stability import Instability
+from ..recording.experiment import Experiment
+from ..recording.turning import FAST, fastest_turn
+from .concern import Concern, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import normal_isf
 from .estimates import Estimate
@@ -102,11 +101,12 @@ class Trust:
 
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     """What is likely described wrongly."""
-    found: list[Concern] = []
-    for cause in causes:
-        data = {"cause": cause.cause, "strength": cause.strength, "said": cause.sentence}
-        found += concerned(True, cause.strength > CERTAIN, "description/cause", **data)
-    return found
+    return [
+        replace(cause, of=f"likely: {cause.of}").concern(
+            "doubtful" if cause.strength > CERTAIN else "check"
+        )
+        for cause in causes
+    ]
 
 
 def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
@@ -123,7 +123,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     smaller = not larger and factor < 1 / MISFIT and level.smaller_p < RARE and not matters
     stated = level.stated
     return [
-        *as_said("residuals/outlier", (f"{o.series}: {o.said}" for o in uncertainty.outliers)),
+        *(outlier.concern for outlier in uncertainty.outliers),
         *concerned(
             matters and persistent,
             found.lag1 > NO_NOISE and factor > MISFIT,
@@ -251,11 +251,18 @@ def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
     """States of the answer in which disturbances grow."""
     concerns: list[Concern] = []
     for each in found:
-        powers = each.e_foldings
-        concerns += concerned(
-            powers > E_FOLDINGS, powers > GROSS_E_FOLDINGS, "stability/grows", said=each.sentence
-        )
+        grows, grossly = each.e_foldings > E_FOLDINGS, each.e_foldings > GROSS_E_FOLDINGS
+        concerns += concerned(grows, grossly, "stability/grows", **vars(each))
     return concerns
+
+
+def turn_concerns(
+    experiment: Experiment, substeps: int, far: float = FAST, code: str = "scheme/turns"
+) -> list[Concern]:
+    """A grasp that turns farther within a step of the grid than `far` [rad]."""
+    turn = fastest_turn(experiment, substeps)
+    numbers = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
+    return concerned(turn.angle_rad > far, False, code, **vars(turn), **numbers)
 
 
 def scheme_concerns(
@@ -295,90 +302,3 @@ def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:
     total = float(samples.sum())
     left = max(0.0, 1 - fitted / (3 * total))
     return float(np.sqrt(3 * left * (samples @ sigma_m**2) / total))
-
-
-Grade = Literal["check", "doubtful"]
-
-# By code; of others the sentence is in the data, as `said`.
-SENTENCES: Mapping[str, str] = {
-    "description/cause": "likely: {said}",
-    "noise/larger": "the residuals are {factor:.2g} times as large as {stated} says",
-    "noise/smaller": "{stated} seems {factor:.2g} times too large for these residuals",
-    "noise/marker": "{marker} is off by {factor:.2g} times sigma_m",
-    "noise/markers": "{count} markers, most of all {marker}, are off by {factor:.2g} times sigma_m",
-    "noise/allowance": "sigma_m = {sigma_mm:.3g} mm is {share:.2g} of the body's size, more than "
-    "cameras miss: if the model's error decides, error bars of independent errors are too short",
-    "residuals/persist": "the residuals are not noise: they persist from sample to sample "
-    "(autocorrelation {autocorrelation:.2f})",
-    "residuals/shared": "the residuals are not noise: markers or axes share them",
-    "residuals/recordings": "the recordings disagree on {names}: model error decides, not noise",
-    "residuals/wild": "{percent:.0f} % of the samples are beyond Huber's threshold",
-    "residuals/far": "{percent:.0f} % of the markers' samples lie far from where they can be",
-    "information/bound": "{names} ended at its bound",
-    "information/bounds": "{names} ended at their bounds",
-    "information/none": "these data do not tell {names}",
-    "information/at-bound": "{name} is at a bound",
-    "information/not-yet": "{name} is not known yet: {reason}",
-    "nuisance/limit": "{name} ended at the largest value allowed",
-    "nuisance/far": "{name} is {deviations:.1f} deviations of its prior away from zero",
-    "nuisance/clock": "the markers of '{experiment}' were seen {shift_ms:.2g} ms {when} than their "
-    "times say: the estimates allow for it; better find out why",
-    "scheme/step": "the step moves {name} by {percent:+.2g} %, {errors:.2g} standard errors: its "
-    "interval allows for that; raise transcription.substeps, or run refine to measure it",
-    "scheme/damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
-    "first mode of '{experiment}'",
-    "scheme/period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
-    "mesh/refined": "step and mesh move {name} by {percent:+.2g} %, {errors:.2g} standard errors: "
-    "its interval allows for that",
-    "roll-out/failed": "the forward simulation of '{experiment}' failed: {said}",
-    "roll-out/misses": "the forward simulation of '{experiment}' misses by {rms_mm:.2g} mm, "
-    "the fit by {fit_mm:.2g} mm",
-    "roll-out/predicted": "'{experiment}' is predicted {times:.2g} times worse than the others are "
-    "fitted",
-    "solve/lost": "the solve did not converge: {said}",
-    "solve/acceptable": "the solve converged to the acceptable tolerance only",
-    "solve/no-error-bars": "no error bars could be found",
-    "solve/interrupted": "interrupted: {said}",
-    "solve/moves": "the estimate still moves: it is farther than its error bar from where it was "
-    "simulated",
-    "solve/anew": "restarted {times}, as if the body had been at rest there",
-}
-
-
-@dataclass(frozen=True)
-class Concern:
-    """One thing that gives concern.
-
-    Attributes
-    ----------
-    code : str
-        Topic and what it is, such as "noise/larger"; stays the same where words change.
-    grade : {"check", "doubtful"}
-    data : mapping
-        What its sentence holds.
-    """
-
-    code: str
-    grade: Grade = "check"
-    data: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def topic(self) -> str:
-        """What it is about, by which it is cured."""
-        return self.code.partition("/")[0]
-
-    @property
-    def sentence(self) -> str:
-        """The same for people."""
-        data = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in self.data.items()}
-        return SENTENCES.get(self.code, "{said}").format(**data)
-
-
-def concerned(found: bool, gross: bool, code: str, **data: Any) -> list[Concern]:
-    """A concern where there is one, doubtful where it is gross."""
-    return [Concern(code, "doubtful" if gross else "check", data)] if found else []
-
-
-def as_said(code: str, sentences: Iterable[str]) -> list[Concern]:
-    """Concerns of one code whose sentences were made elsewhere."""
-    return [Concern(code, data={"said": sentence}) for sentence in sentences]

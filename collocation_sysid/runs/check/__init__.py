@@ -6,9 +6,9 @@ Every warning is one sentence that ends with the remedy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 from ...arrays import Array
 from ...methods.reduced_space import ReducedSpace
@@ -21,18 +21,19 @@ from ...program.reaction_rows import Reactions
 from ...program.stability import Instability, instabilities
 from ...program.viscoelastic_rows import Overstress
 from ...program.wrench_rows import WrenchRows
-from ...recording.turning import turning_warnings
+from ...statistics.concern import Concern
 from ...statistics.hypothesis import Hypothesis, ranked
 from ...statistics.modal import doubts
 from ...statistics.numerical import MOST_SUBSTEPS
 from ...statistics.plausible import oddities
-from ...statistics.scale import scale_notes, stillness_notes
-from ...statistics.trust import Concern, as_said, stability_concerns
-from .body import BodyFinding, ElementShape, Hold, body_finding, hold_warnings, holds_of
-from .cost import Cost, cost_notes, cost_warnings, costs, nonzeros
+from ...statistics.scale import scale_concerns, stillness_concerns
+from ...statistics.trust import stability_concerns, turn_concerns
+from ...tree import content
+from .body import BodyFinding, ElementShape, Hold, body_finding, hold_concerns, holds_of
+from .cost import Cost, cost_concerns, cost_notes, costs, nonzeros
 from .derivatives import derivative_errors, shortened
-from .measurements import MarkerFinding, Recording, recording_of, recording_warnings
-from .motion import ModeFinding, Motion, motion_notes, motion_of, motion_warnings
+from .measurements import MarkerFinding, Recording, recording_concerns, recording_of
+from .motion import ModeFinding, Motion, motion_concerns, motion_notes, motion_of
 
 __all__ = [
     "BodyFinding",
@@ -104,6 +105,8 @@ class Findings:
         What will go wrong, with the remedy; `warnings` are their sentences.
     """
 
+    TOLD: ClassVar = ("warnings",)
+
     bodies: tuple[BodyFinding, ...]
     experiments: int
     timesteps: int
@@ -146,8 +149,7 @@ class Findings:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON and tables."""
-        causes = [cause.as_dict() for cause in self.causes]
-        return asdict(replace(self, causes=())) | {"causes": causes, "warnings": self.warnings}
+        return content(replace(self, causes=())) | {"causes": [c.as_dict() for c in self.causes]}
 
 
 def glance(problem: Problem) -> Glance:
@@ -287,21 +289,17 @@ def _concerns(
     experiments, parameters = problem.experiments, problem.parameters
     bodies, chosen = findings.bodies, findings.chosen_cost
     body_of = {name: body for body in bodies for name in body.experiments}
-    holds = (warning for hold in findings.holds for warning in hold_warnings(hold))
-    turns = (w for e in experiments for w in turning_warnings(e, problem.first_substeps))
-    seen = (w for r in findings.recordings for w in recording_warnings(r, body_of[r.experiment]))
-    costly = cost_warnings(chosen, findings.costs) if chosen else []
     return (
-        *as_said("description/doubt", (cause.sentence for cause in findings.causes)),
-        *as_said("information/still", stillness_notes(experiments, parameters)),
-        *as_said("scale/unknown", scale_notes(experiments, parameters)),
-        *as_said("mesh/elements", _body_warnings(bodies)),
-        *as_said("description/grasp", holds),
-        *(concern for motion in findings.motions for concern in motion_warnings(motion)),
+        *(cause.concern() for cause in findings.causes),
+        *stillness_concerns(experiments, parameters),
+        *scale_concerns(experiments, parameters),
+        *(each for body in bodies for each in _of_body(body, bodies)),
+        *(each for hold in findings.holds for each in hold_concerns(hold)),
+        *(each for motion in findings.motions for each in motion_concerns(motion)),
         *stability_concerns(unstable),
-        *as_said("scheme/turn", turns),
-        *as_said("markers/recording", seen),
-        *as_said("memory/short", costly),
+        *(each for e in experiments for each in turn_concerns(e, problem.first_substeps)),
+        *(c for r in findings.recordings for c in recording_concerns(r, body_of[r.experiment])),
+        *(cost_concerns(chosen, findings.costs) if chosen else ()),
     )
 
 
@@ -325,14 +323,11 @@ def _holds(problem: Problem, bodies: tuple[BodyFinding, ...]) -> tuple[Hold, ...
     return tuple(hold for e in problem.experiments for hold in holds_of(e, edges_m[e.name]))
 
 
-def _body_warnings(bodies: tuple[BodyFinding, ...]) -> list[str]:
-    if len(bodies) == 1:
-        return list(bodies[0].warnings)
-    return [
-        f"in the body of {', '.join(map(repr, body.experiments))}: {warning}"
-        for body in bodies
-        for warning in body.warnings
-    ]
+def _of_body(body: BodyFinding, bodies: Sequence[BodyFinding]) -> Iterator[Concern]:
+    """Those of a body, with the names of its experiments where there are several bodies."""
+    of = f"in the body of {', '.join(map(repr, body.experiments))}" if len(bodies) > 1 else ""
+    for each in body.concerns:
+        yield replace(each, data={"of": of, **each.data})
 
 
 def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ...fem.mesh_checks import edge_lengths, mean_ratios
 from ...fem.moduli import engineering
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
+from ...statistics.concern import Concern, concerned
 
 # Mean-ratio quality below which an element's shape functions are poor.
 FLAT = 0.1
@@ -92,36 +94,46 @@ def slenderness(mesh: TetMesh) -> Slenderness:
     return Slenderness(float(edges[-1]), thickness, thickness / cell)
 
 
-def element_warnings(
+def element_concerns(
     body: Body, theta: Array, shape: Slenderness, worst: ElementShape
-) -> list[str]:
-    """What the elements will do to the answer, one sentence each."""
-    warnings = []
-    if worst.quality < FLAT:
-        warnings.append(
-            f"element {worst.element} is nearly flat (mean-ratio quality {worst.quality:.2g}, "
-            f"aspect ratio {worst.aspect_ratio:.0f}), which makes the body stiffer and Newton's "
-            "steps short: improve the mesh there"
-        )
-    name = body.element.name
+) -> list[Concern]:
+    """What the elements will do to the answer."""
+    name, needed = body.element.name, CELLS_ACROSS.get(body.element.name, 0.0)
     poisson = max(engineering(*lame)[1] for lame in body.lame(theta).values())
-    if name in LOCKING_POISSON and poisson >= LOCKING_POISSON[name] - ROUND_OFF:
-        warnings.append(
-            f"Poisson's ratio is {poisson:.3g} at the guess and {name} elements lock from "
-            f"{LOCKING_POISSON[name]:g} on, so that the stiffness found will be too low: "
-            f"{FOR_VOLUME}"
-        )
-    needed = CELLS_ACROSS.get(name, 0.0)
-    if shape.length_m > SLENDER * shape.thickness_m and shape.cells_across < needed - ROUND_OFF:
-        off, found = ("stiff", "low") if name == LINEAR else ("soft", "high")
-        instead = f"{FOR_BENDING}, or refine" if name == LINEAR else "refine"
-        warnings.append(
-            f"only about {shape.cells_across:.1f} {name} elements lie across the body's "
-            f"{1e3 * shape.thickness_m:.3g} mm, too {off} in bending, so that the stiffness found "
-            f"of a real body will be too {found} (not of data simulated with these elements, which "
-            f"are as {off}): {instead} the mesh to {needed:.0f} or more"
-        )
-    return warnings
+    limit = LOCKING_POISSON.get(name, np.inf)
+    slender = shape.length_m > SLENDER * shape.thickness_m
+    off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
+    return [
+        *concerned(
+            worst.quality < FLAT,
+            False,
+            "mesh/flat",
+            number=worst.element,
+            quality=worst.quality,
+            aspect_ratio=worst.aspect_ratio,
+        ),
+        *concerned(
+            poisson >= limit - ROUND_OFF,
+            False,
+            "mesh/locks",
+            poisson=poisson,
+            element=name,
+            limit=limit,
+            remedy=FOR_VOLUME,
+        ),
+        *concerned(
+            slender and shape.cells_across < needed - ROUND_OFF,
+            False,
+            "mesh/few",
+            cells=shape.cells_across,
+            element=name,
+            thickness_mm=1e3 * shape.thickness_m,
+            off=off,
+            level=level,
+            remedy=f"{FOR_BENDING}, or refine" if name == LINEAR else "refine",
+            needed=needed,
+        ),
+    ]
 
 
 def _covariance(mesh: TetMesh) -> Array:
@@ -155,9 +167,11 @@ class BodyFinding:
     cells_across : float
         Elements that share the body's thickness.
     guess : mapping of the constants, and of E and ν at small strain, to their values at the guess
-    warnings : tuple of str
-        What the elements will do to the answer, one sentence each.
+    concerns : tuple of Concern
+        What the elements will do to the answer; `warnings` are their sentences.
     """
+
+    TOLD: ClassVar = ("warnings",)
 
     experiments: tuple[str, ...]
     nodes: int
@@ -172,12 +186,17 @@ class BodyFinding:
     worst_elements: tuple[ElementShape, ...]
     cells_across: float
     guess: dict[str, float]
-    warnings: tuple[str, ...]
+    concerns: tuple[Concern, ...]
 
     @property
     def diagonal_m(self) -> float:
         """Length of the diagonal of its bounding box."""
         return float(np.linalg.norm(self.size_m))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence each."""
+        return tuple(concern.sentence for concern in self.concerns)
 
 
 def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyFinding:
@@ -199,7 +218,7 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         worst_elements=worst,
         cells_across=shape.cells_across,
         guess=_guess(body, theta),
-        warnings=tuple(element_warnings(body, theta, shape, worst[0])),
+        concerns=tuple(element_concerns(body, theta, shape, worst[0])),
     )
 
 
@@ -286,13 +305,8 @@ def hold_sentence(hold: Hold) -> str:
     return f"{hold.nodes} nodes, {hold.share:.0%} of all, in {size} mm from ({low}) mm on{along}"
 
 
-def hold_warnings(hold: Hold) -> list[str]:
+def hold_concerns(hold: Hold) -> list[Concern]:
     """Whether it is a matter of chance which nodes are held."""
-    if not hold.nearly_held and not hold.nearly_free:
-        return []
-    return [
-        f"the grasp of '{hold.experiment}' cuts through elements: with its box a tenth of an edge "
-        f"larger it holds {hold.nearly_held} nodes more than {hold.nodes}, or as much smaller "
-        f"{hold.nearly_free} less, and the stiffness found depends on them; move the edge of "
-        "grasp.nodes between layers of nodes, or mesh the body with a layer where the fingers end"
-    ]
+    by_chance = bool(hold.nearly_held or hold.nearly_free)
+    counts = {"nodes": hold.nodes, "nearly_held": hold.nearly_held, "nearly_free": hold.nearly_free}
+    return concerned(by_chance, False, "description/grasp", experiment=hold.experiment, **counts)

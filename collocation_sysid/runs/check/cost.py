@@ -20,6 +20,7 @@ from ...problem import Problem
 from ...program.collocation import Collocation
 from ...program.factorisation import Choice
 from ...program.sweep import Sweep
+from ...statistics.concern import Concern
 from .derivatives import few, first_samples, shortened
 
 # IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
@@ -185,17 +186,15 @@ def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
     ]
 
 
-def cost_warnings(chosen: Cost, others: Sequence[Cost]) -> list[str]:
+def cost_concerns(chosen: Cost, others: Sequence[Cost]) -> list[Concern]:
     """Whether the chosen method will run out of memory."""
     available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
         return []
     fitting = [cost for cost in others if cost.memory_mb < available]
     remedy = f'set solver.method = "{fitting[0].method}"' if fitting else "shorten window_s"
-    return [
-        f"{chosen.method} will take about {chosen.memory_mb / 1e3:.2g} GB, more than this "
-        f"machine's {available / 1e3:.2g} GB: {remedy}"
-    ]
+    sizes = {"needed_gb": chosen.memory_mb / 1e3, "there_gb": available / 1e3}
+    return [Concern("memory/short", data={"method": chosen.method, **sizes, "remedy": remedy})]
 
 
 def _sweeps_s(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ...arrays import Array
 from ...recording.experiment import Experiment
+from ...statistics.concern import Concern, concerned
 from .body import BodyFinding
 
 # Of the mean edge length: beyond this, a marker's place is mostly extrapolation.
@@ -108,30 +110,25 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     )
 
 
-def recording_warnings(recording: Recording, body: BodyFinding) -> list[str]:
-    """What is wrong with the measurements, one sentence each; the worst marker stands for all."""
+def recording_concerns(recording: Recording, body: BodyFinding) -> list[Concern]:
+    """What is wrong with the measurements; the worst marker stands for all."""
     if not recording.markers:
         return []
-    warnings = []
-    name, far, lost = recording.experiment, recording.farthest, recording.least_seen
-    if far.distance_m > FAR * body.edges_m[1]:
-        warnings.append(
-            f"marker '{far.name}' of '{name}' lies {1e3 * far.distance_m:.3g} mm from its place on "
-            "the body and is extrapolated: give its reference_m, or check the frame and unit"
-        )
-    if lost.samples == 0:
-        warnings.append(f"marker '{lost.name}' of '{name}' is never seen: leave it out of names")
-    elif lost.missing > MOSTLY_MISSING * recording.frames:
-        warnings.append(
-            f"marker '{lost.name}' of '{name}' is missing in {lost.missing} of {recording.frames} "
-            "samples: shorten window_s to where it is seen, or leave it out of names"
-        )
-    astray = [m for m in recording.markers if (m.start_miss_m or 0.0) > ASTRAY * body.diagonal_m]
-    if astray:
-        worst = max(astray, key=lambda marker: marker.start_miss_m or 0.0)
-        warnings.append(
-            f"marker '{worst.name}' of '{name}' is first seen {1e3 * (worst.start_miss_m or 0):.3g}"
-            " mm from where the guess has it: check length_unit, the frame of the poses, "
-            "reference_m, and whether the guess is far too soft"
-        )
-    return warnings
+
+    def of(marker: MarkerFinding, distance_m: float | None = 0.0) -> dict[str, Any]:
+        by_mm, frames = 1e3 * (distance_m or 0.0), recording.frames
+        named = {"marker": marker.name, "experiment": recording.experiment}
+        return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
+
+    far, lost = recording.farthest, recording.least_seen
+    worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
+    unseen = lost.samples == 0
+    missing = not unseen and lost.missing > MOSTLY_MISSING * recording.frames
+    astray = (worst.start_miss_m or 0.0) > ASTRAY * body.diagonal_m
+    off = far.distance_m > FAR * body.edges_m[1]
+    return [
+        *concerned(off, False, "markers/off", **of(far, far.distance_m)),
+        *concerned(unseen, False, "markers/unseen", **of(lost)),
+        *concerned(missing, False, "markers/missing", **of(lost)),
+        *concerned(astray, False, "markers/astray", **of(worst, worst.start_miss_m)),
+    ]

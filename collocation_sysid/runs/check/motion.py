@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from ...program.modes import Modes, natural_modes
 from ...program.newton import Solver
 from ...program.rest import rest_state
 from ...recording.experiment import Experiment
-from ...statistics.trust import Concern, as_said
+from ...statistics.concern import Concern, concerned
 
 COUNT = 6
 # A scheme may add this share of the physical damping ratio, or this ratio where there is little.
@@ -161,51 +162,39 @@ def _damping_limit(mode: ModeFinding) -> float:
     return max(DAMPING_SHARE * mode.damping_ratio, LITTLE_DAMPING)
 
 
-def motion_warnings(motion: Motion) -> list[Concern]:
+def motion_concerns(motion: Motion) -> list[Concern]:
     """What the time grid and the length of the recording will spoil."""
     mode = motion.first
     if mode is None:
         return []
-    which, unseen = _first_mode(motion, mode), []
-    if mode.samples_per_period < FEW_SAMPLES:
-        unseen.append(
-            f"{which} has only {mode.samples_per_period:.1f} samples a period, too few to see it: "
-            f"record at {FEW_STEPS * mode.frequency_hz:.2g} Hz or more"
-        )
-    if motion.duration_s * mode.frequency_hz < 1:
-        unseen.append(
-            f"{which} takes longer for a period than the {motion.duration_s:.3g} s recorded, which "
-            "leaves the damping uncertain: record longer"
-        )
-    grid = as_said("scheme/grid", _grid_warnings(motion, mode))
-    return [*grid, *as_said("information/recording", unseen)]
+    first, samples = _first_mode(motion, mode), mode.samples_per_period
+    seen = {"samples": samples, "needed_hz": FEW_STEPS * mode.frequency_hz}
+    cut, length = motion.duration_s * mode.frequency_hz < 1, {"duration_s": motion.duration_s}
+    return [
+        *_grid_concerns(motion, mode),
+        *concerned(samples < FEW_SAMPLES, False, "information/rate", **first, **seen),
+        *concerned(cut, False, "information/short", **first, **length),
+    ]
 
 
-def _grid_warnings(motion: Motion, mode: ModeFinding) -> list[str]:
+def _grid_concerns(motion: Motion, mode: ModeFinding) -> list[Concern]:
     """What the scheme and its step spoil."""
-    which = _first_mode(motion, mode)
-    added = mode.numerical_damping_ratio
+    first, added = _first_mode(motion, mode), mode.numerical_damping_ratio
     if abs(added) > _damping_limit(mode):
-        does, found = (("adds", "to"), "low") if added > 0 else (("takes", "from"), "high")
         remedy = _finer(motion)
         if motion.scheme != UNDAMPED:
             or_finer = "" if motion.substeps_needed is None else f", or {_bare(motion)}"
             remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
-        return [
-            f"{motion.scheme} at {1e3 * motion.timestep_s:.3g} ms {does[0]} a damping ratio of "
-            f"{abs(added):.2g} {does[1]} {which}, by which the damping found will be too {found}: "
-            f"{remedy}"
-        ]
-    if mode.steps_per_period < FEW_STEPS:
-        return [
-            f"{which} has only {mode.steps_per_period:.1f} steps a period and is slowed down by "
-            f"{mode.period_error:.0%}: {_finer(motion)}"
-        ]
-    return []
+        grid = {"scheme": motion.scheme, "step_ms": 1e3 * motion.timestep_s, "ratio": abs(added)}
+        code = "scheme/adds" if added > 0 else "scheme/takes"
+        return [Concern(code, data=first | grid | {"remedy": remedy})]
+    steps = {"steps": mode.steps_per_period, "error": mode.period_error, "remedy": _finer(motion)}
+    few = mode.steps_per_period < FEW_STEPS
+    return concerned(few, False, "scheme/coarse", **first, **steps)
 
 
-def _first_mode(motion: Motion, mode: ModeFinding) -> str:
-    return f"the first mode of '{motion.experiment}' ({mode.frequency_hz:.3g} Hz at the guess)"
+def _first_mode(motion: Motion, mode: ModeFinding) -> dict[str, Any]:
+    return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
 
 
 def motion_notes(motion: Motion) -> list[str]:
@@ -224,7 +213,7 @@ def motion_notes(motion: Motion) -> list[str]:
             f"the first mode of '{name}' creeps at the guess (damping ratio "
             f"{mode.damping_ratio:.2g}): if the recording swings, guess less damping"
         )
-    if mode.period_error > PERIOD_ERROR and not _grid_warnings(motion, mode):
+    if mode.period_error > PERIOD_ERROR and not _grid_concerns(motion, mode):
         notes.append(
             f"{motion.scheme} lengthens the first period of '{name}' by {mode.period_error:.1%}, "
             f"and the stiffness found will be about {2 * mode.period_error:.1%} too high: "

@@ -1,0 +1,338 @@
+"""What may give concern: by its code the sentence, and by the code's topic what to do about it.
+
+A concern has a code, a grade and data. The first part of the code is the topic: "noise/larger" is
+about the noise. Codes stay where words change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ..errors import listed
+
+Grade = Literal["check", "doubtful"]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What concerns are about, and how they are cured.
+
+    Attributes
+    ----------
+    about : str
+        Its title.
+    page : str
+        The page of `docs/howto` that says more.
+    cure : str
+        What to do, in a sentence or two.
+    said : mapping
+        By the rest of the code what is said, with places for the data.
+    """
+
+    about: str
+    page: str
+    cure: str
+    said: Mapping[str, str]
+
+
+MODE = "the first mode of '{experiment}' ({frequency_hz:.3g} Hz at the guess)"
+TURN = "the grasp of '{experiment}' turns by {angle_rad:.2g} rad a grid step of {step_ms:.3g} ms"
+SAMPLE = (
+    "the sample at t = {t_s:.4g} s, off by {deviations:.2g} sigma, alone has {percent:.0f} % of "
+    "the residuals' power: "
+)
+NO_DAMPING = "no information on damping"
+FIX_DAMPING = "fix {damping}, or add a recording of a motion"
+
+TOPICS: Mapping[str, Topic] = {
+    "scale": Topic(
+        "The scale",
+        "forces",
+        "Measure a force, tie on a known mass, or fix a density: motion alone tells ratios only.",
+        {
+            "unknown": "only the ratios of {names} can be told (E/ρ): no known force or mass sets "
+            "their scale; fix a density, give a known mass, or measure a wrench",
+        },
+    ),
+    "description": Topic(
+        "The description",
+        "wrong_description",
+        "Compare units, frames, labels and clocks of the problem file with the laboratory's notes; "
+        "check looks for mistakes in the recordings before any solve.",
+        {
+            "poses-inverted": "the markers move as if the poses were inverted: invert them, they "
+            "are to map the undeformed body to where it is",
+            "rotation-inverted": "the markers move as if the poses' rotations were inverted: "
+            "transpose the matrices or conjugate the quaternions, and leave the positions",
+            "quaternion-order": "the markers move as if the quaternions were in another order: set "
+            'grasp.quaternion = "{order}" or swap the columns',
+            "length-unit": "{who} were {factor:g} times as large: {remedy}",
+            "length-unit/size": "the body is {size_m:.3g} m large; expected {least:g} to {most:g} "
+            "m: check object.length_unit, {likely}",
+            "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
+            "{most:g}: set object.density_kg_m3 or mass_kg, {likely}, and check object.length_unit",
+            "density/metal": "the body is as dense as metal, {density_kg_m3:.4g} kg/m³, and as "
+            "soft as rubber, E = {young_pa:.3g} Pa: a thousandth of both, if the mass was in g; "
+            "check object.density_kg_m3 or mass_kg",
+            "gravity": "the markers hang as if gravity were along {axis}: set gravity_m_s2 = "
+            "[{vector}]",
+            "gripper-frame": "the markers move with the poses, but the body is elsewhere in them: "
+            "the poses are of the gripper's own frame, or the mesh is in another one; multiply "
+            "every pose on the right by the transform from the mesh's frame to the gripper's, or "
+            "fit the poses by grasp.markers",
+            "camera-frame": "the markers fit if all are moved rigidly: cameras and robot have "
+            "different frames; set markers.template_m and template_window_s",
+            "clock": "the markers' clock is {when} by about {by_ms:.3g} ms against the poses': "
+            "{do} that to t_s of the poses, or estimate it with nuisance.time_shift",
+            "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: check "
+            "the box of grasp.nodes against where the fingers end",
+            "grasp": "the grasp of '{experiment}' cuts through elements: with its box a tenth of "
+            "an edge larger it holds {nearly_held} nodes more than {nodes}, or as much smaller "
+            "{nearly_free} less, and the stiffness found depends on them; move the edge of "
+            "grasp.nodes between layers of nodes, or mesh the body with a layer where the fingers "
+            "end",
+            "markers-exchanged": "markers have each other's names: {names}; correct markers.labels "
+            "or reference_m",
+            "markers-exchanged/later": "markers have each other's names {when}: {names}; exchange "
+            "them back there, or leave these samples out",
+            "marker-slip": "marker {marker} slips at about t = {t_s:.4g} s: give it "
+            "markers.weights = 0, or end window_s before",
+            "marker-slip/alone": "marker {marker} slips by {by_mm:.2g} mm at t = {t_s:.4g} s, the "
+            "others do not: give it markers.weights = 0, or end window_s before",
+            "pose-jump": "the poses jump by {by_mm:.2g} mm at t = {t_s:.4g} s and the markers do "
+            "not: repair the poses there, or end window_s before",
+            "sign": "along {axis} grasp {grasp} and the force that it gives go opposite ways "
+            "(correlation {correlation:.2f}), as if the body gave work: one of both signs is "
+            "wrong; set sign = -1 of its displacement or of its wrench",
+            "wrench-sign": "all of it fits with the other sign: it is what the body gives the "
+            "grasp; change its sign",
+            "wrench-frame": 'it is in the frame of the {other}: set frame = "{other}"',
+            "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
+            "wrench-clock": "it was measured about {by_ms:.2g} ms {when} than its times say: its "
+            "clock is not that of the poses",
+            "wrench-tare": "it seems zeroed with the body in hand: zero it before, or widen "
+            "nuisance.tare",
+        },
+    ),
+    "noise": Topic(
+        "The size of the noise",
+        "verdict",
+        "Error bars follow the residuals. State the sensor's noise in sigma where it is known; "
+        "where one marker alone is off, look at its track for swaps and reflections.",
+        {
+            "larger": "the residuals are {factor:.2g} times as large as {stated} says",
+            "smaller": "{stated} seems {factor:.2g} times too large for these residuals",
+            "marker": "{marker} is off by {factor:.2g} times sigma_m",
+            "markers": "{count} markers, most of all {marker}, are off by {factor:.2g} times "
+            "sigma_m",
+            "allowance": "sigma_m = {sigma_mm:.3g} mm is {share:.2g} of the body's size, more than "
+            "cameras miss: if the model's error decides, error bars of independent errors are too "
+            "short",
+        },
+    ),
+    "residuals": Topic(
+        "Residuals that are not noise",
+        "trust",
+        "Look at the residuals over time: a constant part means a wrong place or offset, a large "
+        "beginning a wrong time of release, an oscillation a wrong stiffness or damping. "
+        "compare --materials tells whether another model predicts better.",
+        {
+            "outlier": f"{SAMPLE}leave it out, or set solver.huber",
+            "first": f"{SAMPLE}the body counts as relaxed at the first sample; let the recording "
+            "begin before the load does, or leave the sample out",
+            "persist": "the residuals are not noise: they persist from sample to sample "
+            "(autocorrelation {autocorrelation:.2f})",
+            "shared": "the residuals are not noise: markers or axes share them",
+            "recordings": "the recordings disagree on {names}: model error decides, not noise",
+            "wild": "{percent:.0f} % of the samples are beyond Huber's threshold",
+            "far": "{percent:.0f} % of the markers' samples lie far from where they can be",
+        },
+    ),
+    "information": Topic(
+        "What the data do not tell",
+        "trust",
+        "Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
+        "motion that it matters to.",
+        {
+            "bound": "{names} ended at its bound",
+            "bounds": "{names} ended at their bounds",
+            "none": "these data do not tell {names}",
+            "at-bound": "{name} is at a bound",
+            "not-yet": "{name} is not known yet: {reason}",
+            "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
+            "still": f"nothing moves in {{names}}: {NO_DAMPING}, and of the stiffness only what "
+            f"the sag tells; {FIX_DAMPING}",
+            "rate": f"{MODE} has only {{samples:.1f}} samples a period, too few to see it: record "
+            "at {needed_hz:.2g} Hz or more",
+            "short": f"{MODE} takes longer for a period than the {{duration_s:.3g}} s recorded, "
+            "which leaves the damping uncertain: record longer",
+        },
+    ),
+    "markers": Topic(
+        "The markers",
+        "motion_capture",
+        "Look at the markers' labels, unit, frame and places, and at when each is seen.",
+        {
+            "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm from its place on the "
+            "body and is extrapolated: give its reference_m, or check the frame and unit",
+            "unseen": "marker '{marker}' of '{experiment}' is never seen: leave it out of names",
+            "missing": "marker '{marker}' of '{experiment}' is missing in {missing} of {frames} "
+            "samples: shorten window_s to where it is seen, or leave it out of names",
+            "astray": "marker '{marker}' of '{experiment}' is first seen {by_mm:.3g} mm from where "
+            "the guess has it: check length_unit, the frame of the poses, reference_m, and whether "
+            "the guess is far too soft",
+        },
+    ),
+    "nuisance": Topic(
+        "What is not known of a recording",
+        "motion_capture",
+        "Ask whether it can be true: are gravity, clock, grasp and places as the file describes "
+        "them? If the value can be true, widen its prior in [experiment.nuisance].",
+        {
+            "limit": "{name} ended at the largest value allowed",
+            "far": "{name} is {deviations:.1f} deviations of its prior away from zero",
+            "clock": "the markers of '{experiment}' were seen {shift_ms:.2g} ms {when} than their "
+            "times say: the estimates allow for it; better find out why",
+        },
+    ),
+    "scheme": Topic(
+        "Step and scheme",
+        "scheme",
+        "Raise transcription.substeps, or take the midpoint scheme, which damps least. "
+        "refine RUN measures what is left.",
+        {
+            "step": "the step moves {name} by {percent:+.2g} %, {errors:.2g} standard errors: its "
+            "interval allows for that; raise transcription.substeps, or run refine to measure it",
+            "damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
+            "first mode of '{experiment}'",
+            "period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
+            "adds": f"{{scheme}} at {{step_ms:.3g}} ms adds a damping ratio of {{ratio:.2g}} to "
+            f"{MODE}, by which the damping found will be too low: {{remedy}}",
+            "takes": f"{{scheme}} at {{step_ms:.3g}} ms takes a damping ratio of {{ratio:.2g}} "
+            f"from {MODE}, by which the damping found will be too high: {{remedy}}",
+            "coarse": f"{MODE} has only {{steps:.1f}} steps a period and is slowed down by "
+            "{error:.0%}: {remedy}",
+            "turn": TURN,
+            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s), which is "
+            "computed along the chord and spoils what is found, damping most of all: {remedy}",
+        },
+    ),
+    "stability": Topic(
+        "States that are not stable",
+        "material",
+        "Does the body buckle there? If not, the damping feeds energy in: take damping = "
+        '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
+        {
+            "grows": "'{experiment}' is not stable at {time_s:.3g} s: disturbances grow by "
+            "{growth_1_s:.2g} 1/s",
+        },
+    ),
+    "mesh": Topic(
+        "The mesh",
+        "mesh",
+        'Refine it, and take element = "tet10", or "tet10-p0" from ν = 0.45 on. '
+        "refine RUN measures what is left.",
+        {
+            "refined": "step and mesh move {name} by {percent:+.2g} %, {errors:.2g} standard "
+            "errors: its interval allows for that",
+            "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
+            "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
+            "improve the mesh there",
+            "locks": "Poisson's ratio is {poisson:.3g} at the guess and {element} elements lock "
+            "from {limit:g} on, so that the stiffness found will be too low: {remedy}",
+            "few": "only about {cells:.1f} {element} elements lie across the body's "
+            "{thickness_mm:.3g} mm, too {off} in bending, so that the stiffness found of a real "
+            "body will be too {level} (not of data simulated with these elements, which are as "
+            "{off}): {remedy} the mesh to {needed:.0f} or more",
+        },
+    ),
+    "roll-out": Topic(
+        "The forward simulation",
+        "trust",
+        "If the fit is good and the simulation is not, the step is too long. If a recording is "
+        "predicted badly, the model lacks something that this recording shows.",
+        {
+            "failed": "the forward simulation of '{experiment}' failed: {why}",
+            "misses": "the forward simulation of '{experiment}' misses by {rms_mm:.2g} mm, the fit "
+            "by {fit_mm:.2g} mm",
+            "predicted": "'{experiment}' is predicted {times:.2g} times worse than the others are "
+            "fitted",
+        },
+    ),
+    "memory": Topic(
+        "RAM",
+        "large",
+        "Take reduced-space, fewer timesteps or a coarser mesh.",
+        {
+            "short": "{method} will take about {needed_gb:.2g} GB, more than this machine's "
+            "{there_gb:.2g} GB: {remedy}",
+        },
+    ),
+    "solve": Topic(
+        "The solve",
+        "trust",
+        "Start from another guess, or from none, and make sure that check finds nothing wrong.",
+        {
+            "lost": "the solve did not converge: {why}",
+            "no-start": "there is no start yet: the first frame needs a pose",
+            "not-simulable": "the body cannot be simulated with these parameters",
+            "grasp-lost": "the grasp is lost",
+            "seeking": "a start is still sought",
+            "acceptable": "the solve converged to the acceptable tolerance only",
+            "no-error-bars": "no error bars could be found",
+            "interrupted": "interrupted: {left_out}",
+            "moves": "the estimate still moves: it is farther than its error bar from where it was "
+            "simulated",
+            "anew": "restarted {times}, as if the body had been at rest there",
+        },
+    ),
+}
+
+
+def sentence_of(code: str, data: Mapping[str, Any]) -> str:
+    """What is said of a code with its data; what it is `of` stands in front where that is told."""
+    topic, _, rest = code.partition("/")
+    shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
+    said = TOPICS[topic].said[rest].format(**shown)
+    nearer = f" ({data['nearer']:.2g} times nearer)" if "nearer" in data else ""
+    return f"{data['of']}: {said}{nearer}" if data.get("of") else said
+
+
+@dataclass(frozen=True)
+class Concern:
+    """One thing that gives concern.
+
+    Attributes
+    ----------
+    code : str
+        Topic and what it is, such as "noise/larger"; stays the same where words change.
+    grade : {"check", "doubtful"}
+    data : mapping
+        What its sentence holds.
+    """
+
+    code: str
+    grade: Grade = "check"
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def topic(self) -> str:
+        """What it is about, by which it is cured."""
+        return self.code.partition("/")[0]
+
+    @property
+    def sentence(self) -> str:
+        """The same for people."""
+        return sentence_of(self.code, self.data)
+
+
+def concerned(found: bool, gross: bool, code: str, **data: Any) -> list[Concern]:
+    """A concern where there is one, doubtful where it is gross."""
+    return [Concern(code, "doubtful" if gross else "check", data)] if found else []
+
+
+def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:
+    """What several concerns are about, each topic once."""
+    return {concern.topic: TOPICS[concern.topic] for concern in concerns}
