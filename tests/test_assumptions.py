@@ -6,11 +6,23 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
-from problems_small import EDGE_M, hung_cube
+from problems_small import EDGE_M, box, hung_cube, smooth_poses
+from test_static import PRESSED_M, TIMES, block
 
-from collocation_sysid import Body, Collocation, Experiment, Tied, Unknown, simulate
+from collocation_sysid import (
+    Body,
+    Collocation,
+    Experiment,
+    Force,
+    Grasp,
+    NodeForce,
+    Tied,
+    Unknown,
+    simulate,
+)
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.assumptions import (
     AIR_KG_M3,
@@ -52,11 +64,11 @@ def parameters(**stated: float | Unknown | Tied) -> Parameters:
     return Parameters.of(VALUES | {"young_pa": Unknown(VALUES["young_pa"], 10.0, 1e6)} | stated)
 
 
-def changed(experiment: Experiment, name: str) -> np.ndarray:
+def changed(experiment: Experiment, name: str, scheme: str = "midpoint") -> np.ndarray:
     """Markers (T, M, 3) where an assumption is off by one of its unit, to first order [m]."""
     row = name.partition(" ")[0]
-    collocation = Collocation([experiment], parameters(), "midpoint")
-    positions = simulate(experiment, VALUES, "midpoint").positions_m
+    collocation = Collocation([experiment], parameters(), scheme)
+    positions = simulate(experiment, VALUES, scheme).positions_m
     z = collocation.pack(collocation.guess_p, [positions.reshape(len(positions), -1)])
     names, found = changed_residuals(collocation, z, [(BY_NAME[row], 1.0)])
     return found[0][..., names.index(name)] * experiment.markers.sigma_m[:, None]
@@ -71,6 +83,69 @@ def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
     assert largest > 0
     atol = (0.05 if name == "stiffness_drift" else 0.01) * largest
     np.testing.assert_allclose(changed(experiment, name), simulated, atol=atol)
+
+
+def test_a_grip_that_gives_way_is_a_body_on_springs():
+    layer_m, sway_m = 1e-4, np.array([0.02, 0.01, -0.015])
+    mesh, hung = box().mesh, hung_cube(24, start="undeformed", gravity_m_s2=(0.0, 0.0, 0.0))
+    nodes, body = hung.grasps[0].nodes, Body(mesh, density_kg_m3=60.0)
+    poses = smooth_poses(hung.t_s, tuple(sway_m), turn_rad=(0.0, 0.0, 0.0))
+
+    def spring(x, v, at):
+        way = x - at.rest_m - sway_m * (1 - ca.cos(20.0 * at.t_s))
+        return -VALUES["young_pa"] * at.volume_m3 ** (2 / 3) / layer_m * way
+
+    loose = Body(mesh, density_kg_m3=60.0, forces=[NodeForce.of(spring, nodes=nodes)])
+    gripped = replace(hung, body=body, grasps=(Grasp(nodes, poses),))
+    on_springs = replace(hung, body=loose, grasps=())
+    # Under the midpoint rule springs as stiff as these would ring.
+    tracks = [simulate(each, VALUES, "bdf2").markers_m for each in (on_springs, gripped)]
+    simulated = (tracks[0] - tracks[1]) / layer_m
+    expected = changed(gripped, "grip_layer_m", "bdf2")
+    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
+
+
+def platen_forces_n(experiment: Experiment, platen: int) -> np.ndarray:
+    """(T, k, 3) what a platen gives each node that it holds, which is what the body gives it."""
+    x = simulate(experiment, VALUES).positions_m.reshape(len(experiment.t_s), -1)
+    inside = experiment.body.force(x, np.zeros_like(x), experiment.body.theta(VALUES))
+    return -inside.reshape(len(x), -1, 3)[:, experiment.grasps[platen].nodes]
+
+
+def test_a_bench_that_gives_way_presses_less():
+    compliance_m_n, pressed_m = 1e-6, PRESSED_M
+    for _ in range(5):  # what it gives way follows the force, and that what is pressed
+        force_n = platen_forces_n(block("xyz", z_m=pressed_m), 1)[..., 2].sum(axis=1)
+        pressed_m = PRESSED_M - compliance_m_n * force_n
+    tracks = [simulate(block("xyz", z_m=z_m), VALUES).markers_m for z_m in (pressed_m, PRESSED_M)]
+    simulated = (tracks[0] - tracks[1]) / compliance_m_n
+    expected = changed(block("xyz"), "machine_compliance_m_n")
+    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
+    assert simulated[-1, :, 2].max() > 0
+
+
+def test_friction_holds_back_what_slides_on_platens():
+    friction, sliding, tracks = 1e-3, block(), []
+    x, start = simulate(sliding, VALUES).positions_m, sliding.body.nodes_m
+    for k in range(1, len(PRESSED_M)):
+        forces = []
+        for platen in range(2):
+            nodes = sliding.grasps[platen].nodes
+            press = friction * np.abs(platen_forces_n(sliding, platen)[k, :, 2:])
+            way = (x[k] - start)[nodes] * [1, 1, 0]
+            pull = -press * way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+            forces += [Force([n], f) for n, f in zip(nodes, pull, strict=True) if f.any()]
+        held_back = block(t_s=TIMES[:2], z_m=PRESSED_M[[k, k]], forces=forces)
+        tracks.append(simulate(held_back, VALUES).markers_m[-1])
+    simulated = (tracks - sliding.markers.observe(x)[1:]) / friction
+    expected = changed(sliding, "platen_friction")[1:]
+    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
+
+
+def test_planes_of_symmetry_have_no_friction_and_are_no_grip():
+    sliding, sticking = changed(block(), "grip_layer_m"), changed(block("xyz"), "platen_friction")
+    assert not sliding.any()
+    assert not sticking.any()
 
 
 def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():

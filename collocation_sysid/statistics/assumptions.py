@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..checked import Positive
@@ -268,36 +269,52 @@ def _poisson(at: Fitted, _: int) -> Effect | None:
 
 
 def _grip(at: Fitted, _: int) -> Effect | None:
-    """Grip and what it touches give way like so much more of the body, in its thickness."""
-    held = at.part.setting.held
-    if not len(held.dofs):
+    """Grip and what it touches give way like so much more of the body, in its thickness.
+
+    What holds along some axes only is a platen or a plane of symmetry, and no grip.
+    """
+    held, holding = at.part.setting.held, at.part.segment.experiment.grasps
+    gripped = [grasp.dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
+    if not gripped:
         return None
     area_m2 = at.body.dof_volume_m3[held.dofs] ** (2 / 3)
-    return Effect(moved_m=-at.grasp_force_n / (at.young_pa * area_m2))
+    moved = -at.grasp_force_n / (at.young_pa * area_m2)
+    return Effect(moved_m=moved * np.isin(held.dofs, np.concatenate(gripped)))
+
+
+def _driven(at: Fitted) -> NDArray[np.bool_]:
+    """(g,) grasped dofs that a bench moves."""
+    goals = at.part.setting.held.positions_m
+    return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
 
 
 def _machine(at: Fitted, _: int) -> Effect | None:
-    """A test bench gives way: its displacement is measured behind its frame."""
+    """A test bench gives way: the displacement of what it moves is measured behind its frame."""
     experiment, held = at.part.segment.experiment, at.part.setting.held
-    if not experiment.static or not len(held.dofs):
+    if not experiment.static or not (driven := _driven(at)).any():
         return None
     moved = np.zeros_like(at.grasp_force_n)
     for grasp in experiment.grasps:
         for axis in range(3):
             here = np.flatnonzero(np.isin(held.dofs, grasp.dofs) & (held.dofs % 3 == axis))
-            moved[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+            if driven[here].any():
+                moved[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
     return Effect(moved_m=moved)
 
 
 def _platen_friction(at: Fitted, _: int) -> Effect | None:
-    """Friction against the way that grasped nodes slide along what holds them across."""
+    """Friction against the way that nodes slide along platens, across the axis these are moved on.
+
+    Planes of symmetry have none: nothing presses along their axes.
+    """
     experiment, held = at.part.segment.experiment, at.part.setting.held
-    sliding = [grasp for grasp in experiment.grasps if 0 < len(grasp.axes) < 3]
-    if not sliding:
+    if not experiment.static:
         return None
+    pressed = {_AXES[k] for k in np.unique(held.dofs[_driven(at)] % 3)}
+    platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
     force, x = np.zeros_like(at.part.x), at.part.x
     start = at.body.nodes_m.ravel()
-    for grasp in sliding:
+    for grasp in platens:
         across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
         for node in grasp.nodes:
             normal = np.isin(held.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
@@ -306,7 +323,7 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
             way = x[:, dofs] - start[dofs]
             length = np.linalg.norm(way, axis=1, keepdims=True)
             force[:, dofs] -= press[:, None] * way / np.maximum(length, 1e-9)
-    return Effect(force)
+    return Effect(force) if platens else None
 
 
 def _buoyancy(at: Fitted, _: int) -> Effect:

@@ -104,7 +104,8 @@ class Sources:
         )
         if not whole > 0:
             return 1.0, 1.0
-        return float(np.clip(known / whole, 0.0, 1.0)), whole / all_of_it
+        agreed = 1.0 if (self.wider == 1).all() else whole / all_of_it
+        return float(np.clip(known / whole, 0.0, 1.0)), agreed
 
     def of_recordings(self, by_q: Array, others: float, told: float) -> float:
         """A variance by what parameters differ by between recordings, beyond what is told of it.
