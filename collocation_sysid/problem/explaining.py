@@ -19,10 +19,7 @@ Fault = Mapping[str, Any]
 
 
 def explain(
-    error: ValidationError,
-    content: dict[str, Any],
-    path: Path,
-    root: type[BaseModel] = ProblemFile,
+    error: ValidationError, content: dict[str, Any], path: Path, root: type[BaseModel] = ProblemFile
 ) -> InputError:
     """Turn the first complaint into an `InputError`, and count the others.
 

@@ -28,13 +28,7 @@ from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader, existing_file
 from .recording_schema import ReadingSection
-from .schema import (
-    CodeSection,
-    ObjectSection,
-    ParameterSection,
-    PriorSection,
-    ProblemFile,
-)
+from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 
 T = TypeVar("T")
 

@@ -9,13 +9,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from .clock import (
-    STEP_TOLERANCE,
-    even_times_s,
-    rounding_s,
-    sample_interval_s,
-    unrounded_s,
-)
+from .clock import STEP_TOLERANCE, even_times_s, rounding_s, sample_interval_s, unrounded_s
 from .poses import PoseSequence
 from .readers import MarkerTable
 

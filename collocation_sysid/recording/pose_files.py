@@ -11,9 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..errors import InputError
-from .formats.columns import TIME, column_of, name_and_unit, times_of
-from .formats.plain import read_grid
-from .formats.text import Grid, Row, decode, is_number, listed, numbers, read_bytes
+from .formats.columns import TIME, column_of, name_and_unit
+from .formats.text import (
+    Grid,
+    Row,
+    decode,
+    is_number,
+    numbers,
+    of_file,
+    read_bytes,
+    read_grid,
+    times_of,
+)
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit, si_factor
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
@@ -24,6 +33,7 @@ _ORDERS = ("xyzw", "wxyz")
 _ZIP = b"PK\x03\x04"
 
 
+@of_file
 def read_poses(
     path: str | Path, quaternion: str | None = None, length_unit: str | None = None
 ) -> PoseSequence:
@@ -53,15 +63,14 @@ def read_poses(
     """
     refuse_unknown_unit(length_unit)
     if quaternion not in (None, *_ORDERS):
-        raise InputError(f"quaternion is {quaternion!r}; expected one of {listed(_ORDERS)}")
+        raise InputError(f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}")
     content = read_bytes(path)
     if content.startswith(_ZIP):
         t_s, matrices = _archive(path)
-        return _from_matrices(
-            path, t_s, matrices, length_unit, [f"index {k}" for k in range(len(t_s))]
-        )
-    grid = _with_names(read_grid(path, decode(content, path)))
-    lines = [f"line {line}" for line in grid.lines]
+        places = [f"index {k}" for k in range(len(t_s))]
+        return _from_matrices(t_s, matrices, length_unit, places)
+    grid = _with_names(read_grid(decode(content)))
+    lines = [f"line {row.line}" for row in grid.rows]
     time = column_of(grid, TIME)
     if time is None:
         raise _other_columns(grid)
@@ -69,22 +78,18 @@ def read_poses(
     others = [k for k in range(len(grid.columns)) if k != time[0]]
     if sorted(grid.columns[k] for k in others) == sorted(_MATRIX_COLUMNS):
         matrices = _columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(-1, 4, 4)
-        return _from_matrices(path, t_s, matrices, length_unit, lines)
+        return _from_matrices(t_s, matrices, length_unit, lines)
     axes, metres = _axes(grid, length_unit)
     components = _components(grid, quaternion, [k for k in others if k not in axes])
     positions_m = _columns(grid, axes) * metres
-    return _sequence(path, t_s, positions_m, _columns(grid, components), lines)
+    return _sequence(t_s, positions_m, _columns(grid, components), lines)
 
 
 def _sequence(
-    path: str | Path,
-    t_s: Array,
-    positions_m: Array,
-    quaternions: Array,
-    places: list[str],
+    t_s: Array, positions_m: Array, quaternions: Array, places: list[str]
 ) -> PoseSequence:
     if fault := first_pose_fault(t_s, positions_m, quaternions):
-        raise InputError(fault[1], path, places[fault[0]])
+        raise InputError(fault[1], where=places[fault[0]])
     return PoseSequence(t_s, positions_m, quaternions)
 
 
@@ -100,19 +105,14 @@ def _with_names(table: Grid) -> Grid:
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
-    return Grid(table.path, names, [Row(1, table.columns), *table.rows])
+    return Grid(names, [Row(1, table.columns), *table.rows])
 
 
 def _other_columns(grid: Grid) -> InputError:
-    return _refused(
-        grid,
-        f"the columns are {listed(grid.columns)}; expected {listed(POSE_COLUMNS)}, each once "
-        "(or t_s and m00, m01 … m33)",
+    return grid.refusal(
+        f"the columns are {', '.join(grid.columns)}; expected {', '.join(POSE_COLUMNS)}, each once "
+        "(or t_s and m00, m01 … m33)"
     )
-
-
-def _refused(grid: Grid, message: str) -> InputError:
-    return InputError(message, grid.path, f"line {grid.names_line}")
 
 
 def _axes(grid: Grid, given: str | None) -> tuple[list[int], float]:
@@ -123,20 +123,18 @@ def _axes(grid: Grid, given: str | None) -> tuple[list[int], float]:
     metres = [si_factor(unit or given or "m", "length") for unit in stated]
     if len(axes) != 3 or None in metres or len(set(metres)) > 1:
         raise _other_columns(grid)
-    named = listed(grid.columns[k] for k in axes)
+    named = ", ".join(grid.columns[k] for k in axes)
     if given is None and None in stated:
-        raise _refused(
-            grid,
+        raise grid.refusal(
             f"the columns {named} name no unit; expected length_unit, one of "
-            f"{listed(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m",
+            f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
     if given and any(
         unit and si_factor(unit, "length") != METRES_PER_UNIT[given] for unit in stated
     ):
-        raise _refused(
-            grid,
+        raise grid.refusal(
             f"length_unit is '{given}', but the columns are {named}; expected the same unit, or no "
-            "length_unit",
+            "length_unit"
         )
     return axes, float(metres[0] or 1.0)
 
@@ -147,20 +145,18 @@ def _components(grid: Grid, given: str | None, others: list[int]) -> list[int]:
     if sorted(place) == ["qw", "qx", "qy", "qz"]:
         order = "".join(name[1] for name in place)
         if given not in (None, order):
-            raise _refused(
-                grid,
-                f"quaternion is '{given}', but the columns are {listed(place)}; expected the same "
-                "order, or no quaternion",
+            raise grid.refusal(
+                f"quaternion is '{given}', but the columns are {', '.join(place)}; expected the "
+                "same order, or no quaternion"
             )
         return [place[f"q{axis}"] for axis in "xyzw"]
     numbered = sorted(place)
     if len(others) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
         raise _other_columns(grid)
     if given is None:
-        raise _refused(
-            grid,
-            f"the columns {listed(numbered)} do not say which is the scalar; expected quaternion "
-            "= 'xyzw' or 'wxyz', or columns qx, qy, qz, qw",
+        raise grid.refusal(
+            f"the columns {', '.join(numbered)} do not say which is the scalar; expected "
+            "quaternion = 'xyzw' or 'wxyz', or columns qx, qy, qz, qw"
         )
     return [place[numbered[given.index(axis)]] for axis in "xyzw"]
 
@@ -173,30 +169,25 @@ def _archive(path: str | Path) -> tuple[Array, Array]:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
     except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise InputError(f"is not a NumPy archive of numbers: {error}", path) from error
+        raise InputError(f"is not a NumPy archive of numbers: {error}") from error
     shapes = {key: array.shape for key, array in arrays.items()}
     shape = shapes.get("t_s", ())
     if len(shape) != 1 or shapes.get("matrices") != (*shape, 4, 4) or not shape[0]:
         raise InputError(
             f"holds {', '.join(f'{key} {size}' for key, size in shapes.items()) or 'nothing'}; "
-            "expected t_s (T,) and matrices (T, 4, 4)",
-            path,
+            "expected t_s (T,) and matrices (T, 4, 4)"
         )
     try:
         return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"t_s and matrices must hold numbers: {error}", path) from error
+        raise InputError(f"t_s and matrices must hold numbers: {error}") from error
 
 
 def _from_matrices(
-    path: str | Path,
-    t_s: Array,
-    matrices: Array,
-    length_unit: str | None,
-    places: list[str],
+    t_s: Array, matrices: Array, length_unit: str | None, places: list[str]
 ) -> PoseSequence:
     if fault := first_matrix_fault(t_s, matrices):
-        raise InputError(fault[1], path, places[fault[0]])
+        raise InputError(fault[1], where=places[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]
     quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    return _sequence(path, t_s, matrices[:, :3, 3] * metres, quaternions, places)
+    return _sequence(t_s, matrices[:, :3, 3] * metres, quaternions, places)

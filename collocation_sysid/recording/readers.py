@@ -13,8 +13,9 @@ from ..errors import InputError, hint_at
 from ..stated import key, stated
 from .arrays import floats, read_only_tracks
 from .clock import first_time_fault
-from .formats import Choose, RawTracks, c3d, motive, plain, qualisys, trc
-from .formats.text import decode, listed, read_bytes
+from .formats import c3d, motive, plain, qualisys, trc
+from .formats.text import decode, of_file, read_bytes
+from .formats.tracks import Choose, RawTracks
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
 
 # A frame rate and a column of times agree within this part.
@@ -56,6 +57,7 @@ class MarkerTable:
         vars(self)["positions_m"] = tracks
 
 
+@of_file
 def read_markers(
     path: str | Path,
     *,
@@ -95,122 +97,102 @@ def read_markers(
     if rate_hz is not None and not 0 < rate_hz < np.inf:
         raise InputError(f"rate_hz is {rate_hz:g}; expected a rate above 0")
     labels = dict(labels or {})
-    raw = _read_tracks(path, _choice(path, names, labels))
-    metres = METRES_PER_UNIT[_unit(path, raw, length_unit)]
-    t_s = _times_s(path, raw, rate_hz)
+    raw = _read_tracks(path, _choice(names, labels))
+    metres = METRES_PER_UNIT[_unit(raw, length_unit)]
+    t_s = _times_s(raw, rate_hz)
     taken = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _present(raw, taken)
     return MarkerTable(t_s, tuple(taken), coordinates * metres, (*raw.notes, *notes))
 
 
 def _read_tracks(path: str | Path, choose: Choose) -> RawTracks:
-    """Read the markers that `choose` picks from a file of any known format.
-
-    Raises
-    ------
-    InputError
-        Naming the file, and the line where there is one.
-    """
+    """Read the markers that `choose` picks from a file of any known format."""
     content = read_bytes(path)
     if c3d.recognises(content):
         return c3d.read(path, content, choose)
-    text = decode(content, path)
+    text = decode(content)
     start = text.lstrip().lstrip('"')
-    for beginning, read in _TEXT_FORMATS.items():
-        if start.startswith(beginning):
-            return read(path, text, choose)
-    return plain.read(path, text, choose)
+    known = (read for beginning, read in _TEXT_FORMATS.items() if start.startswith(beginning))
+    return next(known, plain.read)(text, choose)
 
 
-def _choice(path: str | Path, names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
+def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
     """What picks the markers asked for from the labels in a file."""
 
     def choose(labels: Sequence[str], aside: Collection[str] = ()) -> list[int]:
-        _refuse_repeated(path, labels, "two markers are labelled")
+        _refuse_repeated(labels, "two markers are labelled")
         for label in renamed:
-            _require_one_of(path, label, labels, "label")
+            _require_one_of(label, labels, "label")
         known = [renamed.get(label, label) for label in labels]
-        _refuse_repeated(path, known, "after renaming two markers are named")
+        _refuse_repeated(known, "after renaming two markers are named")
         if names is None:
             wanted = [k for k, label in enumerate(labels) if label not in aside or label in renamed]
+            if not labels:
+                raise InputError("holds no markers")
             if not wanted:
-                raise InputError(_no_markers(labels), path)
+                remedy = f"label them, or rename with labels: {', '.join(labels)}"
+                raise InputError(f"holds unlabelled markers only; {remedy}")
             return wanted
         if not names:
-            raise InputError(
-                "no markers are asked for; leave the names out to take all of them", path
-            )
+            raise InputError("no markers are asked for; leave the names out to take all of them")
         for name in names:
-            _require_one_of(path, name, known, "marker")
-        _refuse_repeated(path, names, "asked for more than once: marker")
+            _require_one_of(name, known, "marker")
+        _refuse_repeated(names, "asked for more than once: marker")
         return [known.index(name) for name in names]
 
     return choose
 
 
-def _no_markers(labels: Sequence[str]) -> str:
-    if not labels:
-        return "holds no markers"
-    return f"holds unlabelled markers only; label them, or rename with labels: {listed(labels)}"
-
-
-def _refuse_repeated(path: str | Path, names: Sequence[str], message: str) -> None:
+def _refuse_repeated(names: Sequence[str], message: str) -> None:
     for name in names:
         if list(names).count(name) > 1:
-            raise InputError(f"{message} '{name}'; expected names that differ", path)
+            raise InputError(f"{message} '{name}'; expected names that differ")
 
 
-def _require_one_of(path: str | Path, name: str, there: Sequence[str], what: str) -> None:
+def _require_one_of(name: str, there: Sequence[str], what: str) -> None:
     if name not in there:
         hint = hint_at(name, there)
-        raise InputError(f"no {what} '{name}'; the file has {listed(there)}{hint}", path)
+        raise InputError(f"no {what} '{name}'; the file has {', '.join(there)}{hint}")
 
 
-def _unit(path: str | Path, raw: RawTracks, given: str | None) -> str:
+def _unit(raw: RawTracks, given: str | None) -> str:
     if given and raw.unit and given != raw.unit:
         raise InputError(
             f"length_unit is '{given}', but {raw.unit_key} says '{raw.unit}'; expected the same, "
-            "or no length_unit",
-            path,
+            "or no length_unit"
         )
     unit = given or raw.unit or raw.default_unit
     if unit is None:
         raise InputError(
             f"no unit of length is stated by {raw.unit_key}; expected length_unit, one of "
-            f"{listed(METRES_PER_UNIT)}",
-            path,
+            f"{', '.join(METRES_PER_UNIT)}"
         )
     return unit
 
 
-def _times_s(path: str | Path, raw: RawTracks, given_hz: float | None) -> Array:
+def _times_s(raw: RawTracks, given_hz: float | None) -> Array:
     """Times of the frames: as in the file, else from the rate."""
     t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": given_hz}
     stated = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
-        lines = raw.lines
-        if fault := first_time_fault(t_s):
-            raise InputError(fault[1], path, None if lines is None else f"line {lines[fault[0]]}")
         for key, rate in stated.items():
-            _refuse_other_rate(path, t_s, key, rate)
+            _refuse_other_rate(t_s, key, rate)
         return t_s
     if not stated:
         raise InputError(
             f"neither {raw.rate_key} nor a column of times states when the frames were taken; "
-            "expected rate_hz",
-            path,
+            "expected rate_hz"
         )
     first, *others = stated.values()
     if not all(math.isclose(first, other, rel_tol=1e-6) for other in others):
         raise InputError(
             f"rate_hz is {given_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
-            "rate_hz",
-            path,
+            "rate_hz"
         )
     return np.arange(len(raw.coordinates)) / first
 
 
-def _refuse_other_rate(path: str | Path, t_s: Array, key: str, rate_hz: float) -> None:
+def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
     """Lost frames spoil the mean step, and coarsely printed times the median: one must agree."""
     if len(t_s) < 2:
         return
@@ -219,8 +201,7 @@ def _refuse_other_rate(path: str | Path, t_s: Array, key: str, rate_hz: float) -
     if min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1)) > _RATE_TOLERANCE:
         raise InputError(
             f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "
-            f"{mean_hz:.6g} Hz; expected the same",
-            path,
+            f"{mean_hz:.6g} Hz; expected the same"
         )
 
 

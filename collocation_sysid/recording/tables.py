@@ -24,10 +24,8 @@ from .formats.columns import (
     Columns,
     Quantity,
     read_columns,
-    times_of,
 )
-from .formats.plain import read_grid
-from .formats.text import Grid, decode, listed, numbers, read_bytes
+from .formats.text import decode, numbers, of_file, read_bytes, read_grid, times_of
 from .poses import PoseSequence
 
 WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
@@ -64,33 +62,28 @@ def read_tension(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         tension is negative; the line is named.
     """
-    grid, t_s, tension = _one(path, TENSION, LARGEST_N)
-    for row in (tension < 0).nonzero()[0]:
-        raise InputError(
-            f"tension_n is {tension[row]:g}; expected 0 or more, since a tendon only pulls: take "
-            "the sensor's offset off",
-            path,
-            f"line {grid.lines[row]}",
-        )
-    return t_s, tension
+    return _course(path, TENSION, LARGEST_N, at_least=0.0)
 
 
 def read_pressure(path: str | Path) -> tuple[Array, Array]:
     """Read a pressure above the surroundings', `t_s` (T,) and `pressure_pa` (T,); see above."""
-    return _one(path, PRESSURE, LARGEST_PA)[1:]
+    return _course(path, PRESSURE, LARGEST_PA)
 
 
-def _one(path: str | Path, quantity: Quantity, largest: float) -> tuple[Grid, Array, Array]:
+@of_file
+def _course(
+    path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
+) -> tuple[Array, Array]:
     table = read_columns(path, [quantity])
     values = table.values[quantity.key]
-    for row in (abs(values) > largest).nonzero()[0]:
-        raise InputError(
-            f"{quantity.column} is {values[row]:g}, which no soft body bears; check the unit of "
-            "the column",
-            path,
-            f"line {table.grid.lines[row]}",
-        )
-    return table.grid, table.t_s, values
+    for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
+        is_so = f"{quantity.column} is {values[row]:g}"
+        if abs(values[row]) > largest:
+            why = ", which no soft body bears; check the unit of the column"
+        else:
+            why = "; expected 0 or more, since a tendon only pulls: take the sensor's offset off"
+        raise table.grid.refusal(is_so + why, int(row))
+    return table.t_s, values
 
 
 # Of a grasp, as a robot or a test bench tells it --------------------------------------------------
@@ -219,6 +212,7 @@ def _unrounded(t_s: Array) -> Array:
 # Of an instrument ---------------------------------------------------------------------------------
 
 
+@of_file
 def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Array, list[str]]:
     """Read times (S,) and what an instrument said then (S, m); NaN where a cell is blank.
 
@@ -234,17 +228,14 @@ def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Ar
         If a column is missing or repeated, a cell is not a number, or time does not increase; the
         line is named.
     """
-    grid = read_grid(path, decode(read_bytes(path), path))
+    grid = read_grid(decode(read_bytes(path)))
     wanted = list(columns) or [name for name in grid.columns if name != "t_s"]
     for name in ("t_s", *wanted):
         if (count := grid.columns.count(name)) != 1:
             there = f"{count} columns are called" if count else "there is no column"
             hint = "" if count else hint_at(name, grid.columns)
-            raise InputError(
-                f"{there} {name!r}; expected one among {listed(grid.columns)}{hint}",
-                path,
-                f"line {grid.names_line}",
-            )
+            among = ", ".join(grid.columns)
+            raise grid.refusal(f"{there} {name!r}; expected one among {among}{hint}")
     t_s = times_of(grid, grid.columns.index("t_s"))
     values = numbers(grid, [grid.columns.index(name) for name in wanted], True)
     return _unrounded(t_s), np.asarray(values), wanted

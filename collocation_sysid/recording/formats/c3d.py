@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...apart import Failed, computed_apart
 from ...errors import InputError
-from . import Choose, RawTracks
+from .tracks import Choose, RawTracks
 from .units import stated_unit
 
 _KEY = 0x50
@@ -37,26 +37,25 @@ def recognises(content: bytes) -> bool:
 def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     """Read a C3D file; ezc3d gives NaN for points with a negative residual."""
     if find_spec("ezc3d") is None:
-        raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'", path)
-    points_stated, frames_stated = _stated_counts(path, content)
+        raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
+    points_stated, frames_stated = _stated_counts(content)
     try:
         read = computed_apart(_WORKER, str(Path(path).resolve()))
     except Failed as error:
-        raise InputError(f"is a damaged C3D file: ezc3d says '{error}'", path) from error
+        raise InputError(f"is a damaged C3D file: ezc3d says '{error}'") from error
     points = read.pop("points")  # (3, points, frames)
     for what, stated, count in (
         ("points", points_stated, points.shape[1]),
         ("frames", frames_stated, points.shape[2]),
     ):
         if stated is not None and count != stated:
-            raise InputError(f"the header states {stated} {what}, but {count} are there", path)
+            raise InputError(f"the header states {stated} {what}, but {count} are there")
     labels = _labels(read)
     if len(labels) != points.shape[1]:
         raise InputError(
             f"{len(labels)} labels, but {points.shape[1]} points in every frame; "
             "expected a label for each",
-            path,
-            "POINT:LABELS",
+            where="POINT:LABELS",
         )
     chosen = choose(labels)
     units = "".join(map(str, read.get("UNITS", [])[:1]))
@@ -64,21 +63,21 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     return RawTracks(
         labels=[labels[k] for k in chosen],
         coordinates=points[:, chosen].transpose(2, 1, 0),
-        unit=stated_unit(units, path, "POINT:UNITS"),
+        unit=stated_unit(units, "POINT:UNITS"),
         unit_key="POINT:UNITS",
         rate_hz=rates[0] if rates and rates[0] > 0 else None,
         rate_key="POINT:RATE",
     )
 
 
-def _stated_counts(path: str | Path, content: bytes) -> tuple[int, int | None]:
+def _stated_counts(content: bytes) -> tuple[int, int | None]:
     """Points and frames by the header; no frames where they are too many for its counter.
 
     Of a file that is cut short ezc3d returns what is left, so the size is compared here.
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
-        raise InputError("is cut short: the C3D header is not whole", path)
+        raise InputError("is cut short: the C3D header is not whole")
     processor = content[start + 3]
     order = ">" if processor == _SGI else "<"
     points, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
@@ -93,11 +92,10 @@ def _stated_counts(path: str | Path, content: bytes) -> tuple[int, int | None]:
     if len(content) < size:
         raise InputError(
             f"has {len(content)} bytes, but {frames} frames of {points} points need {size}; "
-            "is the file cut short?",
-            path,
+            "is the file cut short?"
         )
     if frames < 1 or not points:
-        raise InputError(f"holds {points} points and {frames} frames; expected some", path)
+        raise InputError(f"holds {points} points and {frames} frames; expected some")
     return points, frames
 
 

@@ -15,9 +15,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, hint_at
-from ..clock import first_time_fault
-from .plain import read_grid
-from .text import Grid, decode, listed, numbers, read_bytes
+from .text import Grid, decode, numbers, of_file, read_bytes, read_grid, times_of
 from .units import expected_units, si_factor
 
 
@@ -96,6 +94,7 @@ class Columns:
     values: Mapping[str, Array]
 
 
+@of_file
 def read_columns(
     path: str | Path,
     wanted: Sequence[Quantity],
@@ -126,54 +125,34 @@ def read_columns(
         If a column is missing, repeated, unknown, without unit or with one of something else, a
         cell is not a number, or time does not increase; the line is named.
     """
-    grid = read_grid(path, decode(read_bytes(path), path))
+    grid = read_grid(decode(read_bytes(path)))
     if "t_s" in grid.columns and not mapped:
         _refuse_unknown(grid, wanted, all_of)
-    places = _found(grid, wanted, mapped or {})
+    places = _places(grid, wanted, mapped or {})
     t = places.pop(TIME.key, None)
     if len(places) < (len(wanted) if all_of else 1) or (timed and t is None):
         raise _other_columns(grid, wanted, all_of)
-    values = {key: _values(grid, column, blank_allowed) for key, column in places.items()}
-    if t is None:
-        return Columns(grid, np.arange(float(len(grid.rows))), values)
-    return Columns(grid, times_of(grid, *t), values)
-
-
-def times_of(grid: Grid, place: int, factor: float = 1.0) -> Array:
-    """The times in a column.
-
-    Raises
-    ------
-    InputError
-        If a cell is not a number, or time does not increase; the line is named.
-    """
-    t_s = factor * numbers(grid, [place], blank_allowed=False)[:, 0]
-    if fault := first_time_fault(t_s):
-        raise InputError(fault[1], grid.path, f"line {grid.lines[fault[0]]}")
-    return t_s
-
-
-def _values(grid: Grid, column: tuple[int, float], blank_allowed: bool) -> Array:
-    place, factor = column
-    values = factor * numbers(grid, [place], blank_allowed)[:, 0]
-    if np.isnan(values).all():
-        name = grid.columns[place]
-        raise InputError(f"column {name} is blank throughout; leave it out", grid.path)
-    return values
+    values = {}
+    for key, (place, factor) in places.items():
+        values[key] = factor * numbers(grid, [place], blank_allowed)[:, 0]
+        if np.isnan(values[key]).all():
+            raise InputError(f"column {grid.columns[place]} is blank throughout; leave it out")
+    t_s = np.arange(float(len(grid.rows))) if t is None else times_of(grid, *t)
+    return Columns(grid, t_s, values)
 
 
 # Which column -------------------------------------------------------------------------------------
 
 
-def _found(
+def _places(
     grid: Grid, wanted: Sequence[Quantity], mapped: Mapping[str, str]
 ) -> dict[str, tuple[int, float]]:
     """The column of each quantity that is there, and its unit in SI."""
     quantities = {quantity.key: quantity for quantity in (TIME, *wanted)}
     for key in mapped:
         if key not in quantities:
-            expected = f"expected one of {listed(quantities)}{hint_at(key, quantities)}"
-            raise InputError(f"columns has the key {key!r}; {expected}", grid.path)
+            expected = f"expected one of {', '.join(quantities)}{hint_at(key, quantities)}"
+            raise InputError(f"columns has the key {key!r}; {expected}")
     chosen = {key: _mapped(grid, quantities[key], name) for key, name in mapped.items()}
     sought = wanted if not chosen.keys() - {TIME.key} else ()
     recognised = {
@@ -188,18 +167,16 @@ def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
     bare, stated = name_and_unit(name)
     there = name if name in grid.columns else bare
     if grid.columns.count(there) != 1:
-        found = "is there twice" if there in grid.columns else "is not there"
-        raise _refused(
-            grid,
-            f"columns.{quantity.key} is {name!r}, which {found}; the columns are "
-            f"{listed(grid.columns)}{hint_at(name, grid.columns)}",
+        fault = "is there twice" if there in grid.columns else "is not there"
+        raise grid.refusal(
+            f"columns.{quantity.key} is {name!r}, which {fault}; the columns are "
+            f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
     unit = name_and_unit(there)[1] or stated
     if quantity in (STRAIN, STRESS) and _words(there) & _DEFORMED:
-        raise _refused(
-            grid,
+        raise grid.refusal(
             f"column {there} is of the deformed specimen; expected engineering "
-            f"{quantity.key}, by the undeformed length or area",
+            f"{quantity.key}, by the undeformed length or area"
         )
     factor = None if unit is None else si_factor(unit, quantity.dimension)
     if factor is None:
@@ -217,10 +194,9 @@ def column_of(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
     factors = {k: si_factor(unit, quantity.dimension) for k, unit in units.items() if unit}
     fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
     if len(fitting) > 1:
-        raise _refused(
-            grid,
-            f"the columns {listed(grid.columns[k] for k, _ in fitting)} may each be "
-            f'{quantity.key}; expected one, or columns = {{ {quantity.key} = "…" }} to say which',
+        raise grid.refusal(
+            f"the columns {', '.join(grid.columns[k] for k, _ in fitting)} may each be "
+            f'{quantity.key}; expected one, or columns = {{ {quantity.key} = "…" }} to say which'
         )
     if units and not fitting:
         first = next(iter(units))
@@ -249,10 +225,6 @@ def _words(name: str) -> set[str]:
 # Refusals -----------------------------------------------------------------------------------------
 
 
-def _refused(grid: Grid, message: str) -> InputError:
-    return InputError(message, grid.path, f"line {grid.names_line}")
-
-
 def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> None:
     known = {quantity.key for quantity in KNOWN}
     for column in grid.columns:
@@ -264,25 +236,23 @@ def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> Non
 def _other_columns(
     grid: Grid, wanted: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
-    expected = listed(quantity.column for quantity in wanted)
+    expected = ", ".join(quantity.column for quantity in wanted)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
         for quantity, size in ((STRAIN, "length_m"), (STRESS, "area_m2"))
         if quantity not in wanted and any(_is_called(column, quantity) for column in grid.columns)
     ]
-    return _refused(
-        grid,
-        f"the columns are {listed(grid.columns)}; expected {TIME.column} and "
+    return grid.refusal(
+        f"the columns are {', '.join(grid.columns)}; expected {TIME.column} and "
         f"{'all' if all_of else 'any'} of {expected}, each once, in these or other units"
-        f"{why}{''.join(needed)}",
+        f"{why}{''.join(needed)}"
     )
 
 
 def _other_unit(grid: Grid, column: str, unit: str | None, quantity: Quantity) -> InputError:
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
-    return _refused(
-        grid,
+    return grid.refusal(
         f"column {column} {has}; expected {expected_units(unit or '', quantity.dimension)}: "
-        f"{remedy}",
+        f"{remedy}"
     )

@@ -9,12 +9,11 @@ bones and their rotations are skipped; unlabelled markers are taken only if they
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 from ...errors import InputError
-from . import Choose, RawTracks
-from .text import Header, Row, grid, numbers, separated_rows
+from .text import Row, grid, separated_rows
+from .tracks import Choose, Header, RawTracks, tracks
 from .units import stated_unit
 
 BEGINNING = "Format Version"
@@ -30,45 +29,46 @@ class _Columns:
     places: tuple[int, int, int]
 
 
-def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: Choose) -> RawTracks:
     """Read a Motive CSV file."""
-    rows = separated_rows(text, path, ",")
+    rows = separated_rows(text, ",")
     first = rows[0]
     pairs = zip(first.cells[::2], first.cells[1::2], strict=False)
-    header = Header(path, {key: (text, first.line) for key, text in pairs})
+    header = Header({key: (text, first.line) for key, text in pairs})
     top = next((k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None)
     if top is None or top < 4 or not "".join(rows[top].cells[1:2]).startswith("Time"):
         raise InputError(
             "is no Motive CSV with markers: expected rows of Type, Name, ID and Position, then "
-            "'Frame,Time (Seconds),X,Y,Z,…'",
-            path,
+            "'Frame,Time (Seconds),X,Y,Z,…'"
         )
     heads = _heads(rows[1:top], rows[top])
-    columns = _marker_columns(path, heads, rows[top].line)
+    columns = _marker_columns(heads, rows[top].line)
     labels = list(columns)
-    chosen = [labels[k] for k in choose(labels, [n for n in labels if n.startswith("Unlabeled")])]
+    chosen = choose(labels, [name for name in labels if name.startswith("Unlabeled")])
     titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
-    table = grid(path, titles, rows[top + 1 :])
+    table = grid(titles, rows[top + 1 :])
     header.compare("Total Exported Frames", len(table.rows), "frames")
-    cells = [column for label in chosen for column in columns[label].places]
     rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
     (unit, _) = header.stated.get("Length Units", ("", 0))
-    return RawTracks(
-        labels=chosen,
-        coordinates=numbers(table, cells, blank_allowed=True).reshape(-1, len(chosen), 3),
-        unit=stated_unit(unit, path, "line 1, Length Units"),
+    raw = tracks(
+        table,
+        labels,
+        [each.places for each in columns.values()],
+        chosen,
+        time=1,
+        unit=stated_unit(unit, "line 1, Length Units"),
         unit_key="Length Units",
-        t_s=numbers(table, [1], blank_allowed=False)[:, 0],
         rate_hz=header.number(rate_key),
         rate_key=rate_key,
-        lines=table.lines,
-        notes=tuple(
-            f"{label}: has no measured columns; those of Type '{columns[label].kind}' were taken, "
-            "which Motive places by the rigid body it fits"
-            for label in chosen
-            if columns[label].kind != _MEASURED
-        ),
     )
+    solved = {label: columns[label].kind for label in raw.labels}
+    notes = (
+        f"{label}: has no measured columns; those of Type '{kind}' were taken, which Motive places "
+        "by the rigid body it fits"
+        for label, kind in solved.items()
+        if kind != _MEASURED
+    )
+    return replace(raw, notes=tuple(notes))
 
 
 def _heads(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
@@ -80,9 +80,7 @@ def _heads(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
     return list(zip(types, names, padded[-1], axes.cells, strict=True))
 
 
-def _marker_columns(
-    path: str | Path, heads: Sequence[tuple[str, str, str, str]], line: int
-) -> dict[str, _Columns]:
+def _marker_columns(heads: Sequence[tuple[str, str, str, str]], line: int) -> dict[str, _Columns]:
     """The columns of every marker by its name, measured ones before solved ones."""
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):
@@ -90,18 +88,14 @@ def _marker_columns(
             continue
         axes = by_kind.setdefault((name, kind), {})
         if axis in axes:
-            raise InputError(
-                f"two markers are named '{name}'; expected names that differ", path, f"line {line}"
-            )
+            message = f"two markers are named '{name}'; expected names that differ"
+            raise InputError(message, where=f"line {line}")
         axes[axis] = column
     columns: dict[str, _Columns] = {}
     for (name, kind), axes in by_kind.items():
         if sorted(axes) != ["X", "Y", "Z"]:
-            raise InputError(
-                f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z",
-                path,
-                f"line {line}",
-            )
+            message = f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z"
+            raise InputError(message, where=f"line {line}")
         if kind == _MEASURED or name not in columns:
             columns[name] = _Columns(kind, (axes["X"], axes["Y"], axes["Z"]))
     return dict(sorted(columns.items(), key=lambda item: item[1].places))

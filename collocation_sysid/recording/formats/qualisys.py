@@ -7,43 +7,39 @@ The file does not state its unit of length.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-from pathlib import Path
 
 from ...errors import InputError
-from . import Choose, RawTracks
-from .text import Header, Row, framed, tab_rows
+from .text import Row, tab_rows
+from .tracks import Choose, Header, RawTracks, framed
 
 BEGINNING = "NO_OF_"
 _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
 
 
-def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: Choose) -> RawTracks:
     """Read a Qualisys TSV file."""
     rows = tab_rows(text)
     count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
     above = {row.cells[0]: row for row in rows[:count]}
     if "MARKER_NAMES" not in above:
-        raise InputError(
-            "the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data", path
-        )
+        raise InputError("the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data")
     labels = [cell for cell in above["MARKER_NAMES"].cells[1:] if cell]
     stated = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
-    header = Header(path, stated)
+    header = Header(stated)
     header.compare("NO_OF_MARKERS", len(labels), "marker names")
     frames = rows[count:]
-    leading = _leading_columns(path, frames, 3 * len(labels))
+    leading = _leading_columns(frames, 3 * len(labels))
     if frames and _names_columns(frames[0]):
         del frames[0]
-    raw = framed(header, "NO_OF_FRAMES", "FREQUENCY", leading, labels, frames, choose)
-    return replace(raw, unit_key="a Qualisys TSV (QTM writes mm)")
+    said = {"unit_key": "a Qualisys TSV (QTM writes mm)"}
+    return framed(header, "NO_OF_FRAMES", "FREQUENCY", leading, labels, frames, choose, **said)
 
 
 def _names_columns(row: Row) -> bool:
     return any(re.match(r"[A-Za-z]", cell) and cell.lower() != "nan" for cell in row.cells[:3])
 
 
-def _leading_columns(path: str | Path, frames: list[Row], coordinates: int) -> list[str]:
+def _leading_columns(frames: list[Row], coordinates: int) -> list[str]:
     """The columns before the first coordinate, by their names, else by their number."""
     if not frames:
         return []
@@ -59,7 +55,6 @@ def _leading_columns(path: str | Path, frames: list[Row], coordinates: int) -> l
         raise InputError(
             f"{len(first.cells)} cells; expected {coordinates} coordinates, or Frame and Time "
             "before them",
-            path,
-            f"line {first.line}",
+            where=f"line {first.line}",
         )
     return ["Frame", "Time"][:extra]

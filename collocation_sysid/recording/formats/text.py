@@ -1,4 +1,7 @@
-"""Text files as rows of cells: reading, and turning cells into numbers."""
+"""Text files as tables: reading rows of cells below column names, and turning cells into numbers.
+
+Messages name lines; whoever reads a file adds its path.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,23 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError, excerpt
+from ...errors import InputError, excerpt, located
 from ...files import require_regular
-from . import Choose, RawTracks
+from ..clock import first_time_fault
+from .units import UNITS, si_factor
 
+P = ParamSpec("P")
+T = TypeVar("T")
 # Nothing measured is larger, and products of two such numbers are still numbers.
 LARGEST = 1e100
 _ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
@@ -24,6 +33,7 @@ _CONTROL, _SEPARATOR = re.compile("[\x01-\x08\x0e-\x1f]"), re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _POINTED = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
+_EMPTY = "is empty; expected a line of column names, then rows of numbers"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,15 +48,25 @@ class Row:
 class Grid:
     """Rows of equal length below column names."""
 
-    path: Path
     columns: list[str]
     rows: list[Row]
     names_line: int = 1
 
-    @property
-    def lines(self) -> list[int]:
-        """The line of each row."""
-        return [row.line for row in self.rows]
+    def refusal(self, message: str, row: int | None = None) -> InputError:
+        """What is wrong with a row, or with the names of the columns."""
+        line = self.names_line if row is None else self.rows[row].line
+        return InputError(message, where=f"line {line}")
+
+
+def of_file(read: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+    """A reader of a file, with the path in its messages."""
+
+    @wraps(read)
+    def reader(path: Any, *args: P.args, **kwargs: P.kwargs) -> T:
+        with located(path):
+            return read(path, *args, **kwargs)
+
+    return reader
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -61,10 +81,10 @@ def read_bytes(path: str | Path) -> bytes:
     try:
         return Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path) from error
+        raise InputError(f"cannot be read: {error.strerror}") from error
 
 
-def decode(content: bytes, path: str | Path) -> str:
+def decode(content: bytes) -> str:
     """Return the text that a file's content is: UTF-8, or as Windows and its machines write it.
 
     Raises
@@ -74,9 +94,9 @@ def decode(content: bytes, path: str | Path) -> str:
     """
     text = next(filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)), None)
     if text is None and content:
-        raise InputError("is not a CSV text file (UTF-8), nor any other format known here", path)
+        raise InputError("is not a CSV text file (UTF-8), nor any other format known here")
     if not text or not text.strip():
-        raise _empty(path)
+        raise InputError(_EMPTY)
     return text
 
 
@@ -92,11 +112,10 @@ def _decoded(content: bytes, encoding: str) -> str | None:
     return None if "\0" in text or odd else text
 
 
-def _empty(path: str | Path) -> InputError:
-    return InputError("is empty; expected a line of column names, then rows of numbers", path)
+# Rows ---------------------------------------------------------------------------------------------
 
 
-def separated_rows(text: str, path: str | Path, separator: str | None = None) -> list[Row]:
+def separated_rows(text: str, separator: str | None = None) -> list[Row]:
     """Rows of a file with this between its cells, or what most lines have; blank ones are skipped.
 
     Where that is no comma and no number has a point, the commas of numbers are points.
@@ -105,25 +124,21 @@ def separated_rows(text: str, path: str | Path, separator: str | None = None) ->
         lines = text.splitlines()
         shares = {mark: sum(mark in line for line in lines) / len(lines) for mark in ";\t"}
         separator = next((mark for mark, share in shares.items() if share > 0.5), ",")
-    rows = _cells(text, path, separator)
-    if separator == "," or any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
-        return rows
-    return [Row(row.line, [_pointed(cell) for cell in row.cells]) for row in rows]
-
-
-def _pointed(cell: str) -> str:
-    return cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
-
-
-def _cells(text: str, path: str | Path, separator: str) -> list[Row]:
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
         rows = [Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
-        raise InputError(f"is not a CSV text file: {error}", path) from error
+        raise InputError(f"is not a CSV text file: {error}") from error
     rows = [row for row in rows if any(row.cells)]
     if not rows:
-        raise _empty(path)
+        raise InputError(_EMPTY)
+    if separator != "," and not any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
+        for row in rows:
+            commas = [_DECIMAL_COMMA.fullmatch(cell) for cell in row.cells]
+            row.cells[:] = [
+                c.replace(",", ".") if comma else c
+                for c, comma in zip(row.cells, commas, strict=True)
+            ]
     return rows
 
 
@@ -133,7 +148,7 @@ def tab_rows(text: str) -> list[Row]:
     return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def grid(path: str | Path, columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
+def grid(columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
     """Return rows as wide as their column names; blank columns at the end of all rows are cut.
 
     Raises
@@ -142,19 +157,51 @@ def grid(path: str | Path, columns: list[str], rows: list[Row], names_line: int 
         If there is no row, or one is of another length.
     """
     if not rows:
-        raise InputError("has column names but no rows of numbers", path)
+        raise InputError("has column names but no rows of numbers")
     width = len(columns)
     common = len(rows[0].cells)
     if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
-    for row in rows:
+    table = Grid(columns, rows, names_line)
+    for k, row in enumerate(rows):
         if len(row.cells) != width:
-            raise InputError(
-                f"{len(row.cells)} cells, but the header has {width} columns",
-                path,
-                f"line {row.line}",
-            )
-    return Grid(Path(path), columns, rows, names_line)
+            raise table.refusal(f"{len(row.cells)} cells, but the header has {width} columns", k)
+    return table
+
+
+def read_grid(text: str) -> Grid:
+    """Return a file of separated cells with a row of column names.
+
+    What a machine writes above the names is left out; units in a row of their own are joined to
+    the names, as in "Load (N)".
+
+    Raises
+    ------
+    InputError
+        If it is none, has no rows, or rows of different lengths.
+    """
+    rows = separated_rows(text)
+    # The names are above the first row that holds several cells, of numbers only.
+    numeric = (
+        k
+        for k, row in enumerate(rows)
+        if len(row.cells) > 1 and all(is_number(c.replace(",", ".")) for c in row.cells if c)
+    )
+    names = 0 if "t_s" in rows[0].cells else max(next(numeric, 0) - 1, 0)
+    header = rows[names].cells
+    if names and all(map(_is_unit, header)):
+        above = rows[names - 1].cells
+        header = [f"{a} ({u.strip('()[]')})" for a, u in zip_longest(above, header, fillvalue="")]
+    return grid(header, rows[names + 1 :], rows[names].line)
+
+
+def _is_unit(cell: str) -> bool:
+    bare = cell.strip("()[]")
+    bracketed = cell in (f"({bare})", f"[{bare}]")
+    return not bare or bracketed or any(si_factor(bare, dimension) for dimension in UNITS)
+
+
+# Cells --------------------------------------------------------------------------------------------
 
 
 def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
@@ -174,15 +221,25 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
             except ValueError:
                 value = math.inf
             if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
-                or_blank = " or a blank cell" if blank_allowed else ""
-                raise InputError(
-                    f"column {grid.columns[column]} holds '{excerpt(cell)}'; expected a "
-                    f"number{or_blank}",
-                    grid.path,
-                    f"line {row.line}",
-                )
+                wanted = "a number or a blank cell" if blank_allowed else "a number"
+                name = grid.columns[column]
+                raise grid.refusal(f"column {name} holds '{excerpt(cell)}'; expected {wanted}", i)
             values[i, j] = value
     return values
+
+
+def times_of(grid: Grid, place: int, factor: float = 1.0) -> Array:
+    """The times in a column.
+
+    Raises
+    ------
+    InputError
+        If a cell is not a number, or time does not increase; the line is named.
+    """
+    t_s = factor * numbers(grid, [place], blank_allowed=False)[:, 0]
+    if fault := first_time_fault(t_s):
+        raise grid.refusal(fault[1], fault[0])
+    return t_s
 
 
 def is_number(cell: str) -> bool:
@@ -195,90 +252,3 @@ def written_number(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(f"found {text!r}")
     return float(text)
-
-
-@dataclass(frozen=True)
-class Header:
-    """What a file states above its frames.
-
-    Attributes
-    ----------
-    path : str or Path
-    stated : mapping of a key to its text and line
-    """
-
-    path: str | Path
-    stated: Mapping[str, tuple[str, int]]
-
-    def number(self, key: str) -> float | None:
-        """The number that a key states; None where it is blank.
-
-        Raises
-        ------
-        InputError
-            If it is no number above 0.
-        """
-        text, line = self.stated.get(key, ("", 0))
-        if not text:
-            return None
-        try:
-            value = written_number(text)
-        except ValueError:
-            value = math.nan
-        if not 0 < value < math.inf:
-            message = f"{key} is '{text}'; expected a number above 0"
-            raise InputError(message, self.path, f"line {line}")
-        return value
-
-    def compare(self, key: str, count: int, what: str, line: int | None = None) -> None:
-        """Raise an `InputError` if it states another count than there is."""
-        stated = self.number(key)
-        if stated is not None and stated != count:
-            raise InputError(
-                f"{key} is {stated:g}, but {count} {what} are there; is the file cut short?",
-                self.path,
-                f"line {line or self.stated[key][1]}",
-            )
-
-
-def framed(
-    header: Header,
-    counted: str,
-    rate: str,
-    leading: Sequence[str],
-    labels: Sequence[str],
-    frames: list[Row],
-    choose: Choose,
-) -> RawTracks:
-    """Tracks of a table of frames: some columns, then x, y and z of each marker.
-
-    Parameters
-    ----------
-    header : Header
-    counted, rate : str
-        Keys of the number of frames, and of their rate.
-    leading : sequence of str
-        Columns before those of the markers.
-    labels : sequence of str
-    frames : list of Row
-    choose : Choose
-    """
-    chosen = choose(labels)
-    titles = [f"{label} {axis}" for label in labels for axis in "XYZ"]
-    table = grid(header.path, [*leading, *titles], frames)
-    header.compare(counted, len(frames), "frames")
-    columns = [len(leading) + 3 * k + axis for k in chosen for axis in range(3)]
-    timed = "Time" in leading
-    return RawTracks(
-        labels=[labels[k] for k in chosen],
-        coordinates=numbers(table, columns, blank_allowed=True).reshape(-1, len(chosen), 3),
-        t_s=numbers(table, [leading.index("Time")], blank_allowed=False)[:, 0] if timed else None,
-        rate_hz=header.number(rate),
-        rate_key=rate,
-        lines=table.lines,
-    )
-
-
-def listed(names: Iterable[str]) -> str:
-    """Names with commas between them."""
-    return ", ".join(names)

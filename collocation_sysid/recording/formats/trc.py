@@ -6,42 +6,35 @@ Units …); line 4 Frame#, Time and the marker names, line 5 X1, Y1, Z1 …; the
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 from ...errors import InputError
-from . import Choose, RawTracks
-from .text import Header, framed, listed, tab_rows
+from .text import tab_rows
+from .tracks import Choose, Header, RawTracks, framed
 from .units import stated_unit
 
 BEGINNING = "PathFileType"
 _KEYS = ("DataRate", "NumFrames", "NumMarkers", "Units")
 
 
-def read(path: str | Path, text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: Choose) -> RawTracks:
     """Read a TRC file."""
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
-        raise InputError("ends within the header of a TRC file", path, f"line {rows[-1].line}")
+        raise InputError("ends within the header of a TRC file", where=f"line {rows[-1].line}")
     _, keys, values, names, axes, *frames = rows
     stated = zip(values.cells, [values.line] * len(keys.cells), strict=False)
-    header = Header(path, dict(zip(keys.cells, stated, strict=False)))
+    header = Header(dict(zip(keys.cells, stated, strict=False)))
     if missing := [key for key in _KEYS if key not in header.stated]:
-        raise InputError(
-            f"the header lacks {listed(missing)}; found {listed(filter(None, keys.cells))}",
-            path,
-            f"line {keys.line}",
-        )
-    unit = stated_unit(header.stated["Units"][0], path, f"line {values.line}")
+        there = ", ".join(filter(None, keys.cells))
+        message = f"the header lacks {', '.join(missing)}; found {there}"
+        raise InputError(message, where=f"line {keys.line}")
+    unit = stated_unit(header.stated["Units"][0], f"line {values.line}")
     labels = [cell for cell in names.cells[2:] if cell]
     if names.cells[0] != "Frame#" or axes.cells[0]:
         raise InputError(
-            f"found {listed(filter(None, names.cells[:3]))}; expected Frame#, Time and the names "
-            "of the markers, and X1, Y1, Z1 … below them",
-            path,
-            f"line {names.line}",
+            f"found {', '.join(filter(None, names.cells[:3]))}; expected Frame#, Time and the "
+            "names of the markers, and X1, Y1, Z1 … below them",
+            where=f"line {names.line}",
         )
     header.compare("NumMarkers", len(labels), "marker names", names.line)
-    leading = ["Frame#", "Time"]
-    raw = framed(header, "NumFrames", "DataRate", leading, labels, frames, choose)
-    return replace(raw, unit=unit, unit_key="Units")
+    leading, said = ["Frame#", "Time"], {"unit": unit, "unit_key": "Units"}
+    return framed(header, "NumFrames", "DataRate", leading, labels, frames, choose, **said)

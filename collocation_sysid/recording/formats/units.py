@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from ...errors import InputError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -48,7 +46,7 @@ def expected_units(unit: str, dimension: str) -> str:
     return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
 
 
-def stated_unit(text: str, path: str | Path, where: str) -> str | None:
+def stated_unit(text: str, where: str) -> str | None:
     """Return the unit that a file's own words mean; None where it leaves them blank.
 
     Raises
@@ -58,11 +56,9 @@ def stated_unit(text: str, path: str | Path, where: str) -> str | None:
     """
     word = text.strip().lower()
     if word and word not in _SPELLINGS:
-        raise InputError(
-            f"the unit of length is '{text.strip()}'; expected one of {', '.join(METRES_PER_UNIT)}",
-            path,
-            where,
-        )
+        expected = ", ".join(METRES_PER_UNIT)
+        message = f"the unit of length is '{text.strip()}'; expected one of {expected}"
+        raise InputError(message, where=where)
     return _SPELLINGS.get(word)
 
 
