@@ -14,19 +14,20 @@ from ...arrays import Array
 from ...errors import InputError
 from ...program.rest import rest_state
 from .identified import Identified, IdentifiedRegion
-from .target import Comparison, Exported, heading, left_out, mean_dilatation_lost
+from .target import Comparison, Exported, Holds, heading
 
 DECK = "body.inp"
 LONGEST_S = 600.0
 # Of U = Σ (J − 1)^2i / D_i beyond the first: a zero is taken for a very stiff term.
 NO_TERM = 1e20
 # C_i of Arruda and Boyce's series.
+HOLDS = Holds({}, instead="", mass_damping="", forces="", quadratic=True)
 _CHAINS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 
 def export(body: Identified) -> Exported:
     """The deck of one static step, as large as the loads are."""
-    limits = left_out(body, moving=False) + mean_dilatation_lost(body)
+    limits = HOLDS.lost(body)
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
     for k, region in enumerate(body.regions):
@@ -37,10 +38,10 @@ def export(body: Identified) -> Exported:
             f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
         )
     limits.append("damping is not exported: an equilibrium has none")
-    if body.body.element.nodes == 10:
+    if body.quadratic:
         limits.append("the weight of an element is spread by its shape functions, ours is lumped")
     mesh = f"*NODE,NSET=ALL\n{_rows(body.nodes_m)}"
-    kind = "C3D10" if body.body.element.nodes == 10 else "C3D4"
+    kind = "C3D10" if body.quadratic else "C3D4"
     for k, region in enumerate(body.regions):
         cells = body.body.cells[region.cells] + 1
         lines = (", ".join(map(str, (n + 1, *c))) for n, c in zip(region.cells, cells, strict=True))
@@ -53,7 +54,7 @@ def export(body: Identified) -> Exported:
 def _step(body: Identified, linear: bool) -> str:
     """Grasped nodes where they are held, gravity, and what else pulls."""
     held = np.argwhere(body.held)
-    moved = body.held_m - body.nodes_m
+    moved = body.moved_m
     boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(float(moved[n, a]))}\n" for n, a in held)
     pulled = np.argwhere(body.loads_n)
     loads = "".join(f"{n + 1},{a + 1},{_fields(float(body.loads_n[n, a]))}\n" for n, a in pulled)

@@ -5,30 +5,34 @@ from __future__ import annotations
 import numpy as np
 
 from .identified import Identified, IdentifiedRegion
-from .target import Exported, heading, left_out, mean_dilatation_lost, numbers
+from .target import Exported, Holds, heading, numbers
 
 MODEL = "body.feb"
 # Number of the volumetric energy ½ κ (J − 1)² among those of an uncoupled material.
 SQUARE = 2
+HOLDS = Holds(
+    {
+        "mooney-rivlin": "Mooney-Rivlin",
+        "neo-hookean": "neo-Hookean",
+        "st-venant-kirchhoff": "St.Venant-Kirchhoff",
+        "linear": "isotropic elastic",
+    },
+    stiffness_damping="γ_r = {gamma_r_s:.4g} s is not exported",
+    mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not exported; in a dynamic step a body load "
+    '"mass damping" is it',
+    memory=True,
+    forces="",
+    quadratic=True,
+    tried=False,
+)
 
 
 def export(body: Identified) -> Exported:
     """A static step, over which the weight grows."""
-    limits = left_out(body, memory=True, moving=False) + mean_dilatation_lost(body)
+    limits = HOLDS.lost(body)
     materials = "".join(_material(k, region, limits) for k, region in enumerate(body.regions, 1))
-    for region in body.regions:
-        if region.gamma_r_s:
-            limits.append(f"{region.name}: γ_r = {region.gamma_r_s:.4g} s is not exported")
-        if region.gamma_m_1_s:
-            limits.append(
-                f"{region.name}: γ_m = {region.gamma_m_1_s:.4g} 1/s is not exported; in a dynamic "
-                'step a body load "mass damping" is it'
-            )
     if body.loads_n.any():
         limits.append("point masses and forces on nodes are left out")
-    limits.append(
-        "untested: written after the description of the format, never read by FEBio itself"
-    )
     xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + heading(body, limits, "<!-- ", " -->")
     xml += '<febio_spec version="4.0">\n<Module type="solid"/>\n'
     xml += (
@@ -74,31 +78,20 @@ def _law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, fl
     """Type of the material, its constants, and whether it is split in shape and volume."""
     c = region.constants
     if region.material == "mooney-rivlin":
-        return "Mooney-Rivlin", {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
+        return HOLDS.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
     moduli = {"E": region.young_pa, "v": region.poisson}
-    kinds = {
-        "neo-hookean": "neo-Hookean",
-        "st-venant-kirchhoff": "St.Venant-Kirchhoff",
-        "linear": "isotropic elastic",
-    }
     if region.material == "linear":
         limits.append(f"{region.name}: a linear material turns with the body there, ours does not")
-    if region.material not in kinds:
-        limits.append(
-            f"{region.name}: {region.material} becomes the neo-Hookean material of the same λ "
-            "and μ at small strain"
-        )
-    return kinds.get(region.material, "neo-Hookean"), moduli, False
+    return HOLDS.materials.get(region.material, "neo-Hookean"), moduli, False
 
 
 def _mesh(body: Identified) -> str:
-    quadratic = body.body.element.nodes == 10
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):
         xml += f'<node id="{k}">{numbers(point, ",")}</node>\n'
     xml += "</Nodes>\n"
     for region in body.regions:
-        kind = "tet10" if quadratic else "tet4"
+        kind = "tet10" if body.quadratic else "tet4"
         xml += f'<Elements type="{kind}" name="cells_{region.name}">\n'
         for cell, nodes in zip(region.cells, body.body.cells[region.cells] + 1, strict=True):
             xml += f'<elem id="{cell + 1}">{",".join(map(str, nodes))}</elem>\n'
@@ -111,9 +104,8 @@ def _mesh(body: Identified) -> str:
         f'<SolidDomain name="cells_{region.name}" mat="{region.name}"/>\n'
         for region in body.regions
     )
-    moved = np.nan_to_num(body.held_m - body.nodes_m)
     maps = ""
-    for axis, held, way in zip("xyz", body.held.T, moved.T, strict=True):
+    for axis, held, way in zip("xyz", body.held.T, body.moved_m.T, strict=True):
         if way.any():
             rows = "".join(
                 f'<node lid="{i}">{float(v)!r}</node>' for i, v in enumerate(way[held], 1)
@@ -125,8 +117,8 @@ def _mesh(body: Identified) -> str:
 
 def _boundary(body: Identified) -> str:
     """Held where they are, or moved to where another grasp holds them."""
-    conditions, moved = "", np.nan_to_num(body.held_m - body.nodes_m)
-    for axis, held, way in zip("xyz", body.held.T, moved.T, strict=True):
+    conditions = ""
+    for axis, held, way in zip("xyz", body.held.T, body.moved_m.T, strict=True):
         where = f'name="hold_{axis}" node_set="held_{axis}"'
         if way.any():
             conditions += (

@@ -176,6 +176,21 @@ class Identified:
         """(n, 3) where, NaN where a coordinate is free."""
         return self.experiment.grasped([self.start_s])[1][0]
 
+    @property
+    def grasped(self) -> NDArray[np.bool_]:
+        """(n,) which nodes are held along all axes at the first sample."""
+        return np.asarray(self.held.all(axis=1))
+
+    @cached_property
+    def moved_m(self) -> Array:
+        """(n, 3) how far held coordinates are from where the first grasp has the body, else 0."""
+        return np.nan_to_num(self.held_m - self.nodes_m)
+
+    @property
+    def quadratic(self) -> bool:
+        """Whether its elements have nodes on their edges."""
+        return self.body.element.nodes == 10
+
     @cached_property
     def tied_kg(self) -> Array:
         """(n,) point masses at the first sample."""
@@ -185,6 +200,11 @@ class Identified:
     def node_mass_kg(self) -> Array:
         """(n,) of the body, lumped, without what is tied to it."""
         return self.body.mass_of_dofs(self.theta)[::3]
+
+    @cached_property
+    def mass_kg(self) -> Array:
+        """(n,) with what is tied to it."""
+        return self.node_mass_kg + self.tied_kg
 
     @cached_property
     def loads_n(self) -> Array:

@@ -19,15 +19,7 @@ from ...model.forces import Forces
 from ...program.modes import natural_modes
 from ...recording import Grasp
 from .identified import Identified
-from .target import (
-    LINEAR_ONLY,
-    Comparison,
-    Exported,
-    heading,
-    left_out,
-    linear_cells,
-    numbers,
-)
+from .target import Comparison, Exported, Holds, heading, linear_cells, numbers
 
 MODEL = "body.xml"
 # Share of the largest step at which explicit damping and elasticity are stable.
@@ -39,6 +31,16 @@ HEAVY = 1e3
 # How far nodes are moved to see the stiffness, in mean edges.
 PROBE = 1e-5
 MOST_STEPS = 2_000_000
+HOLDS = Holds(
+    {"st-venant-kirchhoff": "flex"},
+    "a flex is St. Venant and Kirchhoff's; {material} has the same E and ν at small strain, "
+    "another stress from its second order on",
+    "the damping of a flex is γ_r times the rate of its second Piola–Kirchhoff stress, which is "
+    "that of {damping} at small strain",
+    "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
+    "nodes of a flex",
+    motion=True,
+)
 
 
 def export(body: Identified) -> Exported:
@@ -56,7 +58,12 @@ def export(body: Identified) -> Exported:
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
                 "throughout: export to calculix or json"
             )
-    limits = _limits(body)
+    limits = HOLDS.lost(body)
+    if body.experiment.grasps:
+        limits.append(
+            "the weld of grasped nodes to the mocap bodies lags two steps behind: for a motion, "
+            "set position and velocity of the free joints at every step, as --verify does"
+        )
     step_s = _step_s(body)
     x = heading(body, limits, "<!-- ", " -->")
     x += f"<mujoco model={quoteattr(body.title or 'body')}>\n"
@@ -67,40 +74,6 @@ def export(body: Identified) -> Exported:
     x += f"<equality>\n{_welds(body, step_s)}</equality>\n"
     x += f"<keyframe>\n{_start(body)}</keyframe>\n"
     return Exported({MODEL: f"{x}</mujoco>\n"}, tuple(limits))
-
-
-def _limits(body: Identified) -> list[str]:
-    said = left_out(body)
-    for region in body.regions:
-        if region.material != "st-venant-kirchhoff":
-            said.append(
-                f"{region.name}: a flex is St. Venant and Kirchhoff's; {region.material} has "
-                "the same E and ν at small strain, another stress from its second order on"
-            )
-        if region.gamma_r_s:
-            said.append(
-                f"{region.name}: the damping of a flex is γ_r times the rate of its second "
-                f"Piola–Kirchhoff stress, which is that of {region.damping} at small strain"
-            )
-        if region.gamma_m_1_s:
-            said.append(
-                f"{region.name}: damping by mass, γ_m = {region.gamma_m_1_s:.4g} 1/s, is "
-                "not known, and MuJoCo refuses dampers on the nodes of a flex"
-            )
-    if body.body.element.nodes == 10:
-        said.append(LINEAR_ONLY)
-    if body.experiment.grasps:
-        said.append(
-            "the weld of grasped nodes to the mocap bodies lags two steps behind: for a motion, "
-            "set position and velocity of the free joints at every step, as --verify does"
-        )
-    if body.experiment.forces:
-        said.append("forces on nodes are left out")
-    return said
-
-
-def _grasped(body: Identified) -> Any:
-    return body.held.all(axis=1)
 
 
 def _grasps(body: Identified) -> str:
@@ -137,8 +110,8 @@ def _pose(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
 
 def _nodes(body: Identified) -> str:
     """Every node that is free as a body on three slides."""
-    lines, mass = "", body.node_mass_kg + body.tied_kg
-    for n in np.flatnonzero(~_grasped(body)):
+    lines, mass = "", body.mass_kg
+    for n in np.flatnonzero(~body.grasped):
         slides = "".join(
             f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
@@ -179,7 +152,7 @@ def _edge_m(body: Identified) -> float:
 
 def _start(body: Identified) -> str:
     """Displacements and velocities at the first sample, as we simulate it."""
-    free = ~_grasped(body)
+    free = ~body.grasped
     shape = body.nodes_m if body.rolled_out_m is None else body.rolled_out_m[0]
     given = body.experiment.start_velocities_m_s
     velocity = np.zeros_like(shape) if given is None else given
@@ -237,7 +210,7 @@ def _mujoco() -> ModuleType:
 
 def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
     """Of the undeformed body: MuJoCo's by differences of its forces, and ours."""
-    data, free, grasps = mujoco.MjData(model), ~_grasped(body), len(body.experiment.grasps)
+    data, free, grasps = mujoco.MjData(model), ~body.grasped, len(body.experiment.grasps)
     probe, count = PROBE * _edge_m(body), 3 * int(free.sum())
     columns = np.zeros((count, count))
     for column in range(count):
@@ -248,7 +221,7 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
             mujoco.mj_forward(model, data)
             ends.append(data.qfrc_passive[6 * grasps :].copy())
         columns[:, column] = (ends[1] - ends[0]) / (2 * probe)
-    mass = np.repeat((body.node_mass_kg + body.tied_kg)[free], 3)
+    mass = np.repeat((body.mass_kg)[free], 3)
     root = 1 / np.sqrt(mass)
     squares = eigh((columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True)
     oscillating = squares[squares > 1e-9 * squares[-1]]
@@ -261,7 +234,7 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
 
 def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
     """The recording: how far nodes move besides rigidly, in MuJoCo and in our simulation."""
-    e, free = body.experiment, ~_grasped(body)
+    e, free = body.experiment, ~body.grasped
     data = mujoco.MjData(model)
     model.eq_active0[:] = 0
     mujoco.mj_resetDataKeyframe(model, data, 0)

@@ -8,10 +8,16 @@ import numpy as np
 
 from ...tree import content
 from .identified import Identified
-from .target import LINEAR_ONLY, Exported, heading, left_out, linear_cells
+from .target import Exported, Holds, heading, linear_cells
 
 MODULE = "body.py"
 NUMBERS = "body.json"
+HOLDS = Holds(
+    {"stable-neo-hookean": "soft mesh"},
+    "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
+    "damping γ_r becomes a viscosity, γ_r μ / 2 in Pa s, of shape alone: changes of volume are "
+    "damped less",
+)
 _BUILD = '''
 import json
 from pathlib import Path
@@ -57,34 +63,18 @@ def export(body: Identified) -> Exported:
     The elastic constants are those of `SolverVBD`, whose energy is the stable neo-Hookean one of λ
     and μ (Smith, de Goes & Kim 2018).
     """
-    limits = left_out(body, moving=False)
     cells, constants = [], []
     for region, own in zip(body.regions, linear_cells(body), strict=True):
         cells.append(own)
         # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
         damping = region.gamma_r_s * region.mu_pa / 2
         constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
-        if region.material != "stable-neo-hookean":
-            limits.append(
-                f"{region.name}: {region.material} becomes the stable neo-Hookean energy of the "
-                "same λ and μ at small strain"
-            )
-        if region.gamma_r_s:
-            limits.append(
-                f"{region.name}: damping γ_r becomes a viscosity, γ_r μ / 2 in Pa s, of shape "
-                "alone: changes of volume are damped less"
-            )
-        if region.gamma_m_1_s:
-            limits.append(f"{region.name}: γ_m = {region.gamma_m_1_s:.4g} 1/s is not known")
-    if body.body.element.nodes == 10:
-        limits.append(LINEAR_ONLY)
-    limits += [
+    limits = [
+        *HOLDS.lost(body),
         "SolverSemiImplicit takes other constants for the same material, k_mu = 4/3 μ and "
         "k_lambda = λ + 5/6 μ, and another damping",
         "positions are single precision; a USD file would hold E, ν and density, but no damping",
     ]
-    if body.experiment.forces:
-        limits.append("forces on nodes are left out")
     k_mu, k_lambda, k_damp = np.concatenate(constants).T
     numbers = {
         "nodes_m": np.where(body.held, body.held_m, body.nodes_m),
@@ -92,8 +82,8 @@ def export(body: Identified) -> Exported:
         "k_mu": k_mu,
         "k_lambda": k_lambda,
         "k_damp": k_damp,
-        "node_mass_kg": body.node_mass_kg + body.tied_kg,
-        "held": body.held.all(axis=1),
+        "node_mass_kg": body.mass_kg,
+        "held": body.grasped,
         "gravity_m_s2": body.experiment.gravity_m_s2,
     }
     files = {

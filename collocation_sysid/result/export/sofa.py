@@ -6,7 +6,7 @@ import numpy as np
 
 from ...errors import InputError
 from .identified import Identified, IdentifiedRegion
-from .target import Exported, heading, left_out, numbers
+from .target import Exported, Holds, heading, numbers
 
 SCENE = "body.scn"
 PLUGINS = (
@@ -19,6 +19,23 @@ PLUGINS = (
     "StateContainer",
     "Topology.Container.Dynamic",
 )
+VERSIONS = (
+    "NeoHookean is that of λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in the versions of SOFA "
+    "that have StableNeoHookean too; older ones take other constants"
+)
+HOLDS = Holds(
+    {
+        "neo-hookean": "NeoHookean",
+        "stable-neo-hookean": "StableNeoHookean",
+        "st-venant-kirchhoff": "StVenantKirchhoff",
+        "linear": "linear",
+    },
+    stiffness_damping="the damping is Rayleigh's, here {damping}: the same at small strain, but it "
+    "brakes that a stretched body turns",
+    mass_damping="",
+    damping="rayleigh",
+    tried=False,
+)
 
 
 def export(body: Identified) -> Exported:
@@ -29,25 +46,19 @@ def export(body: Identified) -> Exported:
     InputError
         For quadratic elements, several regions, or grasps of single axes.
     """
-    if body.body.element.nodes != 4 or len(body.regions) != 1:
+    if body.quadratic or len(body.regions) != 1:
         raise InputError(
             f"the body has {len(body.regions)} region(s) of {body.body.element.name}; the scene "
             "for SOFA takes one of linear tetrahedra: export to calculix, febio or json"
         )
-    if (body.held.any(axis=1) != body.held.all(axis=1)).any():
+    if (body.held.any(axis=1) != body.grasped).any():
         raise InputError("a grasp holds single axes, which the scene for SOFA does not take")
     region = body.regions[0]
-    limits, force = left_out(body, moving=False), _law(region)
-    limits += _limits(region)
-    if (body.held & (np.abs(body.held_m - body.nodes_m) > 1e-9)).any():
+    limits, force = [*HOLDS.lost(body), VERSIONS], _law(region)
+    if (np.abs(body.moved_m) > 1e-9).any():
         limits.append("grasps beside the first hold the body undeformed, not where they hold it")
-    if body.experiment.forces:
-        limits.append("forces on nodes are left out")
-    limits.append(
-        "untested: written after the descriptions of its components, never read by SOFA itself"
-    )
-    mass = numbers(body.node_mass_kg + body.tied_kg)
-    held = " ".join(map(str, np.flatnonzero(body.held.all(axis=1))))
+    mass = numbers(body.mass_kg)
+    held = " ".join(map(str, np.flatnonzero(body.grasped)))
     cells = " ".join(map(str, body.body.cells.ravel()))
     x = '<?xml version="1.0"?>\n' + heading(body, limits, "<!-- ", " -->")
     x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
@@ -71,32 +82,8 @@ def _law(region: IdentifiedRegion) -> str:
             '<TetrahedronFEMForceField method="small" '
             f'youngModulus="{region.young_pa!r}" poissonRatio="{region.poisson!r}"/>'
         )
-    names = {"st-venant-kirchhoff": "StVenantKirchhoff", "stable-neo-hookean": "StableNeoHookean"}
+    name = HOLDS.materials.get(region.material, "NeoHookean")
     moduli = numbers((region.mu_pa, region.lambda_pa))
     return (
-        "<TetrahedronHyperelasticityFEMForceField "
-        f'materialName="{names.get(region.material, "NeoHookean")}" ParameterSet="{moduli}"/>'
+        f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
     )
-
-
-def _limits(region: IdentifiedRegion) -> list[str]:
-    said = [
-        "NeoHookean is that of λ and μ (½ λ ln² J − μ ln J + ½ μ (I₁ − 3)) in the versions of SOFA "
-        "that have StableNeoHookean too; older ones take other constants"
-    ]
-    if region.material not in (
-        "neo-hookean",
-        "stable-neo-hookean",
-        "st-venant-kirchhoff",
-        "linear",
-    ):
-        said.append(
-            f"{region.material} becomes the neo-Hookean material of the same λ and μ at "
-            "small strain"
-        )
-    if region.damping != "rayleigh" and region.gamma_r_s:
-        said.append(
-            "the damping is Rayleigh's, here Kelvin and Voigt's: the same at small strain, but it "
-            "brakes that a stretched body turns"
-        )
-    return said

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,21 @@ from .identified import Identified
 LINEAR_ONLY = (
     "quadratic tetrahedra are split into eight linear ones on the same nodes: too stiff in bending "
     "and near ν = ½"
+)
+MEAN_DILATATION = (
+    "tet10-p0 becomes the plain quadratic tetrahedron: where ν is near ½ it is too stiff "
+    "(ν = {worst:.4g} here)"
+)
+MEMORY = (
+    "memory is not known; the stiffness is the long-term one, at once it is {at_once:.4g} "
+    "times that"
+)
+MOTION = (
+    "grasped nodes are held where they are at the first sample; poses_1.csv and so on have the "
+    "motion, which something has to drive"
+)
+UNTRIED = (
+    "untested: written after the description of the format, never read by the simulator itself"
 )
 
 
@@ -67,51 +82,83 @@ class Target:
     verify: Callable[[Identified, Path], Sequence[Comparison]] | None = None
 
 
-def left_out(body: Identified, memory: bool = False, moving: bool = True) -> list[str]:
-    """What no target of ours takes, or those that know no memory and no moving boundary."""
-    e, said = body.experiment, []
-    if e.actuators:
-        said.append("tendons and pressures are not exported")
-    if e.body.forces:
-        said.append(f"{', '.join(f.name for f in e.body.forces)} of your own is not exported")
-    times = e.t_s
-    if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
-        said.append("forces and point masses stay as they are at the first sample")
-    if not memory:
+@dataclass(frozen=True)
+class Holds:
+    """What a simulator holds of a body, so that what it does not is told alike by all.
+
+    Attributes
+    ----------
+    materials : mapping of a material's name to its own; what all others become is in `instead`
+    instead : str
+        With places for the `material` and the region's constants, as `stiffness_damping` and
+        `mass_damping` have; what these say where a body has them, empty where they are held.
+    damping : str
+        The law of its own, of which nothing is said.
+    memory, motion, quadratic : bool
+        Branches of memory; grasps that move; elements with nodes on their edges, which are split
+        where they are not held.
+    forces : str
+        What is said where forces act on nodes, empty where they are held.
+    tried : bool
+        Whether the simulator itself has ever read such files.
+    """
+
+    materials: Mapping[str, str]
+    instead: str = "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
+    stiffness_damping: str = ""
+    mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not known"
+    damping: str = ""
+    memory: bool = False
+    motion: bool = False
+    forces: str = "forces on nodes are left out"
+    quadratic: bool = False
+    tried: bool = True
+
+    def lost(self, body: Identified) -> list[str]:
+        """What it does not hold of a body, and what was done instead."""
+        said = [*_never_held(body)]
         for region in body.regions:
-            if region.branches:
-                at_once = 1 + sum(branch.share for branch in region.branches)
-                said.append(
-                    f"{region.name}: memory is not known; the stiffness is the long-term one, at "
-                    f"once it is {at_once:.4g} times that"
-                )
-    if not moving:
-        said.append(
-            "grasped nodes are held where they are at the first sample; poses_1.csv and so on have "
-            "the motion, which something has to drive"
-        )
+            damped = bool(region.gamma_r_s)
+            told = [
+                *[MEMORY] * (bool(region.branches) and not self.memory),
+                *[self.instead] * (region.material not in self.materials),
+                *[self.stiffness_damping] * (damped and region.damping != self.damping),
+                *[self.mass_damping] * bool(region.gamma_m_1_s),
+            ]
+            at_once = 1 + sum(branch.share for branch in region.branches)
+            values = {**vars(region), "at_once": at_once}
+            said += [f"{region.name}: {each.format(**values)}" for each in filter(None, told)]
+        if not self.motion:
+            said.append(MOTION)
+        if body.quadratic and not self.quadratic:
+            said.append(LINEAR_ONLY)
+        elif body.body.element.mean_dilatation:
+            worst = max(region.poisson for region in body.regions)
+            said.append(MEAN_DILATATION.format(worst=worst))
+        if body.experiment.forces and self.forces:
+            said.append(self.forces)
+        return said if self.tried else [*said, UNTRIED]
+
+
+def _never_held(body: Identified) -> Iterator[str]:
+    """What no target of ours takes."""
+    e, times = body.experiment, body.experiment.t_s
+    if e.actuators:
+        yield "tendons and pressures are not exported"
+    if e.body.forces:
+        yield f"{', '.join(f.name for f in e.body.forces)} of your own is not exported"
+    if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
+        yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.holds(times).all() for grasp in e.grasps):
-        said.append("grasps that begin or end to hold within the recording stay as they begin")
-    return said
+        yield "grasps that begin or end to hold within the recording stay as they begin"
 
 
 def linear_cells(body: Identified) -> list[Index]:
     """(k, 4) of each region; quadratic cells are split on the same nodes."""
-    if body.body.element.nodes == 4:
+    if not body.quadratic:
         return [body.body.cells[region.cells] for region in body.regions]
     eight = split_in_eight(body.body.mesh).tetrahedra.reshape(-1, 8, 4)
     return [eight[region.cells].reshape(-1, 4) for region in body.regions]
-
-
-def mean_dilatation_lost(body: Identified) -> list[str]:
-    """Said where a target has no element with one pressure."""
-    if not body.body.element.mean_dilatation:
-        return []
-    worst = max(region.poisson for region in body.regions)
-    return [
-        "tet10-p0 becomes the plain quadratic tetrahedron: where ν is near ½ it is too stiff "
-        f"(ν = {worst:.4g} here)"
-    ]
 
 
 def numbers(values: Iterable[float] | Array, separator: str = " ") -> str:
