@@ -272,7 +272,7 @@ def test_keys_are_shortened_while_they_differ():
 
 @pytest.mark.parametrize(
     ("options", "where"),
-    [({"starts": 0}, "--starts"), ({"spread": 0.5}, "--spread"), ({"seed": -1}, "--seed")],
+    [({"starts": 0}, "starts"), ({"spread": 0.5}, "spread"), ({"seed": -1}, "seed")],
 )
 def test_starts_that_cannot_be_are_refused(options, where):
     with pytest.raises(InputError, match=f"^{where}: found"):
@@ -431,9 +431,9 @@ def test_half_a_file_is_no_run(tmp_path):
 @pytest.mark.parametrize(
     ("options", "where"),
     [
-        ({"workers": 0}, "--workers"),
-        ({"time_limit_s": 0.0}, "--time-limit"),
-        ({"workers": 2, "scheduler": "tcp://x:1"}, "--workers and --scheduler"),
+        ({"workers": 0}, "workers"),
+        ({"time_limit_s": 0.0}, "time_limit_s"),
+        ({"workers": 2, "scheduler": "tcp://x:1"}, "workers"),
     ],
 )
 def test_limits_that_cannot_be_are_refused(options, where):

@@ -12,13 +12,26 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, reduce
+from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import typer
 from typer.models import OptionInfo, ParameterInfo
 
+from ..errors import InputError
+from ..methods.options import Options
 from ..stated import attributes
 
 if TYPE_CHECKING:
@@ -99,13 +112,26 @@ def _names(field: str, default: Any, written: str) -> list[str]:
 
 
 def _built(kind: type[T], values: Mapping[str, Any]) -> T:
-    """The options from their values by name, those of fields that are options themselves too."""
-    return kind(
-        **{
-            name: _built(hint, values) if is_dataclass(hint) else values[name]  # type: ignore
-            for name, _, hint, _ in _typed_fields(kind)
-        }
-    )
+    """The options from their values by name, those of fields that are options themselves too.
+
+    Raises
+    ------
+    InputError
+        Naming an option as it is given.
+    """
+    content = {
+        name: _built(hint, values) if is_dataclass(hint) else values[name]  # type: ignore[arg-type]
+        for name, _, hint, _ in _typed_fields(kind)
+    }
+    try:
+        return kind(**content)
+    except InputError as error:
+        fields_ = {name: default for name, default, _, _ in _typed_fields(kind)}
+        if error.where not in fields_:
+            raise
+        written = attributes(kind).get(error.where, ("", ""))[0]
+        names = _names(error.where, fields_[error.where], written)
+        raise InputError(error.message, None, names[0]) from error
 
 
 @cache
@@ -118,6 +144,11 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
     for name in dict.fromkeys(name for name in order if name in defaults):
         annotated = get_origin(hints[name]) is Annotated
         hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
+        if get_origin(hint) in (Union, UnionType):  # of what may be None
+            kinds = (
+                get_args(one)[0] if get_origin(one) is Annotated else one for one in get_args(hint)
+            )
+            hint = reduce(or_, kinds)
         listed.append((name, defaults[name], hint, tuple(marks)))
     return listed
 
@@ -151,7 +182,7 @@ class OfRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told:
+class Told(Options):
     """How a result and what leads to it are told."""
 
     as_json: AsJson = False

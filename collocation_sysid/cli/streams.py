@@ -11,10 +11,12 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from ..checked import NotNegative, Positive
 from ..errors import InputError
 from ..folders import require_possible
 from ..live import Estimator, LiveOptions
 from ..live.sources import problem_in
+from ..methods.options import Options
 from .common import EXIT_BAD_INPUT, errors, show
 from .options import AllowCode, Overrides, ProblemPath, Told, command
 
@@ -22,7 +24,7 @@ commands = typer.Typer()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimating:
+class Estimating(Options):
     """Options of commands that estimate from frames as they come.
 
     Attributes
@@ -33,16 +35,13 @@ class Estimating:
         How far back frames are gone over again.
     """
 
-    budget_ms: float | None = None
-    window_s: float = 3.0
+    budget_ms: Positive | None = None
+    window_s: Positive = 3.0
     set_: Overrides = None
     allow_code: AllowCode = False
 
     def estimator(self, recording: Path) -> Estimator:
         """Of the problem of a file, or of a run's folder."""
-        for name, value in (("--budget-ms", self.budget_ms), ("--window-s", self.window_s)):
-            if value is not None and not 0 < value < float("inf"):
-                raise InputError(f"found {value:g}; expected a number above 0", None, name)
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
         problem = problem_in(recording, self.set_ or (), self.allow_code)
         return Estimator(problem, LiveOptions(budget_s, self.window_s))
@@ -117,7 +116,7 @@ class Replay(Estimating, Told):
     """
 
     recording: Annotated[Path, typer.Argument()]
-    rate: float | None = None
+    rate: NotNegative | None = None
     film: Path | None = None
 
 
@@ -137,8 +136,6 @@ def replay(options: Replay) -> None:
     from ..live.sources import collected_before, paced, recorded
 
     rate, film = options.rate, options.film
-    if rate is not None and not 0 <= rate < float("inf"):
-        raise InputError(f"found {rate:g}; expected a number, 0 or more", None, "--rate")
     if film is not None:
         require_possible(film.parent)
         view.require_film(film)

@@ -12,6 +12,7 @@ from pathlib import Path
 import typer
 from rich.text import Text
 
+from ..checked import Positive
 from ..errors import InputError
 from ..folders import require_possible, run_name
 from ..plan import (
@@ -79,7 +80,7 @@ class Compare(Many):
     with_: list[Path] | None = None
     starts: Starts
     truth: list[str] | None = None
-    within: float = 0.01
+    within: Positive = 0.01
 
 
 @command(

@@ -25,10 +25,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..apart import killed_by
+from ..checked import AtLeastOne, Positive
 from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.kernels import available_threads
 from ..files import write_whole
+from ..methods.options import Options
 from ..tree import as_json
 from .study import PlannedRun
 
@@ -194,7 +196,7 @@ class RunStore:
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class RunOptions(Options):
     """How the runs of a study are done.
 
     Attributes
@@ -207,24 +209,17 @@ class RunOptions:
         A run is ended after this, loading included; it counts as a failure.
     """
 
-    workers: int | None = None
+    workers: AtLeastOne | None = None
     scheduler: str | None = None
-    time_limit_s: float | None = None
+    time_limit_s: Positive | None = None
 
     def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise InputError(f"found {self.workers}; expected 1 or more", None, "--workers")
+        super().__post_init__()
         if self.workers is not None and self.scheduler is not None:
             raise InputError(
                 "the scheduler has workers of its own; leave out one of the two",
                 None,
-                "--workers and --scheduler",
-            )
-        if self.time_limit_s is not None and not self.time_limit_s > 0:
-            raise InputError(
-                f"found {self.time_limit_s:g}; expected a number of seconds above 0",
-                None,
-                "--time-limit",
+                "workers",
             )
 
 

@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checked import AtLeastOne, Count, OneOrMore
 from ..errors import InputError
+from ..methods.options import Options
 from ..problem import Problem
 from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile
@@ -82,7 +84,7 @@ def short_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, s
 
 
 @dataclass(frozen=True)
-class Starts:
+class Starts(Options):
     """Where runs start: first at the file's guess, then about the truth, or the guess without one.
 
     A start depends on the seed and its number alone, so that more of them can be asked for later.
@@ -102,20 +104,13 @@ class Starts:
         For a number, spread or seed that cannot be.
     """
 
-    starts: int = 1
-    spread: float = 10.0
-    seed: int = 0
+    starts: AtLeastOne = 1
+    spread: OneOrMore = 10.0
+    seed: Count = 0
 
     def __post_init__(self) -> None:
-        if self.starts < 1:
-            raise InputError(f"found {self.starts}; expected 1 or more", None, "--starts")
-        require_few(self.starts, "--starts", "starts")
-        if not 1 <= self.spread < np.inf:
-            message = f"found {self.spread:g}; expected a factor of 1 or more"
-            raise InputError(message, None, "--spread")
-        if self.seed < 0:
-            message = f"found {self.seed}; expected a whole number, 0 or more"
-            raise InputError(message, None, "--seed")
+        super().__post_init__()
+        require_few(self.starts, "starts", "starts")
 
     def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
         """Those of a start: log-uniform about truth or guess, and clipped to the bounds."""

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..checked import Positive
+from ..methods.options import Options
 from ..runs.result import Result
 from ..tree import read
 from .process import TIMEOUT, Record
@@ -81,7 +82,7 @@ NORMAL_975 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class Yardstick:
+class Yardstick(Options):
     """What a success is.
 
     Attributes
@@ -92,11 +93,7 @@ class Yardstick:
     """
 
     truth: Mapping[str, float] = field(default_factory=dict)
-    within: float = 0.01
-
-    def __post_init__(self) -> None:
-        if not self.within > 0:
-            raise InputError(f"found {self.within:g}; expected a number above 0", None, "--within")
+    within: Positive = 0.01
 
     @property
     def sentence(self) -> str:

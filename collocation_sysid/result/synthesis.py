@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checked import Count, NotNegative, Positive
 from ..errors import InputError
 from ..files import whole_file
+from ..methods.options import Options
 from ..model.schemes import SCHEMES
 from ..problem import Problem
 from ..program.simulation import Trajectory, simulate
@@ -25,7 +27,7 @@ from .writers import FRAMES_FILE, require_replaceable, run_folder, write_frames
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(Options):
     """How data are made.
 
     Attributes
@@ -54,31 +56,20 @@ class Recipe:
     """
 
     integrator: str = "newmark"
-    timestep_s: float | None = None
-    noise_m: float = 0.0
-    noise_n: float = 0.0
-    noise_nm: float = 0.0
-    noise_own: float = 0.0
-    seed: int = 0
+    timestep_s: Positive | None = None
+    noise_m: NotNegative = 0.0
+    noise_n: NotNegative = 0.0
+    noise_nm: NotNegative = 0.0
+    noise_own: NotNegative = 0.0
+    seed: Count = 0
     frames: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         known = ("newmark", *SCHEMES)
         if self.integrator not in known:
             expected = f"expected one of {', '.join(known)}"
-            raise InputError(f"found {self.integrator!r}; {expected}", None, "--integrator")
-        if self.timestep_s is not None and not 0 < self.timestep_s < np.inf:
-            expected = "expected a number of seconds above 0"
-            raise InputError(f"found {self.timestep_s:g}; {expected}", None, "--timestep-s")
-        noises = {"-m": (self.noise_m, "metres"), "-n": (self.noise_n, "newtons")}
-        noises |= {"-nm": (self.noise_nm, "N m"), "-own": (self.noise_own, "sigmas")}
-        for end, (size, unit) in noises.items():
-            if not 0 <= size < np.inf:
-                message = f"found {size:g}; expected {unit}, 0 or more"
-                raise InputError(message, None, f"--noise{end}")
-        if self.seed < 0:
-            message = f"found {self.seed}; expected a whole number, 0 or more"
-            raise InputError(message, None, "--seed")
+            raise InputError(f"found {self.integrator!r}; {expected}", None, "integrator")
 
 
 def write_data(
