@@ -26,9 +26,12 @@ from collocation_sysid.recording import (
     Grasp,
     Markers,
     Nuisance,
+    Obstacle,
+    Plane,
     PointMass,
     PoseSequence,
     Pressure,
+    Sphere,
     Tendon,
 )
 
@@ -317,3 +320,30 @@ def some_point(made: Collocation, rng: np.random.Generator | None = None) -> np.
     for carried in made.carried:
         z[carried.variables] += 0.01 * rng.normal(size=carried.count)
     return z
+
+
+def pressed_cube(steps: int = 5, friction: float | str = 0.0, **changes) -> Experiment:
+    """A cube held below, with a ball that comes down upon it and a plate that moves against it."""
+    cube = hung_cube(steps, (1, 1, 2))
+    body, t_s = cube.body, cube.t_s
+    down = np.outer(0.012 * (1 - np.cos(20 * t_s)), [0.3, 0.2, -1.0])
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    turning = Rotation.from_rotvec(np.outer(np.sin(20 * t_s), [0.0, 0.05, 0.1])).as_quat()
+    soft = {"stiffness_pa_m": 4e4, "width_m": 0.006, "slip": 0.02}
+    ball = Obstacle(
+        poses=PoseSequence(t_s, down, still),
+        shape=Sphere(0.05, (0.05, 0.05, EDGE_M + 0.052)),
+        name="ball",
+        friction=friction,
+        **soft,
+    )
+    plate = Obstacle(
+        poses=PoseSequence(t_s, 0.2 * down, turning),
+        shape=Plane((1.0, 0.0, 0.0), (0.002, 0.0, 0.0)),
+        name="plate",
+        width_m=0.01,
+    )
+    held = Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())
+    markers = vertex_markers(body, nodes_where(body, 2, EDGE_M), t_s)
+    made = {"grasps": [held, ball, plate], "markers": markers, "name": "pressed cube"}
+    return replace(cube, **(made | changes))

@@ -26,6 +26,7 @@ from problems_small import (
     hung_cube,
     measured,
     measured_with,
+    pressed_cube,
     some_point,
     times,
     with_papers_damping,
@@ -115,6 +116,23 @@ def in_field(law: Callable, scheme: str = "midpoint", on="nodes", **memory) -> C
     own = Parameters.of({force.constants[0].name: cs.Unknown(40.0), **memory})
     known = Parameters((*GUESS.items, *own.items))
     return program(replace(cube, body=body), parameters=known, scheme=scheme)
+
+
+OF_OBSTACLES = Nuisance.none(obstacle_offset_m=1e-3, obstacle_tilt_rad=0.02, obstacle_time_s=2e-3)
+
+
+def touched(
+    friction: float | str = 0.0, scheme: str = "midpoint", felt: bool = False, **changes
+) -> Collocation:
+    """Pressed by a ball and a plate, which may measure the force."""
+    pressed = pressed_cube(4, friction, **changes)
+    if felt:
+        held, ball, plate = pressed.grasps
+        forces = cs.Wrench(pressed.t_s, np.full((5, 3), 0.05), 0.3)
+        pressed = replace(pressed, grasps=[held, replace(ball, wrench=forces), plate])
+    own = {friction: cs.Unknown(0.5)} if isinstance(friction, str) else {}
+    known = Parameters((*GUESS.items, *Parameters.of(own).items))
+    return program(measured(pressed) if not own else pressed, parameters=known, scheme=scheme)
 
 
 def instruments(scheme: str = "midpoint", huber: float | None = None) -> Collocation:
@@ -298,6 +316,15 @@ PROGRAMS: dict[str, Make] = {
     "a user's pressure, bdf2": lambda: in_field(breathing, "bdf2", on="faces"),
     "a user's drag, memory": lambda: in_field(
         smooth_drag, **{"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)}
+    ),
+    **{f"contact, {scheme}": lambda scheme=scheme: touched(scheme=scheme) for scheme in SCHEMES},
+    "contact, friction": lambda: touched("friction"),
+    "contact, friction, bdf2": lambda: touched(0.4, scheme="bdf2"),
+    "contact, unknown place": lambda: touched("friction", nuisance=OF_OBSTACLES),
+    "contact, wrench": lambda: touched("friction", felt=True, nuisance=OF_OBSTACLES),
+    "contact, static": lambda: touched(kind="static", felt=True),
+    "contact, static, friction": lambda: touched(
+        "friction", kind="static", felt=True, nuisance=OF_OBSTACLES
     ),
     "instruments": instruments,
     "instruments, bdf2": lambda: instruments("bdf2"),

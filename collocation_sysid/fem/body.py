@@ -27,6 +27,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from .constants import Constant
 from .discretisation import Discretisation
 from .materials import Damping, Energy, Material, Prony
 from .memory import Past
@@ -119,7 +120,9 @@ class Body(Discretisation):
     constants : dict of name to Constant
         What θ holds, in its order.
     nodes_m : (n, 3) undeformed node positions
-        The mesh's nodes, then, for quadratic elements, the middle of each of `mesh.edges`.
+        The mesh's nodes, then, for quadratic elements, the middle of each of `mesh.edges`, then
+        `frames`.
+    frames : (k, 4) nodes of obstacles, see `with_frames`
     cells : (E, nodes per element) node numbers
     node_mass : (n,) lumped mass, of the densities as stated [kg]
     pattern : SymmetricPattern of K
@@ -163,7 +166,7 @@ class Body(Discretisation):
     def __getstate__(self) -> dict[str, Any]:
         # Kernels are of this process, and what follows from the rest is found anew.
         kept = {n: v for n, v in vars(self).items() if n not in self._following}
-        return kept | {"_evaluators": {}}
+        return kept | {"_evaluators": {}, "_framed": {}}
 
     @property
     def _following(self) -> set[str]:
@@ -185,9 +188,43 @@ class Body(Discretisation):
         other = copy(self)
         for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
             vars(other).pop(name, None)
-        Model.__init__(other, free, self.forces)
-        other._evaluators = {}
+        Model.__init__(other, free, self.forces, self.frictions)
+        other._evaluators, other._framed = {}, {}
         return other
+
+    def with_frames(
+        self, count: int, rubs: bool = False, frictions: tuple[Constant, ...] = ()
+    ) -> Body:
+        """The same body and frames of so many obstacles: four nodes each that no cell has.
+
+        They are at `frame_m`, behind all others. `rubs` is whether any has friction, and
+        `frictions` are the coefficients that are parameters.
+        """
+        key = count, rubs, frictions
+        if key == (len(self.frames), self.rubs, self.frictions):
+            return self
+        if key not in self._framed:
+            other = copy(self)
+            for name in self._following - {"part_of_cells", "frame_m"}:
+                vars(other).pop(name, None)
+            Model.__init__(other, self.parts, self.forces, frictions)
+            other.rubs, other._evaluators = rubs, {}
+            first, added = len(self.nodes.points_m), np.tile(self.frame_m, (count, 1))
+            other.frames = first + np.arange(4 * count).reshape(count, 4)
+            other.nodes_m = np.vstack([self.nodes.points_m, added])
+            other._lumped_m3 = [
+                np.append(each[: 3 * first], np.zeros(added.size)) for each in self._lumped_m3
+            ]
+            other.node_mass = np.append(self.node_mass[:first], np.zeros(len(added)))
+            self._framed[key] = other
+        return self._framed[key]
+
+    @cached_property
+    def frame_m(self) -> Array:
+        """(4, 3) undeformed places of an obstacle's frame: its origin, and ends of its axes."""
+        low, high = self.nodes.points_m.min(axis=0), self.nodes.points_m.max(axis=0)
+        axes = np.vstack([np.zeros(3), np.eye(3) * (high - low).min() / 4])
+        return (low + high) / 2 + axes
 
     @cached_property
     def stresses(self) -> Stresses:
@@ -436,7 +473,8 @@ class Body(Discretisation):
     def _tied_shares(self) -> list[Array]:
         """(3n,) share of each part in the mass of every dof, as stated."""
         parts = zip(self.parts, self._lumped_m3, strict=True)
-        return [part.density_kg_m3 * volume / self.dof_mass for part, volume in parts]
+        whole_kg = np.where(self.dof_mass == 0, 1.0, self.dof_mass)  # frames have none
+        return [part.density_kg_m3 * volume / whole_kg for part, volume in parts]
 
     def _drag(self, theta: Theta, tied_kg: Array | None) -> Array:
         """(3n,) or (T, 3n) of f = −drag v by mass-proportional damping [N·s/m]."""

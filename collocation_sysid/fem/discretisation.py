@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -50,6 +51,9 @@ class Discretisation(Model):
             )
         self.nodes = Nodes.of_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
+        self.frames: Index = np.zeros((0, 4), dtype=np.int64)
+        self.rubs = False
+        self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
         self.geometry = reference_geometry(self.nodes_m, self.cells, self.element)
@@ -110,7 +114,7 @@ class Discretisation(Model):
     def unsymmetric(self) -> bool:
         """Whether the slopes of the force have a skew part."""
         laws = any(part.damping.stress is not None for part in self.parts)
-        return laws or any(force.turns for force in self.forces)
+        return laws or self.rubs or any(force.turns for force in self.forces)
 
     @cached_property
     def pattern(self) -> SymmetricPattern:

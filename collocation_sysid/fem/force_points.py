@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from ..arrays import Array, Index
 from .pattern import SymmetricPattern, dofs_of
+
+MOST_KEPT = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +70,35 @@ class ForcePoints:
         """(T, m) lower triangles on the couplings from those of blocks (3L, 3L, T, i)."""
         columns, rows = np.triu_indices(len(blocks))
         values = np.moveaxis(blocks[rows, columns], 0, 2)
-        onto = self._onto_skew if skew else self._onto_couplings
-        if chosen is not None:
-            onto = onto[:, _each(chosen, len(columns))]
+        onto = self._some("skew" if skew else "couplings", chosen)
         return (onto @ values.reshape(len(values), -1).T).T
 
     def _of(self, chosen: Index | None) -> sp.csr_array:
         """Rows of the operator."""
-        return self._operator if chosen is None else self._operator[_each(chosen, self.dofs)]
+        return self._some("operator", chosen)
+
+    def _some(self, what: str, chosen: Index | None) -> Any:
+        """Of a matrix what belongs to chosen instances; that of the last few choices is kept."""
+        whole = {
+            "operator": lambda: self._operator,
+            "couplings": lambda: self._onto_couplings,
+            "skew": lambda: self._onto_skew,
+        }[what]()
+        if chosen is None:
+            return whole
+        key = what, chosen.tobytes()
+        if key not in self._kept:
+            if len(self._kept) >= MOST_KEPT:
+                self._kept.pop(next(iter(self._kept)), None)
+            if what == "operator":
+                self._kept[key] = whole[_each(chosen, self.dofs)]
+            else:
+                self._kept[key] = whole[:, _each(chosen, self.dofs * (self.dofs + 1) // 2)]
+        return self._kept[key]
+
+    @cached_property
+    def _kept(self) -> dict[tuple[str, bytes], Any]:
+        return {}
 
     @cached_property
     def _operator(self) -> sp.csr_array:
@@ -105,7 +129,8 @@ class ForcePoints:
         """What sums lower triangles (i, d(d + 1)/2), column after column, into the entries."""
         instance, local, dof, weight = self._pairs
         order = np.argsort(instance, kind="stable")
-        instance, local, dof, weight = (e[order] for e in (instance, local, dof, weight))
+        instance, local, dof = instance[order], local[order], dof[order]
+        weight = weight[order]
         starts = np.searchsorted(instance, np.arange(self.count + 1))
         sizes, found = np.diff(starts), []
         for size in np.unique(sizes):

@@ -234,11 +234,13 @@ class Model:
     parts : tuple of BodyPart
     forces : tuple of NodeForce
         Of users.
+    frictions : tuple of Constant
+        Coefficients of friction that are parameters.
 
     Attributes
     ----------
     constants : dict of name to Constant
-        What θ holds, in its order: those of the parts, then those of the forces.
+        What θ holds, in its order: those of the parts, of the forces, and frictions.
 
     Raises
     ------
@@ -246,8 +248,13 @@ class Model:
         If two constants have one name.
     """
 
-    def __init__(self, parts: tuple[BodyPart, ...], forces: tuple[NodeForce, ...] = ()) -> None:
-        self.parts, self.forces = parts, forces
+    def __init__(
+        self,
+        parts: tuple[BodyPart, ...],
+        forces: tuple[NodeForce, ...] = (),
+        frictions: tuple[Constant, ...] = (),
+    ) -> None:
+        self.parts, self.forces, self.frictions = parts, forces, frictions
         self.constants: dict[str, Constant] = {
             part.full_name(c.name): c for part in parts for c in part.constants
         }
@@ -259,6 +266,13 @@ class Model:
                         "part of the body has; expected a name of its own"
                     )
                 self.constants[constant.name] = constant
+        for constant in frictions:
+            if constant.name in self.parameter_names:
+                raise InputError(
+                    f"a friction is called {constant.name!r}, as another constant of the body; "
+                    "expected a name of its own"
+                )
+            self.constants[constant.name] = constant
 
     def sources(self, known: Sequence[str]) -> list[Source]:
         """For each part, which of the names that are known give its constants.
@@ -278,7 +292,8 @@ class Model:
     def used_names(self, known: Sequence[str]) -> set[str]:
         """Those of the names that are known which give its constants."""
         own = {name for source in self.sources(known) for name in source.names.values()}
-        return own | {c.name for force in self.forces for c in force.constants}
+        further = (force.constants for force in self.forces)
+        return own.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -306,7 +321,9 @@ class Model:
             theta += [found[c.name] for c in part.constants]
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
-                raise InputError("no value is given of this constant of a force", None, name)
+                raise InputError(
+                    "no value is given of this constant of a force or friction", None, name
+                )
             theta.append(values[name])
         return theta
 

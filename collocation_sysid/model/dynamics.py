@@ -23,7 +23,7 @@ from ..fem.memory import Past
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .forces import Forces
-from .schemes import QUASI_STATIC, Scheme, as_scheme
+from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from .viscoelasticity import History
 from .weight import Mass
 
@@ -96,7 +96,8 @@ class Dynamics:
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
         """Discretise an experiment with `substeps` steps between samples; a static one has none."""
         if experiment.static:
-            t_s, table = experiment.t_s, QUASI_STATIC
+            t_s = experiment.t_s
+            table = SLIDING if any(o.rubs for o in experiment.obstacles) else QUASI_STATIC
         else:
             rows = (len(experiment.t_s) - 1) * substeps + 1
             t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps

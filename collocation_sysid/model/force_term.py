@@ -57,10 +57,14 @@ class ForceTerm(ABC):
         Number of its own inputs.
     couplings : SymmetricPattern or None
         Which dofs it joins; None where no slope by the state is anything but zero.
+    slides : bool
+        Whether its velocities are, in a static experiment, ways since the sample before; others'
+        are none.
     """
 
     size: int
     couplings: SymmetricPattern | None
+    slides: bool = False
 
     @abstractmethod
     def at(self, u: Array) -> Self:

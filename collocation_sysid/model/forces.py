@@ -8,7 +8,7 @@ inputs u, term by term, see `inputs`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
@@ -21,8 +21,9 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Past
 from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
+from .contact import contacts
 from .force_term import ForceTerm, Potential, Slots, States
-from .point_forces import point_forces
+from .point_forces import Pointwise, point_forces
 from .weight import Mass, Weight
 
 
@@ -39,12 +40,15 @@ class Forces:
     joined : Joined
         The mesh graph, and the couplings of the further terms that have some.
     theta : (k,) constants of the body; NaN where they are not known yet
+    still : bool
+        Whether nothing moves, and ν is the way since the sample before, see `ForceTerm.slides`.
     """
 
     weight: Weight
     further: tuple[ForceTerm, ...]
     joined: Joined
     theta: Array
+    still: bool = False
 
     @classmethod
     def of(
@@ -56,9 +60,11 @@ class Forces:
             Potential(actuator.measure, actuator.amplitude(times)[:, None])
             for actuator in experiment.actuators
         )
-        further = (*potentials, *point_forces(experiment.body, times))
+        touching = contacts(experiment, len(times))
+        further = (*potentials, *touching, *point_forces(experiment.body, times))
         unknown = np.full(len(experiment.body.constants), np.nan)
-        found = cls(Weight.of(experiment, times), further, experiment.joined, unknown)
+        still = experiment.static
+        found = cls(Weight.of(experiment, times), further, experiment.joined, unknown, still)
         return found if theta is None else found.with_theta(theta)
 
     @classmethod
@@ -139,17 +145,21 @@ class Forces:
 
     def total(self, xi: Array, nu: Array, carried: Past | None = None) -> Array:
         """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
-        found = self.body.force(xi, nu, self.theta, self.mass.tied, carried)
-        states = self._states(xi, nu)
+        of = self._states(xi, nu)
+        found = self.body.force(xi, of(self.weight).nu, self.theta, self.mass.tied, carried)
         for term in self.terms:
-            found = found + term.force(states)
+            found = found + term.force(of(term))
         return found
 
     def linearise(
         self, xi: Array, nu: Array, out: Array | None = None, carried: Past | None = None
     ) -> Linearisation:
         """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
-        at = self.body.linearise(xi, nu, self.theta, out, self.mass.tied, carried)
+        of = self._states(xi, nu)
+        still_nu = of(self.weight).nu
+        at = self.body.linearise(xi, still_nu, self.theta, out, self.mass.tied, carried)
+        if self.still:
+            at.by_velocity[:] = 0.0
         if self.further or self._ends[-1] > self._ends[0]:
             spread = self.joined.spread
             at = Linearisation(
@@ -159,9 +169,8 @@ class Forces:
                 self._widened(at.by_theta),
                 spread(at.by_position_skew),
             )
-        states = self._states(xi, nu)
         for term, places in self._placed:
-            term.add_slopes(at, places, states)
+            term.add_slopes(at, places, of(term))
         return at
 
     @property
@@ -180,7 +189,15 @@ class Forces:
     ) -> Curvature:
         """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
         known = self.theta, out, self.mass.tied, carried, stress_weights
-        at = self.body.curvature(xi, nu, weights, *known)
+        of = self._states(xi, nu)
+        at = self.body.curvature(xi, of(self.weight).nu, weights, *known)
+        if self.still:
+            for by_velocity in (
+                at.position_velocity,
+                at.velocity_theta,
+                at.position_velocity_skew,
+            ):
+                by_velocity[:] = 0.0
         if self.further or self._ends[-1] > self._ends[0]:
             spread, widened = self.joined.spread, self._widened
             at = Curvature(
@@ -192,21 +209,29 @@ class Forces:
                 widened(at.theta),
                 spread(at.position_velocity_skew),
                 # Room for the curvature by velocities, where forces may have some.
-                np.zeros((len(at.theta), self.pattern.entries if self.body.forces else 0)),
+                np.zeros((len(at.theta), self.pattern.entries * self._by_velocity)),
             )
-        states = self._states(xi, nu)
         for term, places in self._placed:
+            states = of(term)
             term.add_curvature(at, places, states, weights.reshape(states.xi.shape))
         return at
+
+    @cached_property
+    def _by_velocity(self) -> bool:
+        """Whether a term's slopes by velocities change with these."""
+        return any(isinstance(term, Pointwise) and term.by_velocity for term in self.further)
 
     @property
     def curvature_width(self) -> int:
         """Length of one time's row of `curvature`."""
         return self.body.curvature_width
 
-    def _states(self, xi: Array, nu: Array) -> States:
+    def _states(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
+        """What each term, or the body as weight does, sees of the states."""
         size = self.body.pattern.size
-        return States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
+        moving = States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
+        resting = replace(moving, nu=np.zeros_like(moving.nu)) if self.still else moving
+        return lambda term: moving if term.slides else resting
 
     @cached_property
     def _placed(self) -> list[tuple[ForceTerm, Slots]]:

@@ -1,6 +1,7 @@
 """Where the grasps hold a body's dofs, as a function of how it is off in them.
 
-A grasped node is at U_t H(φ) X, see `nuisance`, along the axes that are held.
+A grasped node is at U_t H(φ) X, see `nuisance`, along the axes that are held. A node of an
+obstacle's frame is at U_t X, and off by what is not known of the obstacle, to first order.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..recording.experiment import Experiment
 from ..recording.grasp import held_dofs
+from ..recording.nuisance import OBSTACLE_TILT, OBSTACLE_TIME, NuisanceRow
+from ..recording.obstacle import Obstacle
 from .nuisance import NuisanceMap
 
 
@@ -73,6 +77,7 @@ class Grasping:
     def places(self, phi: Array) -> tuple[Array, Array]:
         """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
         places, by_own = self.nuisance.in_grasps.slopes(self._own(phi), self._points)
+        places[:, ~self._gripped], by_own[..., ~self._gripped] = self._points[:, ~self._gripped], 0
         slopes = np.zeros((3, len(self.nuisance.moving), places.shape[1]))
         slopes[:, self._columns] = by_own
         return places.T[self._node], np.moveaxis(slopes, 2, 0)[self._node]
@@ -82,6 +87,7 @@ class Grasping:
         pulled = np.einsum("tgj,tg->gj", np.nan_to_num(self.poses[0]), weights)
         of_nodes = np.zeros_like(self._points.T)
         np.add.at(of_nodes, self._node, pulled)
+        of_nodes[~self._gripped] = 0.0
         found = np.zeros((len(self.nuisance.moving),) * 2)
         second = self.nuisance.in_grasps.curvature(self._own(phi), self._points, of_nodes.T)
         found[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
@@ -98,15 +104,40 @@ class Grasping:
 
     @cached_property
     def _zeros(self) -> Array:
-        """(N, g, m) by how much goals move with the zeros of displacements."""
+        """(N, g, m) by how much goals move with the zeros of displacements, and of obstacles."""
         found = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
-        for number, grasp in enumerate(self.experiment.grasps):
+        for number, grasp in enumerate(self.experiment.gripping):
             rows = np.flatnonzero(grasp.holds(self.t_s))
             for axis, place in zip(grasp.zero, self.nuisance.zero(number), strict=False):
                 along = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.moving == place)
                 found[np.ix_(rows, along, column)] = self.nuisance.scales[place]
+        for number, obstacle in enumerate(self.experiment.obstacles, len(self.experiment.gripping)):
+            along = np.searchsorted(self.dofs, obstacle.dofs)
+            for row, axis, place in self.nuisance.of_obstacle(number):
+                column = np.flatnonzero(self.nuisance.moving == place)
+                change = self.nuisance.scales[place] * self._off(obstacle, row, axis)
+                found[:, along, column] = change.reshape(len(self.t_s), -1)
         return found
+
+    def _off(self, obstacle: Obstacle, row: NuisanceRow, axis: int) -> Array:
+        """(N, 4, 3) by how much a frame moves with something that is not known of it."""
+        places_m = self.experiment.body.nodes_m[obstacle.nodes]
+        if row == OBSTACLE_TIME:
+            beside_s = 0.5e-3 * self.experiment.timestep_s
+            after, before = (
+                obstacle.poses.carry(places_m, self.t_s + s) for s in (beside_s, -beside_s)
+            )
+            return (before - after) / (2 * beside_s)
+        moved = np.broadcast_to(obstacle.direction, places_m.shape)
+        if row == OBSTACLE_TILT:
+            moved = np.cross(obstacle.across[axis], places_m - obstacle.shape.middle_m)
+        return np.einsum("tij,kj->tki", obstacle.poses.at(self.t_s)[0], moved)
+
+    @cached_property
+    def _gripped(self) -> NDArray[np.bool_]:
+        """Which of the nodes that are grasped are the body's."""
+        return ~np.isin(self._nodes[0], self.experiment.body.frames)
 
     @cached_property
     def _nodes(self) -> tuple[Index, Index]:

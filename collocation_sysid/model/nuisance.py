@@ -15,7 +15,7 @@ A tension T is max(0, f T − b) at the body, a pressure p is f p − b.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
@@ -36,6 +36,9 @@ from ..recording.nuisance import (
     GRASP_SHIFT,
     GRASP_TURN,
     JOINING,
+    OBSTACLE_OFFSET,
+    OBSTACLE_TILT,
+    OBSTACLE_TIME,
     PLACE,
     PRESSURE_LOST,
     TARE,
@@ -48,6 +51,7 @@ from ..recording.nuisance import (
     Of,
     rotation,
 )
+from ..recording.obstacle import Obstacle
 from ..recording.wrench import COMPONENTS, UNITS, Wrench
 from .generated import Generated
 
@@ -149,7 +153,7 @@ class NuisanceMap:
         scales = np.array([entry.sigma for entry in entries], dtype=float)
         steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
-        held = held_nodes(experiment.grasps)
+        held = held_nodes(experiment.gripping)
         found = cls(
             entries,
             tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
@@ -271,12 +275,29 @@ class NuisanceMap:
         """Positions in φ of the zeros of a grasp, along its axes in turn."""
         return self.places(ZERO, of=number)
 
-    def zero_m(self, number: int, grasp: Grasp, phi: Array) -> Array:
-        """(3,) by how much a grasp is off."""
-        found = np.zeros(3)
+    def of_obstacle(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
+        """Row, axis and position in φ of all that is not known of an obstacle."""
+        own = (k for k in self.moving.tolist() if self.entries[k].row.of == "obstacle")
+        here = ((self.entries[k], k) for k in own if self.entries[k].number == number)
+        return [(entry.row, entry.axis, k) for entry, k in here]
+
+    def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
+        """Grasps and obstacles where φ has them."""
+        motion = self.in_grasp(phi)
+        return tuple(self._with_grasp(k, grasp, motion, phi) for k, grasp in enumerate(grasps))
+
+    def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
+        if isinstance(grasp, Obstacle):
+            off: dict[NuisanceRow, Array] = {}
+            for row, axis, place in self.of_obstacle(number):
+                off.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
+            nothing = np.zeros(2)
+            offset, late = (off.get(r, nothing)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME))
+            return grasp.off_by(offset, off.get(OBSTACLE_TILT, nothing), late)
+        zero_m = np.zeros(3)
         for place in self.zero(number):
-            found[self.entries[place].axis] = phi[place] * self.scales[place]
-        return found
+            zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
+        return replace(grasp, poses=grasp.poses.after(motion).shifted(zero_m))
 
     def limits(self, samples: int) -> tuple[Array, Array]:
         """Lowest and highest φ (k,), where samples are read about this many whole ones away."""
@@ -400,7 +421,9 @@ def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
     if of == "place":
         return [(m, names[m]) for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()]
     if of == "grasp":
-        return [(k, str(k + 1)) for k in range(len(experiment.grasps))]
+        return [(k, str(k + 1)) for k in range(len(experiment.gripping))]
+    if of == "obstacle":
+        return enumerate((each.name for each in experiment.obstacles), len(experiment.gripping))
     if of == "load":
         return enumerate(which for which, _ in _timed(experiment))
     if of == "sensor":
@@ -426,6 +449,11 @@ def _axes(
         wrench = _wrenches(experiment)[number]
         own = np.flatnonzero(wrench.measured).tolist()
         return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in own]
+    if row in (OBSTACLE_TILT, OBSTACLE_TIME):
+        obstacle = experiment.grasps[number]
+        assert isinstance(obstacle, Obstacle)
+        if not (obstacle.shape.flat if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
+            return []
     found = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
     return [each for each in found if row != ZERO or each[1] in experiment.grasps[number].zero]
 

@@ -61,6 +61,8 @@ class Scheme:
 STATIC = Stencil(p=(1.0,), q=(0.0,), w=(1.0,), s=(0.0,))
 # Every sample is an equilibrium of its own: that of static experiments, whatever the others'.
 QUASI_STATIC = Scheme("quasi-static", 1, STATIC, ())
+# What rubs there feels how far it has come since the sample before.
+SLIDING = Scheme("sliding", 1, Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0,)), ())
 
 BACKWARD_EULER = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -2.0, 1.0))
 _FIRST_STEP = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -1.0), r=-1.0)

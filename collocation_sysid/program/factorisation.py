@@ -12,7 +12,7 @@ factorised whole, else by its symmetric part and refined. What remains SuperLU t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -105,8 +105,11 @@ class _RefinedFactor:
     skew: sp.csc_array
     whole: Callable[[], Factor]
     positive_definite: bool = True
+    diverged: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
+        if self.diverged:
+            return self.whole().solve(right, transposed)
         found = correction = self.symmetric.solve(right)
         size = last = np.abs(found).max(axis=0, initial=TINY)
         shrinks = 1.0
@@ -117,6 +120,7 @@ class _RefinedFactor:
             length = np.abs(correction).max(axis=0, initial=TINY)
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
+                self.diverged.append(True)
                 return self.whole().solve(right, transposed)
             found, last = found + correction, length
         return found

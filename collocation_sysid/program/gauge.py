@@ -179,6 +179,6 @@ def _points(experiment: Experiment, gauge: Gauge, rows: int) -> Points:
     """The places that a gauge looks at in all rows."""
     body, points = experiment.body, np.asarray(gauge.points_m)
     names = [f"{gauge.name} {k + 1}" for k in range(len(points))]
-    placement = place_markers(points, body.nodes_m, body, names=names)
+    placement = place_markers(points, body.nodes.points_m, body, names=names)
     chart = Chart.exact(body, placement, points)
     return Points(np.arange(rows), chart, np.full((len(points), 3), -1))

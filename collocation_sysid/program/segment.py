@@ -381,11 +381,7 @@ class Segment:
             return self.experiment
         grasps = self.experiment.grasps
         if self.nuisance.moves_grasps:
-            motion = self.nuisance.in_grasp(phi)
-            grasps = tuple(
-                replace(g, poses=g.poses.after(motion).shifted(self.nuisance.zero_m(k, g, phi)))
-                for k, g in enumerate(grasps)
-            )
+            grasps = self.nuisance.with_grasps(grasps, phi)
         off = iter(self.nuisance.drives(phi))
         tendons, pressures = (
             tuple(actuator.off_by(*next(off)) for actuator in actuators)

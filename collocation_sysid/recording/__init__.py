@@ -15,6 +15,12 @@ from .markers import Placement as Placement
 from .markers import place_markers as place_markers
 from .nuisance import Nuisance as Nuisance
 from .nuisance import NuisanceRow as NuisanceRow
+from .obstacle import Capsule as Capsule
+from .obstacle import Cuboid as Cuboid
+from .obstacle import Cylinder as Cylinder
+from .obstacle import Obstacle as Obstacle
+from .obstacle import Plane as Plane
+from .obstacle import Sphere as Sphere
 from .pose_files import read_poses as read_poses
 from .poses import PoseSequence as PoseSequence
 from .pressure import Pressure as Pressure

@@ -23,6 +23,7 @@ from .grasp import Grasp, free_motions, held_dofs
 from .loads import Change, Force, PointMass, ramp
 from .markers import Markers
 from .nuisance import Nuisance
+from .obstacle import Obstacle, with_frames_of
 from .pressure import Pressure
 from .tables import within
 from .tendon import Tendon
@@ -54,8 +55,8 @@ class Experiment:
     t_s : (T,) array
         At least three evenly spaced times; of a static experiment one or more, ascending.
     grasps : sequence of Grasp
-        No node in two of them at a time along the same axis. Selected nodes are looked up on the
-        body, and poses given as matrices are those at `t_s`.
+        And of `Obstacle`, which stand last. No node in two of them at a time along the same axis.
+        Selected nodes are looked up on the body, and poses given as matrices are those at `t_s`.
     markers : Markers, optional
         Tracks at the times `t_s`, at least one sample present. Those given by their places are put
         on the body, see `place_markers`. None are needed where wrenches or `readings` are measured.
@@ -120,8 +121,13 @@ class Experiment:
 
     def __post_init__(self) -> None:
         loads = ("masses", "forces", "tendons", "pressures")
+        vars(self)["body"] = with_frames_of(self.body, self.obstacles)
+        framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
-            grasps=tuple(grasp.on(self.body, self.t_s) for grasp in self.grasps),
+            grasps=(
+                *(grasp.on(self.body, self.t_s) for grasp in self.gripping),
+                *(obstacle.framed(frame, self.t_s) for obstacle, frame in framed),
+            ),
             markers=Markers.none(self.t_s) if self.markers is None else self.markers,
             **{name: tuple(load.on(self.body) for load in getattr(self, name)) for name in loads},
         )
@@ -144,6 +150,16 @@ class Experiment:
             f"Experiment({self.name!r}: {static}{len(self.t_s)} samples over "
             f"{self.duration_s:.4g} s, grasps: {len(self.grasps)}, {self.markers!r}{validation})"
         )
+
+    @property
+    def gripping(self) -> tuple[Grasp, ...]:
+        """The grasps that hold nodes of the body."""
+        return tuple(grasp for grasp in self.grasps if not isinstance(grasp, Obstacle))
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What it may touch, the last of the grasps."""
+        return tuple(grasp for grasp in self.grasps if isinstance(grasp, Obstacle))
 
     @property
     def static(self) -> bool:
@@ -275,8 +291,10 @@ class Experiment:
 
     @property
     def joined(self) -> Joined:
-        """The mesh graph of its body, and the couplings of each of the actuators and forces."""
-        return self.body.joined_with([each.measure.couplings for each in self.actuators])
+        """The mesh graph of its body, and the couplings of each actuator, obstacle and force."""
+        couplings = [each.measure.couplings for each in self.actuators]
+        couplings += [each.surface(self.body).points.couplings for each in self.obstacles]
+        return self.body.joined_with(couplings)
 
     @property
     def pattern(self) -> SymmetricPattern:
@@ -290,16 +308,19 @@ class Experiment:
         does along some, else the first. Without a grasp the body stays where it is undeformed.
         """
         rotations, translations = self.rigid_motion(t_s)
-        return np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
+        places = np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
+        for obstacle in self.obstacles:
+            places[:, obstacle.nodes] = obstacle.carry(self.body.nodes_m, np.atleast_1d(t_s))
+        return places
 
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        if not self.grasps:
+        if not self.gripping:
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
-        throughout = [grasp for grasp in self.grasps if grasp.holds(self.t_s).all()]
+        throughout = [grasp for grasp in self.gripping if grasp.holds(self.t_s).all()]
         throughout.sort(key=lambda grasp: grasp.axes != "xyz")
-        poses = (throughout or self.grasps)[0].poses
+        poses = (throughout or self.gripping)[0].poses
         if len(poses.t_s) > 1 and not throughout:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
         return poses.at(times)
@@ -386,10 +407,10 @@ class Experiment:
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
                 raise InputError(f"a {what} node {beyond[0]}, but the body has {n}")
-        if self.markers.placement.node_count != n:
+        placed, own = self.markers.placement.node_count, len(self.body.nodes.points_m)
+        if placed not in (own, n):
             raise InputError(
-                f"the markers were placed on a body of {self.markers.placement.node_count} nodes, "
-                f"but this one has {n}"
+                f"the markers were placed on a body of {placed} nodes, but this one has {own}"
             )
 
     def _check_actuators(self) -> None:
@@ -419,6 +440,7 @@ class Experiment:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
                 vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
+            self._start_frames()
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
         elif stated:
@@ -426,7 +448,20 @@ class Experiment:
         if self.start == "equilibrium":
             self._refuse_free_motions()
 
+    def _start_frames(self) -> None:
+        """Where a state without them is given, put the frames of obstacles where they are."""
+        frames = self.body.frames.ravel()
+        if not len(frames) or len(self.start_positions_m) == len(self.body.nodes_m):
+            return
+        at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
+        places = self.rigid_positions(at_s)[:, frames]
+        rates = np.diff(places, axis=0)[0] / np.diff(at_s)
+        for name, own in (("start_positions_m", places[0]), ("start_velocities_m_s", rates)):
+            vars(self)[name] = np.vstack([getattr(self, name), own])
+
     def _refuse_free_motions(self) -> None:
+        if self.obstacles:
+            return  # these may carry it: the rest state is looked for
         held = self.held(self.t_s[:1])[0]
         free = free_motions(self.body.nodes_m, held)
         if free:

@@ -77,6 +77,9 @@ class Grasp:
     wrench: Wrench | None = None
 
     def __post_init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
         if not self.from_s <= self.until_s:
             raise InputError(
                 f"a grasp holds from {self.from_s:g} s until {self.until_s:g} s; expected "

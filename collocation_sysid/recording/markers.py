@@ -140,8 +140,9 @@ class Markers:
                 self._require_seen(m)
                 nodes, weights = shape.nearest(back[m])
                 places[m] = weights @ body.nodes_m[nodes]
+        nodes_m = body.nodes.points_m
         placement = place_markers(
-            places, body.nodes_m, body, self.attach, self.max_distance_m, self.names
+            places, nodes_m, body, self.attach, self.max_distance_m, self.names
         )
         return replace(self, places_m=None, placement=placement)
 

@@ -23,7 +23,16 @@ FREELY = 1e3
 EDGES_A_STEP = SAMPLES_A_STEP = 2.0
 
 Of = Literal[
-    "recording", "place", "marker", "grasp", "tendon", "pressure", "load", "sensor", "gauge"
+    "recording",
+    "place",
+    "marker",
+    "grasp",
+    "obstacle",
+    "tendon",
+    "pressure",
+    "load",
+    "sensor",
+    "gauge",
 ]
 Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives"]
 # What recordings say that share something, besides "recording" for those that do not.
@@ -166,7 +175,7 @@ def _moves(experiment: Any) -> bool:
 def _seen_in_grasp(experiment: Any) -> bool:
     # Nothing but what markers see tells how the body is off in its grasp, and a start that is
     # given tells where it is.
-    return bool(experiment.grasps) and _seen(experiment) and experiment.start == "equilibrium"
+    return bool(experiment.gripping) and _seen(experiment) and experiment.start == "equilibrium"
 
 
 def _edges(experiment: Any) -> float:
@@ -174,7 +183,7 @@ def _edges(experiment: Any) -> float:
 
 
 def _grasped(experiment: Any) -> dict[str, Any]:
-    nodes = {int(node) for grasp in experiment.grasps for node in grasp.nodes}
+    nodes = {int(node) for grasp in experiment.gripping for node in grasp.nodes}
     return {"body": id(experiment.body), "nodes in its grasps": nodes}
 
 
@@ -234,6 +243,21 @@ ZERO = NuisanceRow("displacement_zero_m", "m", 1e-4, key="displacement_zero", of
     axes="x y z", changes=("grasps",), by="worst",
     label="zero of grasp {which}, {axis}", told="zero of a displacement off by {size}",
     said="a constant offset of each displacement along each of its axes")
+OBSTACLE_OFFSET = NuisanceRow("obstacle_offset_m", "m", 1e-4, key="obstacle", of="obstacle",
+    changes=("grasps",), by="worst", applies=lambda experiment: bool(experiment.obstacles),
+    label="place of {which}", told="an obstacle is off by {size}",
+    said="a constant offset of each obstacle along its normal, or along the axis of its "
+         "displacement: where contact begins")
+OBSTACLE_TILT = NuisanceRow("obstacle_tilt_rad", "rad", None, key="obstacle", of="obstacle",
+    axes="first second", changes=("grasps",), by="length", considered=0.2 * DEGREE,
+    applies=lambda experiment: any(each.shape.flat for each in experiment.obstacles),
+    label="tilt of {which}, {axis}", told="an obstacle is tilted by {size}",
+    said="a constant tilt of each plane or box that may be touched, about its point or middle")
+OBSTACLE_TIME = NuisanceRow("obstacle_time_s", "s", None, key="obstacle", of="obstacle",
+    changes=("grasps",), by="worst", considered=1e-3,
+    applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
+    label="delay of {which}", told="an obstacle is late by {size}",
+    said="how much later than stated each obstacle moves, to first order")
 TENSION_FACTOR = NuisanceRow("tension_factor", "1", None, key="tension_factor", of="tendon",
     changes=("drives",),
     label="{which}, more than stated", told="{which} by {signed}",
@@ -295,6 +319,9 @@ ROWS = (
         GRASP_TURN,
         GRASP_SHIFT,
         ZERO,
+        OBSTACLE_OFFSET,
+        OBSTACLE_TILT,
+        OBSTACLE_TIME,
     ),
     *(TENSION_FACTOR, TENSION_LOST, PRESSURE_FACTOR, PRESSURE_LOST, JOINING),
     *(TARE, SENSOR_TIME, SENSOR_LAG, TOOL_MASS, TOOL_CENTRE),

@@ -26,12 +26,12 @@ def refined(experiment: Experiment, finer: Body) -> Experiment:
         return replace(load, nodes=refined_nodes(load.nodes, load.selection, body, finer))
 
     placement = place_markers(
-        markers.observe(body.nodes_m), finer.nodes_m, finer, "embedded", float("inf")
+        markers.observe(body.nodes_m), finer.nodes.points_m, finer, "embedded", float("inf")
     )
     return replace(
         experiment,
         body=finer,
-        grasps=tuple(map(anew, experiment.grasps)),
+        grasps=(*map(anew, experiment.gripping), *experiment.obstacles),
         masses=tuple(map(anew, experiment.masses)),
         forces=tuple(map(anew, experiment.forces)),
         pressures=tuple(pressure.refined(body, finer) for pressure in experiment.pressures),
@@ -45,5 +45,6 @@ def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
     """A field (n, 3) of the nodes at those of the finer body, by the shape functions."""
     if state is None:
         return None
-    places = place_markers(finer.nodes_m, body.nodes_m, body, "embedded")
+    here_m, there_m = finer.nodes.points_m, body.nodes.points_m
+    places = place_markers(here_m, there_m, body, "embedded")
     return (places.weights[:, :, None] * state[places.nodes]).sum(axis=1)

@@ -1,0 +1,78 @@
+"""Where the surface of a body may touch something: quadrature points of its faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Array, Index
+from .body import Body
+from .force_points import ForcePoints
+from .selection import Selection
+
+# A point of the surface, and the four nodes of a frame.
+VECTORS = 5
+
+# Barycentric points and weights of a triangle, exact to order 2 and 4 (Dunavant 1985).
+_A, _B = (0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)
+_TURNS = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
+RULES = {
+    3: (np.where(_TURNS, 1 / 6, 2 / 3), np.full(3, 1 / 3)),
+    6: (
+        np.vstack([np.where(_TURNS, a, 1 - 2 * a) for a, _ in (_A, _B)]),
+        np.repeat([w for _, w in (_A, _B)], 3),
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """Where the surface of a body may touch an obstacle.
+
+    Attributes
+    ----------
+    points : ForcePoints
+        Quadrature points of faces; of each the point, and the nodes of the frame.
+    area_m2 : (i,)
+    edge_m : float
+        Mean length of an edge of the faces.
+    part : int
+        Of the body, that has most of the faces.
+    """
+
+    points: ForcePoints
+    area_m2: Array
+    edge_m: float
+    part: int
+
+    @classmethod
+    def of(cls, body: Body, frame: Index, chosen: Selection | None) -> Touching:
+        """That of a body, or some of its faces, and the frame (4,) of an obstacle."""
+        triangles = body.mesh.surface
+        if chosen is not None:
+            triangles = triangles[chosen.resolve_faces(body.mesh)]
+        faces = body.nodes.on_faces(triangles)
+        corners = body.mesh.points_m[triangles]
+        sides = np.roll(corners, -1, axis=1) - corners
+        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+        places, weights = RULES[faces.shape[1]]
+        shape = places if faces.shape[1] == 3 else _quadratic(places)
+        count = len(weights)
+        nodes = np.hstack([faces, np.broadcast_to(frame, (len(faces), 4))])
+        mix = np.zeros((count, VECTORS, nodes.shape[1]))
+        mix[:, 0, : faces.shape[1]] = shape
+        mix[:, 1:, faces.shape[1] :] = np.eye(4)
+        points = ForcePoints(
+            np.repeat(nodes, count, axis=0), np.tile(mix, (len(faces), 1, 1)), len(body.nodes_m)
+        )
+        held = [np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts]
+        part = int(np.argmax([area[each].sum() for each in held]))
+        edge_m = float(np.linalg.norm(sides, axis=2).mean())
+        return cls(points, np.outer(area, weights).ravel(), edge_m, part)
+
+
+def _quadratic(places: Array) -> Array:
+    """(q, 6) shape functions of a face: corners, and the middles of ab, bc and ca."""
+    beside = np.roll(places, -1, axis=1)
+    return np.hstack([places * (2 * places - 1), 4 * places * beside])

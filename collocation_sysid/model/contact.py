@@ -1,0 +1,221 @@
+"""Contact with obstacles: a pressure that grows as a surface comes near, and friction.
+
+At points of the surface with undeformed areas A and the gap g(x, X) to an obstacle whose frame
+is at X, the energy and the dissipation potential are
+
+    Ψ = Σ A κ/(3δ) ⟨δ − g⟩³,    D = Σ μ N (√(|v_t|² + ε²) − ε),    N = A κ/δ ⟨δ − g⟩²,
+
+v_t being the velocity along the obstacle's surface against it. Forces are −∂Ψ/∂(x, X) − ∂D/∂(v, V):
+those on the frame are what the obstacle is given, and balance. Ψ has continuous second derivatives
+and joins nothing but the nodes of a face. In a static experiment v is the way since the sample
+before, so that friction holds each point where it was then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from ..arrays import Array, Index
+from ..fem.body import Body
+from ..fem.force_points import ForcePoints
+from ..fem.moduli import engineering
+from ..fem.touching import VECTORS, Touching
+from ..recording.experiment import Experiment
+from ..recording.obstacle import Obstacle
+from .force_term import Slots, States
+from .generated import Generated
+from .point_forces import Pointwise
+
+# κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample.
+STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.1, 1e-4)
+# Evaluations are of so many points at a time, or a multiple: that few sizes are compiled.
+AT_A_TIME = 16
+
+
+@dataclass(frozen=True, eq=False)
+class ContactLaw:
+    """The force of one obstacle at a point, as an expression.
+
+    Attributes
+    ----------
+    body : Body
+    obstacle : Obstacle
+    surface : Touching
+    static : bool
+    """
+
+    body: Body
+    obstacle: Obstacle
+    surface: Touching
+    static: bool
+
+    @property
+    def width_m(self) -> float:
+        """δ."""
+        return self.obstacle.width_m or WIDTH * self.surface.edge_m
+
+    @property
+    def slip(self) -> float:
+        """ε."""
+        return self.obstacle.slip or SLIP[self.static] * self.surface.edge_m
+
+    @cached_property
+    def columns(self) -> Index:
+        """(c,) places in θ of what κ follows, and of the friction."""
+        part, found = self.surface.part, []
+        if self.obstacle.stiffness_pa_m is None:
+            first = self.body.starts[part]
+            found = [first + k for k in range(len(self.body.parts[part].material.constants))]
+        if (friction := self.obstacle.coefficient) is not None:
+            found.append(list(self.body.constants).index(friction.name))
+        return np.array(found, dtype=np.int64)
+
+    def stiffness(self, constants: ca.SX) -> ca.SX:
+        """κ [Pa/m]."""
+        if self.obstacle.stiffness_pa_m is not None:
+            return ca.SX(self.obstacle.stiffness_pa_m)
+        material = self.body.parts[self.surface.part].material
+        lame = material.lame(constants[: len(material.constants)])
+        return STIFFNESS / self.surface.edge_m * engineering(lame[0], lame[1])[0]
+
+    def friction(self, constants: ca.SX) -> ca.SX:
+        """μ."""
+        stated = self.obstacle.friction
+        return constants[-1] if isinstance(stated, str) else ca.SX(stated)
+
+    def seen(self, y: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """A point in the frame of its obstacle, and the axes of that."""
+        point, origin, *ends = ca.vertsplit(y, 3)
+        size_m = float(self.body.frame_m[1, 0] - self.body.frame_m[0, 0])
+        axes = ca.horzcat(*[(end - origin) / size_m for end in ends])
+        return axes.T @ (point - origin), axes
+
+    def gap(self, y: ca.SX) -> ca.SX:
+        """G of (y, X)."""
+        return self.obstacle.shape.gap(self.seen(y)[0] + ca.DM(self.body.frame_m[0]))
+
+    def pressure(self, y: ca.SX, constants: ca.SX) -> ca.SX:
+        """κ/δ ⟨δ − g⟩²."""
+        near = ca.fmax(self.width_m - self.gap(y), 0)
+        return self.stiffness(constants) / self.width_m * near**2
+
+    @cached_property
+    def distance(self) -> Generated:
+        """G alone."""
+        return Generated(lambda y, _: self.gap(y), 3 * VECTORS, 0)
+
+    @cached_property
+    def generated(self) -> Generated:
+        """The forces, of (y, ẏ, c) or (y, c); data are A."""
+        moving = 3 * VECTORS * self.obstacle.rubs
+        return Generated(self.force, 3 * VECTORS + moving + len(self.columns), 1)
+
+    def force(self, u: ca.SX, area: ca.SX) -> ca.SX:
+        """(15,) on the point and on the frame."""
+        size = 3 * VECTORS
+        y, constants = u[:size], u[u.numel() - len(self.columns) :]
+        near = ca.fmax(self.width_m - self.gap(y), 0)
+        energy = area * self.stiffness(constants) / (3 * self.width_m) * near**3
+        force = -ca.gradient(energy, y)
+        if not self.obstacle.rubs:
+            return force
+        v = u[size : 2 * size]
+        normal_n = area * self.pressure(y, constants)
+        lost = self.friction(constants) * normal_n * self._speed(y, v)
+        return force - ca.gradient(lost, v)
+
+    def _speed(self, y: ca.SX, v: ca.SX) -> ca.SX:
+        """√(|v_t|² + ε²)."""
+        place, _ = self.seen(y)
+        size_m = float(self.body.frame_m[1, 0] - self.body.frame_m[0, 0])
+        own, origin, *ends = ca.vertsplit(v, 3)
+        carried = sum((place[k] / size_m * (end - origin) for k, end in enumerate(ends)), origin)
+        normal = ca.gradient(self.gap(y), y)[:3]
+        normal = normal / ca.norm_2(normal)
+        against = own - carried
+        along = against - normal * ca.dot(normal, against)
+        return ca.sqrt(ca.sumsqr(along) + self.slip**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Contact(Pointwise):
+    """What one obstacle does to a body at T times.
+
+    Attributes
+    ----------
+    contact : ContactLaw
+    times : int
+    share : float
+    """
+
+    contact: ContactLaw
+    times: int
+    share: float = 1.0
+    size, slides = 0, True
+
+    @property
+    def points(self) -> ForcePoints:  # type: ignore[override]
+        """Of the surface."""
+        return self.contact.surface.points
+
+    @property
+    def law(self) -> Generated:
+        """That of the obstacle."""
+        return self.contact.generated
+
+    @property
+    def by_velocity(self) -> bool:
+        """Where it rubs."""
+        return self.contact.obstacle.rubs
+
+    def at(self, u: Array) -> Self:
+        """It has no inputs but constants."""
+        return self
+
+    def rows(self, rows: slice) -> Self:
+        """The same at some of the times."""
+        return replace(self, times=len(range(self.times)[rows]))
+
+    def towards(self, other: Self, share: float) -> Self:
+        """Obstacles move with their frames, as grasps do."""
+        return self
+
+    def acting(self, states: States) -> Index:
+        """Points within δ at any of the times, and some more."""
+        gap = self.contact.distance.value(self.points.vectors(states.xi), self._no_data(states))[0]
+        near = np.flatnonzero((gap < self.contact.width_m).any(axis=0))
+        beside = np.setdiff1d(np.arange(min(self.points.count, len(near) + AT_A_TIME)), near)
+        return np.sort(np.append(near, beside[: -len(near) % AT_A_TIME]))
+
+    def _no_data(self, states: States) -> Array:
+        return np.zeros((0, len(states.xi), self.points.count))
+
+    def constants(self, states: States) -> Array:
+        """What κ follows, and the friction."""
+        return states.theta[self.contact.columns][:, None]
+
+    def columns(self, places: Slots) -> Index:
+        """Their places in θ."""
+        return self.contact.columns
+
+    def data(self, chosen: Index | None) -> Array:
+        """A."""
+        area = self.contact.surface.area_m2[chosen]
+        return np.broadcast_to(area, (1, self.times, len(area)))
+
+
+def contacts(experiment: Experiment, times: int) -> tuple[Contact, ...]:
+    """Those of an experiment's obstacles at so many times."""
+    laws = (contact_law(experiment.body, o, experiment.static) for o in experiment.obstacles)
+    return tuple(Contact(law, times) for law in laws)
+
+
+@lru_cache(maxsize=32)
+def contact_law(body: Body, obstacle: Obstacle, static: bool) -> ContactLaw:
+    """What an obstacle does to a body; that of the last few is kept, with its derivatives."""
+    return ContactLaw(body, obstacle, obstacle.surface(body), static)
