@@ -43,7 +43,10 @@ def markers(t_s=TIMES, node_count=5, present=True):
 
 
 def experiment(**changes) -> Experiment:
-    body: Any = SimpleNamespace(nodes_m=NODES)
+    body: Any = SimpleNamespace(
+        nodes_m=NODES, nodes=SimpleNamespace(points_m=NODES), frames=np.zeros((0, 4), dtype=int)
+    )
+    body.with_frames = lambda *_: body
     fields: dict[str, Any] = {
         "name": "swing",
         "body": body,

@@ -15,12 +15,7 @@ from .markers import Placement as Placement
 from .markers import place_markers as place_markers
 from .nuisance import Nuisance as Nuisance
 from .nuisance import NuisanceRow as NuisanceRow
-from .obstacle import Capsule as Capsule
-from .obstacle import Cuboid as Cuboid
-from .obstacle import Cylinder as Cylinder
 from .obstacle import Obstacle as Obstacle
-from .obstacle import Plane as Plane
-from .obstacle import Sphere as Sphere
 from .pose_files import read_poses as read_poses
 from .poses import PoseSequence as PoseSequence
 from .pressure import Pressure as Pressure
@@ -28,6 +23,11 @@ from .readers import MarkerTable as MarkerTable
 from .readers import read_markers as read_markers
 from .rigid import align_to_template as align_to_template
 from .rigid import fit_poses as fit_poses
+from .solids import Capsule as Capsule
+from .solids import Cuboid as Cuboid
+from .solids import Cylinder as Cylinder
+from .solids import Plane as Plane
+from .solids import Sphere as Sphere
 from .tables import displaced_axes as displaced_axes
 from .tables import read_displacement as read_displacement
 from .tables import read_wrench as read_wrench

@@ -137,6 +137,7 @@ class Experiment:
         self._check_nodes()
         self._check_start()
         self._check_actuators()
+        self._check_obstacles()
 
     @property
     def place(self) -> str:
@@ -413,6 +414,11 @@ class Experiment:
                 f"the markers were placed on a body of {placed} nodes, but this one has {own}"
             )
 
+    def _check_obstacles(self) -> None:
+        names = [obstacle.name for obstacle in self.obstacles]
+        if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+            raise InputError(f"two obstacles are called {twice[0]!r}; expected different names")
+
     def _check_actuators(self) -> None:
         names = [actuator.name for actuator in self.actuators]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
@@ -440,7 +446,7 @@ class Experiment:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
                 vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
-            self._start_frames()
+            self._start_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
         elif stated:
@@ -448,10 +454,10 @@ class Experiment:
         if self.start == "equilibrium":
             self._refuse_free_motions()
 
-    def _start_frames(self) -> None:
+    def _start_frames(self, given: int) -> None:
         """Where a state without them is given, put the frames of obstacles where they are."""
         frames = self.body.frames.ravel()
-        if not len(frames) or len(self.start_positions_m) == len(self.body.nodes_m):
+        if given == len(self.body.nodes_m):
             return
         at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
         places = self.rigid_positions(at_s)[:, frames]
