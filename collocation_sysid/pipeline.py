@@ -30,6 +30,7 @@ from .statistics.diagnostics import diagnose
 from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import pose_noise_draws
+from .statistics.probes import Answered, Probe, probes
 from .statistics.profile import Profile, profile_of
 from .statistics.trust import turn_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
@@ -110,6 +111,7 @@ def run(
     start: str | Path | Earlier | None = None,
     seek_causes: bool = True,
     scheduler: str | None = None,
+    probe: bool = False,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and find the error bars.
 
@@ -124,6 +126,8 @@ def run(
         Called with what is being done now, a text.
     seek_causes : bool
         Whether a misfit's cause is looked for, see `likely_causes`.
+    probe : bool
+        Whether the data are refitted in parts, and with each assumption freed, see `probes`.
 
     Raises
     ------
@@ -145,6 +149,7 @@ def run(
             profiles = _profiles(found, fit, say)
             sources = _sources(found, fit, found.uncertainty, say)
             found = replace(found, profiles=profiles, sources=sources)
+            found = replace(found, probes=_probes(found, fit, say)) if probe else found
         if not seek_causes or found.solution.status is Status.INTERRUPTED:
             return found
         say("looking for causes of the misfit")
@@ -192,6 +197,16 @@ def _sources(found: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> So
     changes = assumed(solution.collocation, solution.z, stated.deviations)
     parameters = solution.collocation.parameters
     return Sources.of(fit, changes, parameters, solution.q, known)
+
+
+def _probes(found: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
+    """Refits of parts of the data, and with assumptions freed."""
+    say("refitting parts of the data, and with assumptions freed")
+    solution, options = found.solution, found.problem.uncertainty
+    collocation, z = solution.collocation, solution.z
+    extra, known = pose_noise_draws(collocation, z)[0], options.assumptions.deviations
+    how = options.noise, options.errors, extra
+    return probes(Answered(collocation, z, fit, *how, found.estimates, found.budget, known))
 
 
 def _profiles(found: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:

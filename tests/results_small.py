@@ -66,6 +66,7 @@ def a_result(parameters: Mapping[str, FoundValue] | None = None, **changes: Any)
         derived={},
         basis=(),
         budget={},
+        probes=(),
         places={},
         nuisance={},
         uncertainty=None,

@@ -40,6 +40,8 @@ class Solve(OfProblem, Told):
         Exit code 1 if the verdict is doubtful.
     budget : bool
         What the variance of each estimate is made of, whole.
+    probe : bool
+        Look harder: refit parts of the data, and with each assumption freed.
     """
 
     method: str | None = None
@@ -49,6 +51,7 @@ class Solve(OfProblem, Told):
     verbose: bool = False
     strict: bool = False
     budget: bool = False
+    probe: bool = False
 
 
 @command(
@@ -80,7 +83,7 @@ def solve(options: Solve) -> None:
     require_replaceable(folder)
     with Progress(errors, problem, options.verbose, options.quiet) as progress:
         how = options.method, progress.iteration, progress.say, options.start
-        finished = run(problem, *how, scheduler=options.scheduler)
+        finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
         progress.say("writing the run folder")
         finished.save(folder)
     if options.as_json:

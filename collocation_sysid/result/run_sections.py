@@ -31,6 +31,7 @@ from ..statistics.budget import worded
 from ..statistics.concern import Concern, topics_of
 from ..statistics.numerical import NumericalError
 from ..tree import content
+from .probe_sections import FOREMOST, asks_for_probes, probe_section
 from .replay import LARGEST, read_arrays, reading_run
 
 MEANINGS = {
@@ -38,8 +39,6 @@ MEANINGS = {
     "check": "usable after a look at the reasons",
     "doubtful": "something is wrong with the data, the model or the solve",
 }
-# What tells stiffness first, where there are several.
-FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
 # Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
 WORST, APART = 8, 5
 SHOWN_DIAGNOSES = 2
@@ -70,12 +69,22 @@ def summary(result: Result, folder: Path, budget: bool = False) -> list[Shown]:
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (_ended(result), *answer(result), _fit(result), _notes(result))
     tables = [budget_table(result)] if budget and result.budget else []
-    return [*flat(sections), *tables, *ended, f"written to {folder}"]
+    probed = flat([probe_section(result)])
+    return [*flat(sections), *tables, *probed, *ended, f"written to {folder}"]
 
 
 def answer(result: Result) -> list[Shown]:
     """Verdict, values, intervals and what these hold."""
-    return [*flat([_verdict(result), *how_to(result.trust.concerns), _parameters(result)])]
+    return [
+        *flat(
+            [
+                _verdict(result),
+                *how_to(result.trust.concerns),
+                *_harder(result),
+                _parameters(result),
+            ]
+        )
+    ]
 
 
 def run_report(run: str | Path) -> Section:
@@ -98,9 +107,10 @@ def run_report(run: str | Path) -> Section:
             replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
             *flat([_ended(result)]),
-            Section("What to do", tuple(_cures(result.trust.concerns))),
+            Section("What to do", (*_cures(result.trust.concerns), *_harder(result))),
             _parameters(result),
             Section("Error bars", tuple(_error_bars(result))),
+            probe_section(result),
             _fit(result),
             _notes(result),
             *_places(result),
@@ -134,6 +144,12 @@ def _verdict(result: Result, linked: bool = False) -> Section:
         said = (Span(f"  {concern.sentence}"), *[cure] * linked)
         lines.append(Line(said, verdict))
     return Section("", tuple(lines), style=f"verdict {verdict}")
+
+
+def _harder(result: Result) -> list[Line]:
+    """Whether to look harder."""
+    said = "look harder: solve --probe refits parts of the data, and with each assumption freed"
+    return [Line(said, "quiet")] if asks_for_probes(result) else []
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:

@@ -23,6 +23,7 @@ from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
 from ..statistics.numerical import Refinement
+from ..statistics.probes import Probe
 from ..statistics.profile import Profile
 from ..statistics.trust import Trust, cause_concerns, numerical_concerns
 from ..statistics.uncertainty import Place, Uncertainty, places_of
@@ -55,6 +56,8 @@ class Answer:
         What Ctrl-C left out after there was an answer.
     sources : Sources or None
         What moves the estimates beside the noise, where there are error bars.
+    probes : tuple of Probe
+        Refits of parts of the data and with assumptions freed, where these were asked for.
     """
 
     problem: Problem
@@ -68,6 +71,7 @@ class Answer:
     refinement: Refinement | None = None
     missing: str = ""
     sources: Sources | None = None
+    probes: tuple[Probe, ...] = ()
 
     def __repr__(self) -> str:
         solution = self.solution

@@ -13,6 +13,7 @@ from ..methods.solution import Iteration, Timing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import NumericalError
+from ..statistics.probes import Probe
 from ..statistics.trust import Trust
 from ..statistics.uncertainty import Place
 from ..tree import optional, read
@@ -210,7 +211,7 @@ class Result:
     """The content of ``result.json``, whose names are its keys.
 
     `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
-    has each source's share of an estimate's variance.
+    has each source's share of an estimate's variance; `probes` are there where they were asked for.
     """
 
     schema: int
@@ -225,6 +226,7 @@ class Result:
     derived: Mapping[str, FoundValue]
     basis: tuple[str, ...]
     budget: Mapping[str, Mapping[str, float]]
+    probes: tuple[Probe, ...]
     places: Mapping[str, Mapping[str, Place]]
     nuisance: Mapping[str, Mapping[str, FoundNuisance]]
     uncertainty: FoundUncertainty | None

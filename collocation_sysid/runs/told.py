@@ -60,6 +60,7 @@ def result_of(answer: Answer) -> Result:
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_basis(problem)),
         budget={name: line.shares for name, line in answer.budget.items()},
+        probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
         uncertainty=_uncertainty(answer),

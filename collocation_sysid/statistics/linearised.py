@@ -16,7 +16,7 @@ Lᵀ for the parameters, without any further inverse.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -77,7 +77,7 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 Mask = NDArray[np.bool_]
 
 # A parameter this near a bound, in its logarithm, is at it: interior-point methods stay inside.
-AT_BOUND = 1e-3
+AT_BOUND, NO_STEP = 1e-3, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +209,12 @@ class LinearisedFit:
         """Scalar measurements that are present."""
         return sum(block.measurements for block in self.blocks)
 
+    def after(self, step: Array) -> LinearisedFit:
+        """The same after a step (p,) of all parameters, to first order."""
+        moved = (replace(b, residual=b.residual + b.slope @ step) for b in self.blocks)
+        at_best = self.prior_residual + self.prior_slope * step
+        return replace(self, blocks=tuple(moved), prior_residual=at_best)
+
     @property
     def chi_squared(self) -> float:
         """Σ residual² of markers and wrenches, without priors."""
@@ -315,6 +321,6 @@ def rows_of(fit: LinearisedFit, numbers: Iterable[int]) -> LeastSquares:
 
 
 def best_step(fit: LinearisedFit) -> Array:
-    """(p,) step of all parameters to the least squares of what is linearised."""
-    free = np.full(len(fit.names), np.inf)
+    """(p,) step of the parameters to the least squares of what is linearised; at a bound none."""
+    free = np.where(fit.at_bound, NO_STEP, np.inf)
     return least_squares(fit).best(-free, free)

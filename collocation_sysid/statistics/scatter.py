@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from .distributions import chi2_sf
-from .linearised import LinearisedFit, best_step, least_squares, rows_of
+from .linearised import FitBlock, LinearisedFit, best_step, least_squares, rows_of
 
 # Probability that recordings without such an error are said to disagree, for all parameters.
 SIGNIFICANT = 0.01
@@ -103,34 +103,37 @@ def recordings_of(fit: LinearisedFit) -> dict[str, list[int]]:
 def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, Array]]:
     """The fit to each recording alone, and its shared parameters (nq,) less the joint ones.
 
-    Priors of shared parameters are no recording's, and left out. The numbers are those of its
-    blocks.
+    The numbers are those of its blocks.
     """
     for name, numbers in recordings_of(fit).items():
         # What recordings share they have to find alone, too.
         mine = [other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared :]]
         columns = np.r_[np.arange(fit.shared), fit.shared + np.flatnonzero(mine)]
-        prior_residual, prior_slope = (
-            np.where(columns < fit.shared, 0.0, prior[columns])
-            for prior in (fit.prior_residual, fit.prior_slope)
-        )
-        blocks = [fit.blocks[k] for k in numbers]
-        alone = replace(
-            fit,
-            blocks=tuple(replace(each, slope=each.slope[..., columns]) for each in blocks),
-            names=tuple(fit.names[k] for k in columns),
-            prior_residual=prior_residual,
-            prior_slope=prior_slope,
-            at_bound=np.zeros(len(columns), dtype=bool),
-        )
-        step = best_step(alone)
-        moved = [replace(b, residual=b.residual + b.slope @ step) for b in alone.blocks]
-        at_best = prior_residual + prior_slope * step
-        yield (
-            numbers,
-            replace(alone, blocks=tuple(moved), prior_residual=at_best),
-            step[: fit.shared],
-        )
+        alone, step = part_fit(fit, [fit.blocks[k] for k in numbers], columns)
+        yield numbers, alone, step[: fit.shared]
+
+
+def part_fit(
+    fit: LinearisedFit, blocks: Sequence[FitBlock], columns: Index
+) -> tuple[LinearisedFit, Array]:
+    """The fit of some parameters to some data alone, and these less the joint ones.
+
+    Priors of shared parameters are of all the data, and left out.
+    """
+    prior_residual, prior_slope = (
+        np.where(columns < fit.shared, 0.0, prior[columns])
+        for prior in (fit.prior_residual, fit.prior_slope)
+    )
+    alone = replace(
+        fit,
+        blocks=tuple(replace(each, slope=each.slope[..., columns]) for each in blocks),
+        names=tuple(fit.names[k] for k in columns),
+        prior_residual=prior_residual,
+        prior_slope=prior_slope,
+        at_bound=np.zeros(len(columns), dtype=bool),
+    )
+    step = best_step(alone)
+    return alone.after(step), step
 
 
 def scatter_of(fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]) -> Scatter:

@@ -1,0 +1,134 @@
+"""Probes tell which part of the data, or which assumption, makes a fit wrong that looks right."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem_files import run_command, write_problem
+from problems_small import hung_cube
+from scipy.interpolate import CubicSpline
+
+from collocation_sysid import (
+    Body,
+    Nuisance,
+    Problem,
+    Run,
+    UncertaintyOptions,
+    Unknown,
+    run,
+)
+from collocation_sysid.display import plain_text
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.result.run_sections import summary
+from collocation_sysid.runs.result import Result
+from collocation_sysid.statistics.assumptions import Assumptions
+from collocation_sysid.statistics.probes import WINDOWS, Probe
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from assumed_twins import wrong
+
+TRUTH = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
+FREED = ("density_gradient", "anisotropy", "stiffness_drift", "clock_rate")
+NOISE_M = 1e-4
+
+
+@cache
+def probed(fault: str = "", off: float = 0.0) -> Run:
+    """A cube that was swung, of which something is off, solved as if nothing were."""
+    hung = hung_cube(80)
+    hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0), nuisance=Nuisance.none())
+    swung = wrong(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
+    tracks = swung.markers.positions_m
+    if fault == "clock_rate":  # cameras' times are too large
+        tracks = CubicSpline(swung.t_s, tracks)(swung.t_s * (1 - off))
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
+    sigma_m = np.full(tracks.shape[1], NOISE_M)
+    seen = replace(swung.markers, positions_m=tracks, sigma_m=sigma_m)
+    parameters = Parameters.of({name: Unknown(value) for name, value in TRUTH.items()})
+    exact = {n: "none" for n in Assumptions().deviations if n not in FREED}
+    stated = Assumptions(**exact, density_gradient=0.1)
+    options = UncertaintyOptions(assumptions=stated)
+    problem = Problem([replace(swung, markers=seen)], parameters, substeps=1, uncertainty=options)
+    return run(problem, seek_causes=False, probe=True)
+
+
+def named(solved: Run, name: str) -> Probe:
+    (probe,) = (each for each in solved.probes if each.name == name)
+    return probe
+
+
+def told(solved: Run) -> list[str]:
+    """Freed assumptions that are told, the best first."""
+    freed = [p for p in solved.probes if p.kind == "assumption" and p.told]
+    return [p.name for p in sorted(freed, key=lambda p: -p.chi_squared)]
+
+
+def test_nothing_is_told_of_what_is_as_described():
+    faultless = probed()
+    assert [p.name for p in faultless.probes if p.kind == "window"] == list(WINDOWS)
+    assert not any(p.told for p in faultless.probes)
+
+
+@pytest.mark.parametrize(
+    ("name", "off", "of"),
+    [
+        ("density_gradient z", -0.1, "young_pa"),
+        ("stiffness_drift", -0.05, None),
+        ("clock_rate", 1e-3, "gamma_m_1_s"),
+    ],
+)
+def test_what_is_off_is_told_by_freeing_it(name, off, of):
+    solved = probed(name, off)
+    assert told(solved)[0] == name
+    probe = named(solved, name)
+    size = -off if name == "clock_rate" else off
+    assert abs(probe.size - size) < 3 * probe.size_error
+    if of is not None:  # which is nearer to the truth with it than without
+        move = probe.moves[of]
+        assert abs(move.value - TRUTH[of]) < 3 * move.std_error
+        assert abs(move.value - TRUTH[of]) < 0.5 * abs(move.value - move.change - TRUTH[of])
+
+
+def test_windows_of_time_have_the_stiffness_of_their_time():
+    drifting = probed("stiffness_drift", -0.05)
+    first, _, last = (named(drifting, w).moves["young_pa"].change for w in WINDOWS)
+    assert first > 0 > last
+    assert (first - last) / TRUTH["young_pa"] == pytest.approx(0.05 * 2 / 3, rel=0.3)
+
+
+def test_shares_of_both_intervals_stand_beside_every_change():
+    solved = probed("density_gradient z", -0.1)
+    low, high = solved.estimates["young_pa"].ci95
+    least, most = solved.estimates["young_pa"].whole95
+    move = named(solved, "density_gradient z").moves["young_pa"]
+    assert move.of_ci95 == pytest.approx(2 * move.change / (high - low))
+    assert move.of_whole95 == pytest.approx(2 * move.change / (most - least))
+
+
+def test_terminal_page_and_file_have_the_probes(tmp_path):
+    solved = probed("density_gradient z", -0.1)
+    folder = solved.save(tmp_path / "run", frames=False)
+    result = Result.read(folder)
+    assert {p.name for p in result.probes} == {p.name for p in solved.probes}
+    said = plain_text(summary(result, folder))
+    assert "the data tell density gradient z: -0.1" in said
+    assert "−Δχ²" in said
+    assert run_command("report", folder).code == 0
+    assert "the data tell density gradient z" in next(folder.glob("*.html")).read_text()
+
+
+def test_a_solve_probes_where_asked_to_and_says_where_it_would_help(tmp_path):
+    file = write_problem(tmp_path, {"swing": 12})
+    plain = run_command("solve", file, "--out", tmp_path / "plain", "--quiet")
+    assert Result.read(tmp_path / "plain").probes == ()
+    assert "solve --probe" in plain.out
+    probing = run_command("solve", file, "--out", tmp_path / "probed", "--quiet", "--probe")
+    assert Result.read(tmp_path / "probed").probes
+    assert "solve --probe" not in probing.out
+    assert "in half widths of the 95 % and of the whole interval" in " ".join(probing.out.split())
