@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape as escape_html
 from io import StringIO
+from math import isfinite
 from pathlib import Path
 
 from rich.console import Group, RenderableType
@@ -147,6 +148,28 @@ def own_pictures(folder: Path) -> list[Path]:
 def short(value: float) -> str:
     """Two digits, and no powers of ten for the sizes of bodies."""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+
+
+def number(value: float | None, digits: int = 5) -> str:
+    """A number as people write it; a dash for none."""
+    if value is None or not isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def millimetres(metres: float | None) -> str:
+    """A length in millimetres, to the micrometre at most."""
+    return "–" if metres is None or not isfinite(metres) else f"{1e3 * metres:.3g} mm"
+
+
+def duration(time_s: float | None) -> str:
+    """A rounded length of time."""
+    if time_s is None:
+        return "an unknown time"
+    for unit, seconds in (("h", 3600), ("min", 60)):
+        if time_s >= 2 * seconds:
+            return f"{time_s / seconds:.2g} {unit}"
+    return f"{time_s:.1g} s" if time_s < 10 else f"{time_s:.0f} s"
 
 
 def labelled(title: str, rows: dict[str, str]) -> Table:

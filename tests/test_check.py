@@ -21,7 +21,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.check_sections import check_table
+from collocation_sysid.result.check_sections import closer_table
 from collocation_sysid.runs.check import Findings, check_problem, glance
 from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import Cost, cost_concerns, cost_notes
@@ -349,12 +349,12 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None
     assert any("but for their first samples" in n and "check --full" in n for n in short.notes)
-    assert "markers are missed by" not in plain_text(check_table(short))
+    assert "markers are missed by" not in plain_text(closer_table(short))
     assert short.derivatives_agree
     assert not any("simulating the recordings" in each for each in told)
     whole = check_problem(problem, told.append, full=True)
     assert (whole.rms_at_guess_m or 0) > 0
-    assert "markers are missed by" in plain_text(check_table(whole))
+    assert "markers are missed by" in plain_text(closer_table(whole))
     assert any("simulating the recordings at the guess" in each for each in told)
     assert short.jacobian_nonzeros == whole.jacobian_nonzeros
 

@@ -46,7 +46,7 @@ from collocation_sysid.recording import (
     displaced_axes,
     read_displacement,
 )
-from collocation_sysid.result.check_sections import check_table
+from collocation_sysid.result.check_sections import closer_table
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
@@ -455,7 +455,7 @@ def test_a_test_bench_without_markers_is_checked(tmp_path):
     assert findings.derivatives_agree
     assert findings.samples == 0
     assert not findings.motions
-    said = plain_text(check_table(findings))
+    said = plain_text(closer_table(findings))
     assert "Modes" not in said
     assert "markers are missed" not in said
 

@@ -44,7 +44,7 @@ def refine(options: Refine) -> None:
     solved before, as of a call that was interrupted, is not solved again.
     """
     from ..result.refined import refine_run
-    from ..result.run_sections import refinement_table
+    from ..result.run_sections import refinement_table, verdict_of
 
     def say(what: str) -> None:
         if not options.quiet:
@@ -60,9 +60,7 @@ def refine(options: Refine) -> None:
     if options.as_json:
         typer.echo(as_json({**content(found), "trust": result.trust}))
     else:
-        show(refinement_table(found.errors))
-        for reason in result.trust.reasons:
-            show(f"{result.trust.verdict}: {reason}")
+        show([refinement_table(found.errors), verdict_of(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,15 +10,16 @@ from matplotlib.animation import PillowWriter
 from matplotlib.figure import Figure
 
 from ..arrays import Array
-from ..display import Line, Shown, Span, Table
+from ..display import Shown, Table, millimetres
 from ..errors import InputError
 from ..fem.constants import unit_of
 from ..files import whole_file
+from ..result.run_sections import verdict_of
 from ..result.style import BLUE, ORANGE, dress, mathematical, new_figure
 from .estimator import Update
 
 BARS = "▁▂▃▄▅▆▇█"
-COLUMNS = 40
+COLUMNS, SHOWN_REASONS = 40, 2
 WIDTH_MM, ROW_MM, DPI, FRAMES_A_SECOND = 160.0, 32.0, 100, 25
 
 
@@ -41,13 +42,11 @@ def picture(updates: Sequence[Update]) -> list[Shown]:
         error = "" if estimate.std_error is None else f"{estimate.std_error:.2g}"
         way = bars([update.estimates[name].value for update in updates[-COLUMNS:]])
         rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), way))
-    verdict = last.trust.verdict
-    reasons = "".join(f"; {reason}" for reason in last.trust.reasons[:2])
     return [
-        f"t = {last.t_s:.2f} s   markers missed by {1e3 * last.marker_rms_m:.2f} mm   "
+        f"t = {last.t_s:.2f} s   markers missed by {millimetres(last.marker_rms_m)}   "
         f"{1e3 * last.latency_s:.1f} ms",
         Table("", ("", "estimate", "±", "unit", "so far"), tuple(rows), names=5),
-        Line((Span(verdict, verdict), Span(reasons))),
+        verdict_of(last.trust, most=SHOWN_REASONS),
     ]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from ..fem.constants import unit_of
@@ -23,9 +23,12 @@ from ..result.style import (
     TEXT_PT,
     VERMILION,
     dress,
+    legend_above,
+    legend_of_all,
     log_axis,
     mathematical,
     new_figure,
+    plain_numbers,
 )
 from ..runs.result import Result
 from ..tree import read
@@ -70,14 +73,6 @@ def comparison_plots(
     return figures
 
 
-def _legend(axes: Axes, columns: int, height: float = 1.0) -> None:
-    """A legend over the axes, and over their title, where it hides nothing."""
-    axes.legend(
-        loc="lower left", bbox_to_anchor=(0.0, height), ncols=columns, fontsize=SMALL_PT,
-        frameon=False, borderaxespad=0.1, columnspacing=1.2, handlelength=1.6,
-    )  # fmt: skip
-
-
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     """Each method's colour and rows."""
     methods = dict.fromkeys(row["method"] for row in rows)
@@ -107,9 +102,8 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
         log_axis(axes)
         axes.set_xscale("log", nonpositive="mask")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_locator(NullLocator())
-    _legend(panels[0], 3, 1.1)
+        plain_numbers(axes.xaxis)
+    legend_above(panels[0], 3, 1.1)
     return figure
 
 
@@ -144,7 +138,7 @@ def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known:
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_ylim(-4, 104)
-    _legend(axes, 2, 1.1)
+    legend_above(axes, 2, 1.1)
     return figure
 
 
@@ -173,10 +167,9 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Fig
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
         axes.set_xlabel(mathematical(first), fontsize=TEXT_PT)
     _ratio_axes(panels[0, 0], max(distance(row, centre) for row in rows))
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper right", ncols=3, fontsize=SMALL_PT, frameon=False,
-        title=f"guesses over the {'truth' if known else 'best answer'}",
+    title = f"guesses over the {'truth' if known else 'best answer'}"
+    legend_of_all(
+        figure, 3, loc="outside upper right", fontsize=SMALL_PT, title=title,
         title_fontsize=SMALL_PT, alignment="right",
     )  # fmt: skip
     return figure
@@ -190,8 +183,7 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
     for axis, limit in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
         limit(0.8 / factor, 1.25 * factor)
         axis.set_major_locator(FixedLocator([1 / tick, 1, tick]))
-        axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.2g}"))
+        plain_numbers(axis, ".2g")
 
 
 # Answers ------------------------------------------------------------------------------------------
@@ -218,10 +210,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
         off = f", off by at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
         for axis, axes in enumerate(panels):
             axes.plot(track["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=method + off)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=2, fontsize=TEXT_PT, frameon=False
-    )
+    legend_of_all(figure, 2)
     return figure
 
 
@@ -254,7 +243,7 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
         shown = list(texts)[:: -(-len(texts) // MOST_TICKS)]
         bottom.set_xticks(shown, [texts[place] for place in shown])
         if len(swept) > 1:
-            _legend(panels[0, column], 2)
+            legend_above(panels[0, column], 2)
     for line in panels:
         drawn = np.concatenate([c.get_segments() for c in line[0].collections])[..., 1].ravel()
         if drawn.size and drawn.min() > 0 and drawn.max() > WIDE * drawn.min():

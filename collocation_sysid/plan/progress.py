@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from ..console import Watched
+from ..display import duration
 from .design.designing import FORBIDDEN
 from .process import Record
 from .study import PlannedRun
@@ -93,11 +94,3 @@ def time_left_s(
     means = {method: sum(of_method) / len(of_method) for method, of_method in walls.items()}
     expected = [means.get(method, overall) for method in waiting]
     return max(sum(expected) / slots, max(expected))
-
-
-def duration(time_s: float) -> str:
-    """A rounded length of time."""
-    for unit, seconds in (("h", 3600), ("min", 60)):
-        if time_s >= 2 * seconds:
-            return f"{time_s / seconds:.2g} {unit}"
-    return f"{time_s:.0f} s"

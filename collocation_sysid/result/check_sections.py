@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from ..display import Line, Shown, Table, labelled
+from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
 from ..runs.check import BodyFinding, Findings, Glance, Recording
 from ..runs.check.body import hold_sentence
 from .run_sections import how_to
 
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
-
-
-def check_table(findings: Findings) -> list[Shown]:
-    """The findings of a check on one screen, warnings last."""
-    return [*glance_table(findings), *closer_table(findings)]
 
 
 def glance_table(found: Glance | Findings) -> list[Shown]:
@@ -143,21 +138,12 @@ def _solve_section(findings: Findings) -> Table:
         )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
-        rows[cost.method] = f"about {_duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"
+        rows[cost.method] = f"about {duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"
     rows["derivatives"] = (
         f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
         f"{findings.hessian_error:.0e} of differences"
     )
     return labelled("Solve", rows)
-
-
-def _duration(time_s: float | None) -> str:
-    if time_s is None:
-        return "an unknown time"
-    for unit, seconds in (("h", 3600), ("min", 60)):
-        if time_s >= 2 * seconds:
-            return f"{time_s / seconds:.2g} {unit}"
-    return f"{time_s:.1g} s" if time_s < 10 else f"{time_s:.0f} s"
 
 
 def _memory(memory_mb: float) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,8 @@ from ..display import (
     Span,
     Table,
     flat,
+    millimetres,
+    number,
     own_pictures,
     short,
 )
@@ -30,6 +31,7 @@ from ..runs.result import FoundValue, Result, SimulatedExperiment
 from ..statistics.budget import worded
 from ..statistics.concern import Concern, topics_of
 from ..statistics.numerical import NumericalError
+from ..statistics.trust import Trust
 from ..tree import content
 from .probe_sections import FOREMOST, asks_for_probes, probe_section
 from .replay import LARGEST, read_arrays, reading_run
@@ -75,16 +77,8 @@ def summary(result: Result, folder: Path, budget: bool = False) -> list[Shown]:
 
 def answer(result: Result) -> list[Shown]:
     """Verdict, values, intervals and what these hold."""
-    return [
-        *flat(
-            [
-                _verdict(result),
-                *how_to(result.trust.concerns),
-                *_harder(result),
-                _parameters(result),
-            ]
-        )
-    ]
+    verdict = verdict_of(result.trust), *how_to(result.trust.concerns)
+    return [*flat([*verdict, *_harder(result), _parameters(result)])]
 
 
 def run_report(run: str | Path) -> Section:
@@ -98,7 +92,7 @@ def run_report(run: str | Path) -> Section:
     run = Path(run)
     result = Result.read(run)
     with reading_run(run):
-        verdict, took_s = _verdict(result, linked=True), f"{result.timing_s.total:.3g} s"
+        verdict, took_s = verdict_of(result.trust, linked=True), f"{result.timing_s.total:.3g} s"
         took = f" {result.method}, {result.iterations} iterations, {took_s}"
         badge = Span(result.status, f"badge {result.trust.verdict}")
         meaning = Line(f"{MEANINGS[result.trust.verdict]}.", "quiet")
@@ -135,11 +129,11 @@ def _ended(result: Result) -> Section:
     return Section("", tuple(parts))
 
 
-def _verdict(result: Result, linked: bool = False) -> Section:
-    """In one word, with the reasons, linked to their cures on a page."""
-    verdict = result.trust.verdict
+def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> Section:
+    """In one word, with the reasons or the gravest of them, linked to their cures on a page."""
+    verdict = trust.verdict
     lines = [Line(f"Verdict: {verdict}", f"strong {verdict}")]
-    for concern in result.trust.concerns:
+    for concern in trust.concerns[:most]:
         cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
         said = (Span(f"  {concern.sentence}"), *[cure] * linked)
         lines.append(Line(said, verdict))
@@ -436,15 +430,3 @@ def _size(value: float | None, unit: str) -> str:
     # No powers of ten for the sizes of bodies.
     digits = 2 if value is None or abs(factor * value) < 99.5 else 4
     return "–" if value is None else f"{number(factor * value, digits)}{shown}"
-
-
-def number(value: float | None, digits: int = 5) -> str:
-    """A number as people write it; a dash for none."""
-    if value is None or not isfinite(value):
-        return "–"
-    return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
-
-
-def millimetres(metres: float | None) -> str:
-    """A length in millimetres, to the micrometre at most."""
-    return "–" if metres is None or not isfinite(metres) else f"{1e3 * metres:.3g} mm"

@@ -8,8 +8,10 @@ from __future__ import annotations
 import warnings
 from io import BytesIO
 from math import inf
+from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
@@ -109,13 +111,26 @@ def legend(axes: Axes, title: str = "") -> None:
     box.get_frame().set(edgecolor="none", facecolor="white")
 
 
-def legend_above(axes: Axes, columns: int) -> None:
-    """A legend over the axes, where it hides nothing."""
+def legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
+    """A legend over the axes, or over their title at a `height`, where it hides nothing."""
     axes.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize=SMALL_PT,
+        loc="lower left", bbox_to_anchor=(0.0, height), ncols=columns, fontsize=SMALL_PT,
         frameon=False, borderaxespad=0.1, borderpad=0.1, columnspacing=1.2, handlelength=1.6,
         labelspacing=0.2,
     )  # fmt: skip
+
+
+def legend_of_all(figure: Figure, columns: int, **how: Any) -> None:
+    """A legend over all axes of a figure, which those of the first have the lines of."""
+    handles, labels = figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
+    place = {"loc": "outside upper left", "fontsize": TEXT_PT, "frameon": False}
+    figure.legend(handles, labels, ncols=columns, **place | how)
+
+
+def plain_numbers(axis: Axis, form: str = "g") -> None:
+    """Numbers without powers of ten along a logarithmic axis, and no ticks between."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: format(value, form)))
+    axis.set_minor_locator(NullLocator())
 
 
 def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
@@ -132,6 +147,6 @@ def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=subs if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
     if few and low > 1e-3 and high < 1e5:
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        plain_numbers(axes.yaxis)
     else:
         axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(inf, inf)))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from ...display import Line, Shown, Table
 from ...fem.constants import symbol_of, with_unit
@@ -21,6 +20,7 @@ from ...result.style import (
     legend_above,
     mathematical,
     new_figure,
+    plain_numbers,
 )
 from .designing import Design
 from .motion import angular_motion
@@ -136,7 +136,7 @@ def error_bars_picture(design: Design) -> Figure:
         axes.hlines(rows + shift, low, high, color=colour, lw=2.5, alpha=0.4)
         axes.plot(middle, rows + shift, "o", color=colour, ms=4, mec="none", label=label)
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    plain_numbers(axes.xaxis)
     axes.set_yticks(rows, [mathematical(name) or symbol_of(name) for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     dress(axes, "", "predicted standard error [%]", "")

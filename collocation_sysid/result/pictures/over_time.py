@@ -22,6 +22,7 @@ from ..style import (
     dress,
     framed_figure,
     legend_above,
+    legend_of_all,
     log_axis,
 )
 
@@ -105,7 +106,9 @@ def tracks(
             lower.tick_params(labelbottom=row == len(shown) - 1)
             if row == len(shown) - 1:
                 lower.set_xlabel("time [s]", fontsize=TEXT_PT)
-    _legend(figure, height, title)
+    place = {"loc": "upper left", "bbox_to_anchor": (0.005, 1 - 1.0 / height), "borderaxespad": 0.0}
+    said = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
+    legend_of_all(figure, 3, markerscale=2, **place, **said)
     return figure
 
 
@@ -123,15 +126,6 @@ def _boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
 
 def _width_mm() -> float:
     return (PAGE_MM - LEFT_MM - RIGHT_MM - 2 * BETWEEN_MM) / 3
-
-
-def _legend(figure: Figure, height: float, title: str) -> None:
-    handles, labels = figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
-    figure.legend(
-        handles, labels, loc="upper left", bbox_to_anchor=(0.005, 1 - 1.0 / height), ncols=3,
-        fontsize=TEXT_PT, frameon=False, title=title, title_fontsize=TEXT_PT, alignment="left",
-        borderaxespad=0.0, markerscale=2,
-    )  # fmt: skip
 
 
 def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> list[int]:
@@ -222,8 +216,5 @@ def readings_picture(said: Array, names: Sequence[str], units: Sequence[str] = (
             each.plot(t_s[:, 0], values[:, k], label=label, **style)
     for each in grid.flat[len(shown) :]:
         each.set_visible(False)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=3, fontsize=TEXT_PT, frameon=False
-    )
+    legend_of_all(figure, 3)
     return figure
