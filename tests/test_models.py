@@ -12,17 +12,27 @@ import numpy as np
 import pytest
 from fits_small import autoregressive, problem
 from problem_files import EXPERIMENT, PROBLEM, run_command, write_problem
-from problems_small import TRUTH, as_theta, smooth_poses, times
+from problems_small import TRUTH, as_theta, box, hung_cube, smooth_poses, times
 from test_models_in_files import TWO_REGIONS
 from test_static import block
 from wrenches_small import fitted
 
 from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.plan import PlannedRun, plan_models
-from collocation_sysid.plan.choice import advice, evidence_of, model_record, model_rows, without
+from collocation_sysid.plan.choice import (
+    advice,
+    evidence_of,
+    law_disagreements,
+    model_record,
+    model_rows,
+    without,
+)
+from collocation_sysid.plan.laws import law_table
 from collocation_sysid.plan.variants import (
     file_variants,
     models,
@@ -32,9 +42,16 @@ from collocation_sysid.plan.variants import (
     variants,
 )
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.marching import march
-from collocation_sysid.recording import Experiment, Markers, Wrench, write_poses_csv
+from collocation_sysid.recording import (
+    Experiment,
+    Markers,
+    Wrench,
+    write_poses_csv,
+)
 from collocation_sysid.result.synthesis import Recipe, write_data
+from collocation_sysid.statistics.linearised import Derived
 
 BOTH = ("neo-hookean", "yeoh")
 DAMPING = "gamma_r_s = 0.009, gamma_m_1_s = 1.0, lambda_pa = 120.0"
@@ -445,6 +462,40 @@ def test_models_that_predict_alike_tell_what_they_disagree_about():
     assert "By those that predict alike, E is 7e+04 to 1e+05 Pa" in said
     said = advice(rows_of(model("a", 1.001, 70e3), model("b", 1.0, 71e3), model("c", 2.0, 200e3)))
     assert "E is" not in said
+
+
+def test_the_law_is_a_source_of_the_chosen_ones_budget():
+    found = {}
+    for name, free, young_pa in (("a", 3, 70e3), ("b", 4, 100e3)):
+        model = row_of(name, free, {"a": WAVY.tolist()}, 900)
+        model["found"][""]["parameters"] = {"young_pa": young_pa, "c10_pa": young_pa / 7}
+        whole95 = (young_pa / 1.04, young_pa * 1.04)
+        line = {"shares": {"noise": 0.8, "mass": 0.2}, "whole95": whole95}
+        model["found"][""]["budget"] = {"young_pa": line}
+        found[name] = model
+    rows = rows_of(found["a"], found["b"])
+    (told,) = law_disagreements(rows)  # constants of a law have no meaning in another
+    assert told.values == {"a": 70e3, "b": 100e3}
+    apart, known = np.log(100 / 70) / np.sqrt(2), np.log(1.04) / 1.96
+    assert told.share == pytest.approx(apart**2 / (apart**2 + known**2))
+    assert told.whole95[1] == pytest.approx(70e3 * np.exp(1.96 * np.hypot(apart, known)))
+    assert told.whole95[0] < 70e3 < 100e3 < told.whole95[1]
+    assert "with the law (99% of the variance), 6.73e+04 to 7.28e+04 without" in advice(rows)
+    table = law_table([told])
+    assert table.rows[0][:4] == ("E Pa", "7e+04", "1e+05", "43 %")
+
+
+@pytest.mark.parametrize("law", MATERIALS)
+def test_every_law_has_a_stiffness_at_small_strain(law):
+    own = {c.name: Unknown(c.usual or 1e3) for c in MATERIALS[law].constants}
+    values = own | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    body = Body(box().mesh, density_kg_m3=30.0, material=law)
+    hung = replace(hung_cube(2), body=body)
+    collocation = Collocation([hung], Parameters.of(values))
+    constants = (segment.constants for segment in collocation.segments)
+    numbers = Derived.of(constants, collocation.guess_p[: collocation.nq])
+    assert numbers.values["young_pa"] > 0
+    assert numbers.by_q["young_pa"].any()
 
 
 def test_a_model_that_fits_better_but_predicts_worse_is_not_taken():

@@ -27,8 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SimulationError
-from ..fem.constants import bare, symbol_of
+from ..errors import InputError, SimulationError
 from ..methods.solution import Solution, pooled_wrench_rms
 from ..problem import Problem, RolloutOptions
 from ..program.simulation import with_markers
@@ -37,8 +36,12 @@ from ..recording.grasp import Grasp
 from ..runs.forward_simulation import Rollout, roll_out
 from ..runs.solving import solve
 from ..statistics.autocorrelation import ErrorProcess, error_processes
+from ..statistics.budget import Sources, budget
+from ..statistics.considered import assumed
 from ..statistics.linearised import Derived, FitBlock, LinearisedFit, information, linearised_fit
 from ..statistics.noise import ROUNDING
+from ..statistics.uncertainty import uncertainty_of
+from .laws import Disagreement, disagreements
 from .process import Record
 from .study import PlannedRun, recordings
 from .table import Row
@@ -49,8 +52,6 @@ ALIKE = 0.01
 # Anderson 2002, section 2.6); and standard errors of a prediction.
 NO_SUPPORT, SUPPORT = 10.0, 2.0
 SURE, LIKELY = 2.0, 1.0
-# Ratio of small-strain stiffnesses beyond which models that predict alike disagree.
-APART = 1.05
 
 
 def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> list[Row]:
@@ -87,6 +88,7 @@ def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
         "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
         "evidence": evidence,
         "parameters": whole.get("parameters") or {},
+        "budget": whole.get("budget") or {},
         "total_s": sum(each.get("time_s") or 0.0 for each in fits.values()),
     }
 
@@ -181,22 +183,22 @@ def advice(rows: Sequence[Row]) -> str:
         return " ".join([f"{use}: no other predicts what is held out.", *lost])
     rival = min(predicted, key=lambda row: row["log_ratio"])
     said = [f"{use}: {_compared(chosen, rival)}.", _sureness(chosen, rival), *lost]
-    return " ".join([*said, *_stiffness_told([chosen, *predicted])])
+    return " ".join([*said, *(each.sentence for each in law_disagreements(rows))])
 
 
-def _stiffness_told(rows: Sequence[Row]) -> list[str]:
-    """How far the models that predict as well as the best disagree about E at small strain."""
-    alike = [r for r in rows if r["log_ratio"] <= max(ALIKE, SURE * r["log_ratio_error"])]
-    said = []
-    for name in dict.fromkeys(n for r in alike for n in r["parameters"] if bare(n) == "young_pa"):
-        values = [r["parameters"][name] for r in alike if r["parameters"].get(name)]
-        low, high = min(values, default=1.0), max(values, default=1.0)
-        if high > APART * low:
-            said.append(
-                f"By those that predict alike, {symbol_of(name)} is {low:.3g} to {high:.3g} Pa: "
-                "these recordings do not tell it better."
-            )
-    return said
+def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
+    """The numbers that the models which predict as well as the best disagree about."""
+    chosen = next((row for row in rows if row["chosen"]), None)
+    if chosen is None or chosen["log_ratio"] is None:
+        return []
+    alike = [
+        row
+        for row in rows
+        if row["converged"]
+        and row["log_ratio"] is not None
+        and row["log_ratio"] <= max(ALIKE, SURE * row["log_ratio_error"])
+    ]
+    return disagreements(alike, chosen)
 
 
 def _lost(row: Row, chosen: Row) -> str:
@@ -371,7 +373,10 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
             fit = linearised_fit(solution.collocation, solution.z)
         except SimulationError as error:
             return record | {"converged": False, "status": str(error)}
-        return record | {"evidence": asdict(evidence_of(fit))}
+        return record | {
+            "evidence": asdict(evidence_of(fit)),
+            "budget": _budget(problem, solution, fit),
+        }
     experiment = next(e for e in known.experiments if e.name == held_out)
     # With the scheme that was fitted: what is compared are models, not integrators.
     rollout = roll_out(replace(known, rollout=RolloutOptions("scheme")), experiment, solution)
@@ -379,6 +384,20 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
         return record | {"prediction": None, "failure": rollout}
     whole = next(e for e in problem.experiments if e.name == held_out)
     return record | {"prediction": _missed(whole, rollout, start_s)}
+
+
+def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
+    """What the variance of each estimate is made of, but for noise of the poses, step and mesh."""
+    options, parameters = problem.uncertainty, solution.collocation.parameters
+    try:
+        known = uncertainty_of(fit, parameters, solution.q, options.noise, options.errors)
+        changes = assumed(solution.collocation, solution.z, options.assumptions.deviations)
+    except (InputError, SimulationError):
+        return {}  # without error bars there is none
+    sources = Sources.of(fit, changes, parameters, solution.q, known)
+    return {
+        name: asdict(line) for name, line in budget(sources, known, {}, parameters.linear).items()
+    }
 
 
 def without(problem: Problem, name: str) -> tuple[Problem, float]:

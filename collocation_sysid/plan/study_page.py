@@ -14,7 +14,8 @@ from ..display import Items, Line, Section, Shown, Table, as_markdown
 from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import SCHEMA, whole_file, write_whole
 from ..tree import as_json
-from .choice import advice, model_notes, model_rows, shown_in
+from .choice import advice, law_disagreements, model_notes, model_rows, shown_in
+from .laws import law_table
 from .plots import comparison_plots, sweep_plots
 from .process import Record, RunStore
 from .study import PlannedRun, short_keys
@@ -71,7 +72,8 @@ class StudyReport:
         if self.kind == "compare":
             return comparison_views(method_rows(self.rows))
         if self.kind == "models":
-            return model_views(self.rows)
+            told = law_disagreements(self.rows)
+            return [*model_views(self.rows), *([law_table(told)] if told else [])]
         return sweep_views(self.rows, list(self.planned[0].swept))
 
     @property
@@ -197,7 +199,7 @@ def report_json(report: StudyReport) -> dict[str, Any]:
             "methods": method_rows(rows),
         }
     elif report.kind == "models":
-        content["advice"] = advice(rows)
+        content |= {"advice": advice(rows), "laws": law_disagreements(rows)}
     else:
         content["swept"] = list(first.swept)
     return content

@@ -43,6 +43,15 @@ class BudgetLine:
     shares: Mapping[str, float]
     whole95: tuple[float, float]
 
+    def widened(self, source: str, deviation: float, at: Coordinate) -> BudgetLine:
+        """With one more source, of a deviation in a coordinate."""
+        low, high = map(at.at, self.whole95)
+        known, more = ((high - low) / 2 / NORMAL) ** 2, deviation**2
+        shares = {name: share * known / (known + more) for name, share in self.shares.items()}
+        shares[source] = more / (known + more)
+        ranked = dict(sorted(shares.items(), key=lambda part: -part[1]))
+        return BudgetLine(ranked, _whole(at, (low, high), NORMAL * deviation))
+
 
 @dataclass(frozen=True, eq=False)
 class Sources:
