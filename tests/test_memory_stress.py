@@ -18,6 +18,7 @@ from collocation_sysid.fem.materials import Prony
 from collocation_sysid.fem.memory import fading
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.viscoelasticity import Fading, History, Remembered
 from collocation_sysid.program.block_band import whole
 from collocation_sysid.program.simulation import simulate
@@ -41,7 +42,11 @@ def strained(body: Body, size_m: float = 0.003, states: int = 1) -> np.ndarray:
 
 
 def total_force(body: Body, x: np.ndarray, theta: np.ndarray, memory: Remembered) -> np.ndarray:
-    return body.force(x, np.zeros_like(x), theta, carried=memory.now)[0]
+    return memory.now(Forces.on(body, theta)).total(x, np.zeros_like(x))[0]
+
+
+def after(memory: Remembered, x: np.ndarray, interval_s: float) -> Remembered:
+    return memory.following(Forces.on(memory.body, memory.theta), x, 0 * x, interval_s)
 
 
 # Closed forms of the standard linear solid ------------------------------------------------------
@@ -51,12 +56,12 @@ def total_force(body: Body, x: np.ndarray, theta: np.ndarray, memory: Remembered
 def test_the_force_of_a_held_shape_relaxes_exponentially(intervals: int):
     body, held_s = body_of(), 0.3
     theta, (x,) = body.theta(ONE), strained(body)
-    memory = Remembered.at_start(body, body.nodes_m.ravel(), theta, np.inf).after(x, 1e-12)
+    memory = after(Remembered.at_start(body, body.nodes_m.ravel(), theta, np.inf), x, 1e-12)
     long_term = body.force(x, 0 * x, theta)[0]
     at_once = total_force(body, x, theta, memory)
     assert relative_error(at_once, (1 + SHARE) * long_term) < 1e-9
     for _ in range(intervals):
-        memory = memory.after(x, held_s / intervals)
+        memory = after(memory, x, held_s / intervals)
     expected = (1 + SHARE * np.exp(-held_s / TAU_S)) * long_term
     assert relative_error(total_force(body, x, theta, memory), expected) < 1e-9
 
@@ -118,14 +123,14 @@ def test_an_oscillating_strain_has_the_storage_and_loss_modulus():
 def test_turning_rigidly_turns_the_force_and_changes_no_stress():
     body = body_of(prony=["prony_1", "prony_2"])
     theta, (first, second) = body.theta(TWO), strained(body, states=2)
-    memory = Remembered.at_start(body, first, theta, 0.05).after(second, 0.02)
+    memory = after(Remembered.at_start(body, first, theta, 0.05), second, 0.02)
     turn = Rotation.from_rotvec([0.7, -1.1, 2.0]).as_matrix()
     turned = (second.reshape(-1, 3) @ turn.T).ravel()
     np.testing.assert_allclose(
         body.stresses.stress(turned[None], theta)[0], memory.stress, atol=1e-10
     )
     expected = total_force(body, second, theta, memory).reshape(-1, 3) @ turn.T
-    found = total_force(body, turned, theta, memory.after(turned, 1e-12))
+    found = total_force(body, turned, theta, after(memory, turned, 1e-12))
     assert relative_error(found.reshape(-1, 3), expected) < 1e-9
 
 

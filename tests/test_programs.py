@@ -47,6 +47,7 @@ from test_wrench import pressed
 from wrenches_small import EVERYTHING, felt, sensing, wristed_cube
 
 import collocation_sysid as cs
+from collocation_sysid.fem.node_force import On
 from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
@@ -107,9 +108,24 @@ def breathing(x, v, at, breath_pa):
     return -breath_pa * (1 + 10 * at.t_s + ca.dot(v, at.normal)) * at.area_m2 * at.normal
 
 
-def in_field(law: Callable, scheme: str = "midpoint", on="nodes", **memory) -> Collocation:
+def creeping(x, v, before, at, creep_n_m):
+    """It bends by all that it takes, as friction does; what creeps slows down as it goes."""
+    moved, rate = x - at.rest_m + 0.02 * v, creep_n_m * at.volume_m3 * 1e4
+    share = 20 * at.since_s / (1 + 20 * at.since_s + ca.sumsqr(before) / 1e-3)
+    after = before + (1 - at.began) * share * (1 + ca.sin(rate)) * (moved - before)
+    return -rate * (moved - after) * (1 + ca.sumsqr(before) / 1e-3), after
+
+
+def in_field(
+    law: Callable,
+    scheme: str = "midpoint",
+    on: On = "nodes",
+    carries: int = 0,
+    moved: Experiment | None = None,
+    **memory,
+) -> Collocation:
     """With a force of a user."""
-    force, cube = cs.NodeForce.of(law, on=on), hung_cube(5, (1, 1, 2))
+    force, cube = cs.NodeForce.of(law, on=on, carries=carries), moved or hung_cube(5, (1, 1, 2))
     body = cs.Body(
         cube.body.mesh, density_kg_m3=30.0, forces=[force], prony=["prony_1"] if memory else []
     )
@@ -325,6 +341,19 @@ PROGRAMS: dict[str, Make] = {
     "contact, static": lambda: touched(kind="static", felt=True),
     "contact, static, friction": lambda: touched(
         "friction", kind="static", felt=True, nuisance=OF_OBSTACLES
+    ),
+    "carried by a force": lambda: in_field(creeping, carries=3),
+    "carried by a force, bdf2": lambda: in_field(creeping, "bdf2", carries=3),
+    "carried by a force, memory": lambda: in_field(
+        creeping, carries=3, **{"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)}
+    ),
+    "carried by a force, faces": lambda: in_field(creeping, on="faces", carries=3),
+    "carried by a force, let go": lambda: in_field(creeping, carries=3, moved=bar_let_go(6)),
+    "carried by a force, wrench": lambda: in_field(
+        creeping, carries=3, moved=sensing(hung_cube(5, (1, 1, 2)), frame="grasp")
+    ),
+    "carried by a force, static": lambda: in_field(
+        creeping, carries=3, moved=block("z", gravity_m_s2=HANGING)
     ),
     "instruments": instruments,
     "instruments, bdf2": lambda: instruments("bdf2"),

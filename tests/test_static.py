@@ -281,7 +281,7 @@ def test_a_held_block_relaxes_as_the_standard_linear_solid():
     theta = body.theta(values)
     x = np.tile((body.nodes_m * [1.0, 1.0, 0.8]).ravel(), (len(t_s), 1))
     dynamics = Dynamics.of(free, "midpoint").with_theta(theta)
-    carried = dynamics.carried(dynamics.history(x))
+    carried = dynamics.forces_along(dynamics.histories(x)).past
     force = body.force(x, 0 * x, theta, carried=carried)
     relaxed = body.force(x[:1], 0 * x[:1], theta)
     expected = (1 + share * np.exp(-t_s / tau_s))[:, None] * relaxed

@@ -407,16 +407,16 @@ class Body(Discretisation):
         out: Array | None = None,
         tied_kg: Array | None = None,
         carried: Past | None = None,
-        stress_weights: Array | None = None,
     ) -> Curvature:
-        """Second derivatives of wᵀ f + σ·S at T states, see `Curvature` and `force`.
+        """Second derivatives of wᵀ f + σ·S at T states, see `Curvature`, `Past` and `force`.
 
-        `weights` are like `positions`, and σ of what points with memory carry. H counts as given.
+        `weights` are like `positions`. H counts as given.
         """
         x, v, w = self._states(positions, velocities, weights)
         if self.remembers:
             carried = carried or self.memory.nothing(len(x))
-            own = np.zeros_like(carried.overstress) if stress_weights is None else stress_weights
+            own = carried.stress_weights
+            own = np.zeros_like(carried.overstress) if own is None else own
             both = replace(carried, overstress=np.hstack([carried.overstress, own]))
             rows = self._evaluate("curvature", [x, v, w], theta, out, both)
         else:

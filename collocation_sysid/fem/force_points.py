@@ -103,13 +103,13 @@ class ForcePoints:
     @cached_property
     def _operator(self) -> sp.csr_array:
         """(i · 3L, 3n)."""
-        instance, local, node, weight = self._pairs
+        instance, local, node, weight = self.pairs
         shape = self.count * self.dofs, 3 * self.node_count
         return sp.csr_array((weight, (instance * self.dofs + local, node)), shape=shape)
 
     @cached_property
-    def _pairs(self) -> tuple[Index, Index, Index, Array]:
-        """Instance, number among 3L, dof, and weight, of all that are not zero."""
+    def pairs(self) -> tuple[Index, Index, Index, Array]:
+        """(P,) instance, number among 3L, dof, and weight, of all that are not zero."""
         instance, vector, place = np.nonzero(self.mix)
         weight = self.mix[instance, vector, place]
         axes = np.arange(3)
@@ -127,7 +127,7 @@ class ForcePoints:
 
     def _onto(self, skew: bool) -> sp.csc_array:
         """What sums lower triangles (i, d(d + 1)/2), column after column, into the entries."""
-        instance, local, dof, weight = self._pairs
+        instance, local, dof, weight = self.pairs
         order = np.argsort(instance, kind="stable")
         instance, local, dof = instance[order], local[order], dof[order]
         weight = weight[order]

@@ -40,12 +40,15 @@ class Past:
     stiffening : (T, parts) s of each part
     slopes : (T, k) derivative of its part's s by each of θ
     bends : (T, k, k) second derivatives; those by constants of different parts are zero
+    stress_weights : (T, width) σ, optional
+        What S counts besides in second derivatives.
     """
 
     overstress: Array
     stiffening: Array
     slopes: Array
     bends: Array
+    stress_weights: Array | None = None
 
     def runs(self, part: int) -> Iterator[tuple[slice, float]]:
         """Rows that follow one another with the same s of a part, and that."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
@@ -43,6 +43,8 @@ class AtNode(NamedTuple):
         The area of a face is that which it has now, and its volume zero.
     normal : (3,) outward, of length one; of a node undeformed, and zero inside
         That of a face is as it is now.
+    since_s : time since the evaluation before
+    began : one where there is none, which is the start, else zero
     """
 
     t_s: ca.SX
@@ -50,10 +52,13 @@ class AtNode(NamedTuple):
     area_m2: ca.SX
     volume_m3: ca.SX
     normal: ca.SX
+    since_s: ca.SX
+    began: ca.SX
 
 
-# Of the numbers of an `AtNode`, in its order.
-DATA = 9
+# Where the numbers of an `AtNode` end, in its order.
+ENDS = (0, 1, 4, 5, 6, 9, 10, 11)
+DATA = ENDS[-1]
 # The corners of a triangle for trying laws.
 TRIANGLE_M = (0.1, 0.2, 0.3, 0.2, 0.2, 0.3, 0.1, 0.3, 0.3)
 
@@ -75,6 +80,10 @@ class NodeForce:
     on : {"nodes", "faces"}
         On faces of the surface, all of whose nodes are chosen; quadratic ones are as if folded
         along their middles.
+    carries : int
+        So many numbers of a node or face are carried from evaluation to evaluation, such as how far
+        a dashpot has crept: then ``law(x, v, before, at, **constants) -> (force, after)``, where
+        `before` (carries,) are those of the evaluation before, zero at the start.
     """
 
     name: str
@@ -82,6 +91,7 @@ class NodeForce:
     constants: tuple[Constant, ...]
     nodes: Selection | Index | None = None
     on: On = "nodes"
+    carries: int = 0
 
     @classmethod
     def of(
@@ -91,6 +101,7 @@ class NodeForce:
         nodes: Selection | ArrayLike | None = None,
         name: str | None = None,
         on: On = "nodes",
+        carries: int = 0,
     ) -> NodeForce:
         """A force by a law; its arguments after x, v and at name the constants, with their units.
 
@@ -103,6 +114,7 @@ class NodeForce:
             All by default.
         name : str, optional
         on : {"nodes", "faces"}
+        carries : int
 
         Raises
         ------
@@ -111,7 +123,7 @@ class NodeForce:
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         told = {constant.name: constant for constant in constants}
-        arguments = list(inspect.signature(law).parameters)[3:]
+        arguments = list(inspect.signature(law).parameters)[4 if carries else 3 :]
         if unused := sorted(set(told) - set(arguments)):
             raise InputError(
                 f"force {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
@@ -122,32 +134,41 @@ class NodeForce:
             raise InputError(
                 f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
             )
-        found = cls(name, law, known, chosen, on)
+        found = cls(name, law, known, chosen, on, carries)
         found._check()
         return found
 
     def expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Forces (3k,) on k nodes of u = (x, v, constants), and the data of an `AtNode`."""
-        dofs = (u.numel() - len(self.constants)) // 2
-        x, v, values = ca.vertsplit(u, [0, dofs, 2 * dofs, u.numel()])
-        at = AtNode(data[0], data[1:4], data[4], data[5], data[6:9])
+        """Forces (3k,) on k nodes and what they leave, of u = (x, v, constants, before) and data.
+
+        These are the numbers of an `AtNode`.
+        """
+        dofs = (u.numel() - len(self.constants) - self.carries) // 2
+        ends = [0, dofs, 2 * dofs, u.numel() - self.carries, u.numel()]
+        x, v, values, before = ca.vertsplit(u, ends)
+        at = AtNode(*ca.vertsplit(data, [*ENDS]))
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
         if self.on == "nodes":
-            return self._valued(x, v, at, named)
+            return ca.vertcat(*self._valued(x, v, before, at, named))
         places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
         area = area_vector(places)
         size = ca.norm_2(area)
         at = at._replace(area_m2=size, normal=area / size)
-        force = self._valued(middle(x), middle(v), at, named)
-        return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3)
+        force, after = self._valued(middle(x), middle(v), before, at, named)
+        return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after)
 
-    def _valued(self, x: ca.SX, v: ca.SX, at: AtNode, named: dict[str, ca.SX]) -> ca.SX:
-        found = self.law(x, v, at, **named)
-        return ca.SX(ca.vertcat(*found) if isinstance(found, (list, tuple)) else found)
+    def _valued(
+        self, x: ca.SX, v: ca.SX, before: ca.SX, at: AtNode, named: dict[str, ca.SX]
+    ) -> tuple[ca.SX, ca.SX]:
+        """The force, and what is left to the next evaluation."""
+        if not self.carries:
+            return _column(self.law(x, v, at, **named)), ca.SX.zeros(0)
+        force, after = self.law(x, v, before, at, **named)
+        return _column(force), _column(after)
 
     def inputs(self, dofs: int) -> int:
         """Length of u for so many dofs."""
-        return 2 * dofs + len(self.constants)
+        return 2 * dofs + len(self.constants) + self.carries
 
     @property
     def _dofs(self) -> int:
@@ -178,27 +199,34 @@ class NodeForce:
         for _ in range(3):
             some = [rng.uniform(0.5, 1.0, size) for size in (self.inputs(dofs), DATA)]
             values = self._slopes(*some)[1].full()
+            values = values[:dofs]
             for k, part in enumerate((values[:, :dofs], values[:, dofs : 2 * dofs])):
                 size = np.abs(part).max() or 1.0
                 found[k] = max(found[k], np.abs(part - part.T).max() / size)
         return float(found[0]), float(found[1])
 
     def _check(self) -> None:
-        dofs = self._dofs
+        dofs, named = self._dofs, {c.name: ca.SX.sym(c.name) for c in self.constants}
+        x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.carries))
+        at = AtNode(*ca.vertsplit(ca.SX.sym("data", DATA), [*ENDS]))
         try:
-            u, data, _ = self._symbols
-            at = AtNode(data[0], data[1:4], data[4], data[5], data[6:9])
-            named = {c.name: u[2 * dofs + k] for k, c in enumerate(self.constants)}
-            shape = self._valued(u[:3], u[dofs : dofs + 3], at, named).shape
+            force, after = self._valued(x, v, before, at, named)
+            _ = self._symbols
         except (Exception, SystemExit) as error:
+            carried = " and what is carried" if self.carries else ""
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
                 "of x, v, at and named constants in CasADi operations that returns three forces"
+                + carried
             ) from error
-        if shape != (3, 1):
-            raise InputError(f"force {self.name!r} has the shape {shape}; expected (3, 1)")
-        ones = np.ones(len(self.constants))
-        still = np.concatenate([TRIANGLE_M[:dofs], np.zeros(dofs), ones])
+        for what, each, size in (("has", force, 3), ("leaves what has", after, self.carries)):
+            if each.shape != (size, 1):
+                raise InputError(
+                    f"force {self.name!r} {what} the shape {each.shape}; expected ({size}, 1)"
+                )
+        still = np.zeros(self.inputs(dofs))
+        still[:dofs] = TRIANGLE_M[:dofs]
+        still[2 * dofs : 2 * dofs + len(self.constants)] = 1.0
         if not all(np.isfinite(e.full()).all() for e in self._slopes(still, np.ones(DATA))):
             raise InputError(
                 f"force {self.name!r} or its slope is not finite where the node is at rest; "
@@ -227,7 +255,7 @@ class PlacedForce:
     force : NodeForce
     points : ForcePoints
         The nodes, or those of each face.
-    data : (8, i) what an `AtNode` has behind the time
+    data : (8, i) what an `AtNode` has behind the time and before the time since
     columns : (c,) places of its constants in θ
     """
 
@@ -256,6 +284,10 @@ class PlacedForce:
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
         return cls(force, ForcePoints.of_nodes(nodes, len(volume_m3)), data, columns)
+
+
+def _column(values: Any) -> ca.SX:
+    return ca.SX(ca.vertcat(*values) if isinstance(values, (list, tuple)) else values)
 
 
 def middle(values: ca.SX) -> ca.SX:

@@ -269,6 +269,8 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a start that is given", "one in equilibrium, or undeformed")
     if experiment.body.remembers:
         raise refused("a material with memory", "one without Prony branches")
+    if any(placed.force.carries for placed in experiment.body.placed_forces):
+        raise refused("a force that carries something from step to step", "none")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
     if experiment.readings:

@@ -64,12 +64,12 @@ def require_second_derivatives(collocation: Collocation) -> None:
     Raises
     ------
     InputError
-        For materials with memory, and what is measured of grasps.
+        For what is carried, such as by materials with memory, and what is measured of grasps.
     """
     if collocation.remembers:
         raise InputError(
-            "hessian = 'exact' has no second derivatives of materials with memory (prony); "
-            "expected 'gauss-newton'"
+            "hessian = 'exact' has no second derivatives of materials with memory (prony), nor of "
+            "forces that carry something; expected 'gauss-newton'"
         )
     if any(len(segment.sensed_dofs) for segment in collocation.segments):
         raise InputError(

@@ -10,7 +10,7 @@ with the time step put in, so that with G = ∂F/∂ξ and C = ∂F/∂ν at eva
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.body import Body, Linearisation
-from ..fem.memory import Past
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .forces import Forces
+from .histories import AnyHistory, histories, onto
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
-from .viscoelasticity import History
 from .weight import Mass
 
 
@@ -212,21 +211,31 @@ class Dynamics:
         """(k,) constants of the body."""
         return self.forces.theta
 
-    def history(self, x: Array, brought: Array | None = None) -> History | None:
-        """What the evaluations of x (N, 3n), or its first rows, went through; None if nothing.
+    def histories(
+        self, x: Array, brought: Mapping[int, Array] | None = None
+    ) -> tuple[AnyHistory, ...]:
+        """What the evaluations of x (N, 3n), or its first rows, went through; empty if nothing.
 
-        What they bring from the past, (N, all branches), follows from x where it is not given.
+        What they bring from the past follows from x where it is not given, by number.
         """
-        if not self.body.remembers:
-            return None
-        xi = self.combine(self.state_weights[: len(x)], x)
-        intervals = self.until_next_s[: len(x)]
-        return History.of(self.body, xi, self.theta, intervals, self.loaded_since_s, brought)
+        if not (self.body.remembers or self.forces.carrying):
+            return ()
+        here = slice(len(x))
+        states = self.evaluated_at(x)
+        known = self.until_next_s[here], self.loaded_since_s, brought or {}
+        return histories(self.forces.rows(here), states, *known)
 
-    def carried(self, history: History | None, rows: slice | None = None) -> Past | None:
-        """What rows `first_row`…, or some, bring from the past."""
+    def evaluated_at(self, x: Array) -> tuple[Array, Array]:
+        """ξ and ν at all evaluations of x (N, 3n), or its first rows, a given start included."""
+        xi = self.combine(self.state_weights[: len(x)], x)
+        nu = self.combine(self.tables.q[: len(x)], x) / self.step_s
+        nu[: self.first_row] = self.start_velocity_m_s
+        return xi, nu
+
+    def forces_along(self, along: Sequence[AnyHistory], rows: slice | None = None) -> Forces:
+        """The forces of rows `first_row`…, or some, with what they bring."""
         rows = slice(self.first_row, self.rows) if rows is None else rows
-        return None if history is None else history.carried(rows)
+        return onto(self.forces.rows(rows), along, rows)
 
     def combine(self, table: Array, rows: Array) -> Array:
         """Σ_i table[t, i] rows[t − i] for every t; `rows` is (N, …)."""
@@ -242,22 +251,21 @@ class Dynamics:
                 result[: len(rows) - lag] += column * rows[lag:]
         return result
 
-    def residual(self, x: Array, history: History | None = None) -> Array:
+    def residual(self, x: Array, along: Sequence[AnyHistory] = ()) -> Array:
         """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero.
 
-        Here and below the history is that of x, unless another is given.
+        Here and below what is carried is what follows from x, unless other histories are given.
         """
-        return self.assemble_residual(x, self.force(x, history))
+        return self.assemble_residual(x, self.force(x, along))
 
     @property
     def evaluated(self) -> Forces:
         """The forces of rows `first_row`…."""
         return self.forces.rows(slice(self.first_row, self.rows))
 
-    def force(self, x: Array, history: History | None = None) -> Array:
+    def force(self, x: Array, along: Sequence[AnyHistory] = ()) -> Array:
         """Forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
-        carried = self.carried(history or self.history(x))
-        return self.evaluated.total(*self.evaluation_states(x), carried)
+        return self.forces_along(along or self.histories(x)).total(*self.evaluation_states(x))
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """The same from the forces (N − first_row, 3n) at the evaluation states."""
@@ -278,14 +286,11 @@ class Dynamics:
         return acceleration
 
     def linearise(
-        self,
-        x: Array,
-        out: Array | None = None,
-        history: History | None = None,
+        self, x: Array, out: Array | None = None, along: Sequence[AnyHistory] = ()
     ) -> Linearisation:
-        """Forces and derivatives, at the memory as it is, at the evaluation states of x (N, 3n)."""
-        carried = self.carried(history or self.history(x))
-        return self.evaluated.linearise(*self.evaluation_states(x), out, carried)
+        """Forces and derivatives, at what is brought, at the evaluation states of x (N, 3n)."""
+        forces = self.forces_along(along or self.histories(x))
+        return forces.linearise(*self.evaluation_states(x), out)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
         """The force part of ∂c_t/∂x_{t−lag} as Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.

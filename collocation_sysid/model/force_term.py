@@ -60,11 +60,14 @@ class ForceTerm(ABC):
     slides : bool
         Whether its velocities are, in a static experiment, ways since the sample before; others'
         are none.
+    carries : int
+        How many numbers each of its instances carries; only one that is `Pointwise` carries any.
     """
 
     size: int
     couplings: SymmetricPattern | None
     slides: bool = False
+    carries: int = 0
 
     @abstractmethod
     def at(self, u: Array) -> Self:

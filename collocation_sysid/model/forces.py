@@ -42,6 +42,8 @@ class Forces:
     theta : (k,) constants of the body; NaN where they are not known yet
     still : bool
         Whether nothing moves, and ν is the way since the sample before, see `ForceTerm.slides`.
+    past : Past, optional
+        What the states of a body with memory bring; nothing by default.
     """
 
     weight: Weight
@@ -49,6 +51,7 @@ class Forces:
     joined: Joined
     theta: Array
     still: bool = False
+    past: Past | None = None
 
     @classmethod
     def of(
@@ -132,32 +135,35 @@ class Forces:
         return replace(self, weight=self.weight.scaled(share), further=further)
 
     def towards(self, other: Forces, share: float) -> Forces:
-        """The same with a share of the way to what acts at other times."""
+        """With a share of the way to what acts at other times, whose states bring the same."""
         further = tuple(
             term.towards(that, share)
             for term, that in zip(self.further, other.further, strict=True)
         )
-        return replace(self, weight=self.weight.towards(other.weight, share), further=further)
+        return replace(other, weight=self.weight.towards(other.weight, share), further=further)
+
+    def with_further(self, number: int, term: ForceTerm) -> Forces:
+        """The same with another in the place of one of the further terms."""
+        further = self.further[:number], self.further[number + 1 :]
+        return replace(self, further=(*further[0], term, *further[1]))
 
     def undriven(self) -> Forces:
         """Weight and loads alone, without what drives the body or acts by a law of its own."""
         return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
 
-    def total(self, xi: Array, nu: Array, carried: Past | None = None) -> Array:
-        """F, (T, 3n) [N]; `carried` is what the states of a body with memory bring."""
-        of = self._states(xi, nu)
-        found = self.body.force(xi, of(self.weight).nu, self.theta, self.mass.tied, carried)
+    def total(self, xi: Array, nu: Array) -> Array:
+        """F, (T, 3n) [N]."""
+        of = self.states(xi, nu)
+        found = self.body.force(xi, of(self.weight).nu, self.theta, self.mass.tied, self.past)
         for term in self.terms:
             found = found + term.force(of(term))
         return found
 
-    def linearise(
-        self, xi: Array, nu: Array, out: Array | None = None, carried: Past | None = None
-    ) -> Linearisation:
-        """F and its slopes, at the memory as it is; views of `out` (T, `linearisation_width`)."""
-        of = self._states(xi, nu)
+    def linearise(self, xi: Array, nu: Array, out: Array | None = None) -> Linearisation:
+        """F and its slopes, at what is brought; views of `out` (T, `linearisation_width`)."""
+        of = self.states(xi, nu)
         still_nu = of(self.weight).nu
-        at = self.body.linearise(xi, still_nu, self.theta, out, self.mass.tied, carried)
+        at = self.body.linearise(xi, still_nu, self.theta, out, self.mass.tied, self.past)
         if self.still:
             at.by_velocity[:] = 0.0
         if self.further or self._ends[-1] > self._ends[0]:
@@ -179,17 +185,15 @@ class Forces:
         return self.body.linearisation_width
 
     def curvature(
-        self,
-        xi: Array,
-        nu: Array,
-        weights: Array,
-        out: Array | None = None,
-        carried: Past | None = None,
-        stress_weights: Array | None = None,
+        self, xi: Array, nu: Array, weights: Array, out: Array | None = None
     ) -> Curvature:
-        """Second derivatives of weightsᵀ F + σ·S, see `Body`; `out` is (T, `curvature_width`)."""
-        known = self.theta, out, self.mass.tied, carried, stress_weights
-        of = self._states(xi, nu)
+        """Second derivatives of weightsᵀ F and of what of it is left to others.
+
+        That is Σ σ·S of a memory, and `weighed` of what forces carry; `out` is
+        (T, `curvature_width`).
+        """
+        of = self.states(xi, nu)
+        known = self.theta, out, self.mass.tied, self.past
         at = self.body.curvature(xi, of(self.weight).nu, weights, *known)
         if self.still:
             for by_velocity in (
@@ -226,7 +230,7 @@ class Forces:
         """Length of one time's row of `curvature`."""
         return self.body.curvature_width
 
-    def _states(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
+    def states(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
         """What each term, or the body as weight does, sees of the states."""
         size = self.body.pattern.size
         moving = States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
@@ -245,6 +249,17 @@ class Forces:
             )
             for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
         ]
+
+    def pointwise(self, number: int) -> tuple[Pointwise, Index]:
+        """One of the further terms, which is, and where its inputs are among all."""
+        term, places = self._placed[1 + number]
+        assert isinstance(term, Pointwise)
+        return term, term.columns(places)
+
+    @property
+    def carrying(self) -> list[int]:
+        """Numbers of the further terms that carry something."""
+        return [k for k, term in enumerate(self.further) if term.carries]
 
     def _widened(self, by_theta: Array) -> Array:
         """(…, U) slopes by θ with room for those by the inputs of the terms."""

@@ -1,11 +1,20 @@
-"""Forces that act point by point: their derivatives are generated, those of users among them."""
+"""Forces that act point by point: their derivatives are generated, those of users among them.
+
+A law may carry numbers h of each instance from one evaluation to the next, such as how far a
+dashpot has crept or where friction's anchor is:
+
+    (F, h)_k = L(y_k, ẏ_k, c_k, h_{k−1}; data_k).
+
+To the equations of motion h_{k−1} is as what a memory brings: at that, F and its slopes are those
+of any other force; what it does along a motion is in `force_history`, for all methods.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -18,6 +27,17 @@ from .force_term import ForceTerm, Slots, States
 from .generated import Generated
 
 
+class Brought(NamedTuple):
+    """What instances bring to T evaluations.
+
+    before : (n, T, I) h_{k−1}
+    since_s : (T,) time since the evaluation before, zero at the start, which brings nothing
+    """
+
+    before: Array
+    since_s: Array
+
+
 class Pointwise(ForceTerm):
     """A law of what is at points of a body: of their vectors y, of ẏ, and of constants c.
 
@@ -25,17 +45,25 @@ class Pointwise(ForceTerm):
     ----------
     points : ForcePoints
     law : Generated
-        Forces (d,) on y, of (y, ẏ, c), or of (y, c) where nothing depends on ẏ, and of data.
+        Forces (d,) on y, of (y, ẏ, c), or of (y, c) where nothing depends on ẏ, and of data. One
+        that carries n numbers takes them behind c, and gives those for the next behind its forces.
     share : float
+        Of the force; what is carried is the same.
+    brought : Brought, optional
+        Of one that carries; as at the start by default.
+    weighed : (n, T, I), optional
+        What each h_k counts in second derivatives, beside the force.
     """
 
     points: ForcePoints
     share: float
+    brought: Brought | None = None
+    weighed: Array | None = None
 
     @property
     @abstractmethod
     def law(self) -> Generated:
-        """F(y, ẏ, c)."""
+        """F(y, ẏ, c), or (F, h)(y, ẏ, c, h_{k−1})."""
 
     @property
     def by_velocity(self) -> bool:
@@ -43,7 +71,10 @@ class Pointwise(ForceTerm):
         return True
 
     def acting(self, states: States) -> Index | None:
-        """The instances at which it may be more than nothing; None for all."""
+        """The instances at which it may be more than nothing; None for all.
+
+        Others leave nothing either.
+        """
         return None
 
     @abstractmethod
@@ -67,24 +98,38 @@ class Pointwise(ForceTerm):
         """A share of it."""
         return replace(self, share=share * self.share)  # type: ignore[type-var]
 
+    def bringing(self, brought: Brought, weighed: Array | None = None) -> Self:
+        """The same at what instances bring."""
+        return replace(self, brought=brought, weighed=weighed)  # type: ignore[type-var]
+
+    def began(self, times: int) -> tuple[Array, Array]:
+        """(T,) time since the evaluation before, and one where there is none, else zero."""
+        since_s = np.zeros(times) if self.brought is None else self.brought.since_s
+        return since_s, (since_s == 0).astype(float)
+
     def _at(self, states: States) -> _At:
         chosen = self.acting(states)
         y, constants = self.points.vectors(states.xi, chosen), self.constants(states)
         moving = (self.points.vectors(states.nu, chosen),) if self.by_velocity else ()
-        shape = len(constants), *y.shape[1:]
-        u = np.concatenate([y, *moving, np.broadcast_to(constants[..., None], shape)])
-        return _At(chosen, u, self.data(chosen), len(y), len(u) - len(constants))
+        steady = np.broadcast_to(constants[..., None], (len(constants), *y.shape[1:]))
+        before = np.zeros((self.carries, *y.shape[1:]))
+        if self.brought is not None:
+            before = self.brought.before[..., slice(None) if chosen is None else chosen]
+        u = np.concatenate([y, *moving, steady, before])
+        ends = len(y), len(y) * (2 if self.by_velocity else 1), len(u) - len(before)
+        return _At(chosen, u, self.data(chosen), *ends)
 
     def force(self, states: States) -> Array:
         """(T, 3n) [N]."""
         at = self._at(states)
-        return self.share * self.points.summed(self.law.value(at.u, at.data), at.chosen)
+        value = self.law.value(at.u, at.data)[at.y]
+        return self.share * self.points.summed(value, at.chosen)
 
     def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
         """Add F and its slopes."""
         here, points = self._at(states), self.points
         value, slopes = self.law.slopes(here.u, here.data)
-        slopes = self.share * slopes
+        value, slopes = value[here.y], self.share * slopes[here.y]
         at.force[:] += self.share * points.summed(value, here.chosen)
         by_x, by_v, by_c = (slopes[:, part] for part in (here.y, here.v, here.c))
         both = by_x + by_x.swapaxes(0, 1)
@@ -98,9 +143,9 @@ class Pointwise(ForceTerm):
             at.by_theta[:, :, column] += points.summed(by_c[:, k], here.chosen)
 
     def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
-        """Add the derivatives of weightsᵀ F."""
+        """Add the derivatives of weightsᵀ F + `weighed` · h."""
         here, points, entries = self._at(states), self.points, places.entries
-        w, x, v = self.share * points.vectors(weights, here.chosen), here.y, here.v
+        w, x, v = self._weights(here, weights), here.y, here.v
         whole = self.law.curvature(here.u, here.data, w)
         at.position_position[:, entries] += points.entries(whole[x, x], here.chosen)
         if self.by_velocity:
@@ -121,17 +166,64 @@ class Pointwise(ForceTerm):
             for other, place in columns:
                 at.theta_theta[:, column, place] += whole[k, other].sum(axis=1)
 
+    def _weights(self, here: _At, weights: Array) -> Array:
+        """(d + n, T, i) what the force on the vectors, and what is left, count."""
+        own = self.share * self.points.vectors(weights, here.chosen)
+        if not self.carries:
+            return own
+        shape = self.carries, *own.shape[1:]
+        some = slice(None) if here.chosen is None else here.chosen
+        left = np.zeros(shape) if self.weighed is None else self.weighed[..., some]
+        return np.concatenate([own, left])
+
+    # Of one that carries ----------------------------------------------------------------------
+
+    def left(self, states: States) -> Array:
+        """H (n, T, I)."""
+        here = self._at(states)
+        return self._of_all(self.law.value(here.u, here.data)[here.y.stop :], here)
+
+    def parts(self, states: States) -> Parts:
+        """Slopes of F and h, (d + n, …, T, I)."""
+        here = self._at(states)
+        _, slopes = self.law.slopes(here.u, here.data)
+        slopes[here.y] *= self.share
+        return here.split(self._of_all(slopes, here), 1)
+
+    def bent(self, states: States, weights: Array) -> Parts:
+        """Second derivatives by u and h_{k−1}, (…, n, T, I), of weights · F + `weighed` · h."""
+        here = self._at(states)
+        whole = self.law.curvature(here.u, here.data, self._weights(here, weights))
+        return here.split(self._of_all(whole[:, here.b], here), 0)
+
+    def _of_all(self, values: Array, here: _At) -> Array:
+        """(…, T, I) of all instances from those chosen."""
+        if here.chosen is None:
+            return values
+        found = np.zeros((*values.shape[:-1], self.points.count))
+        found[..., here.chosen] = values
+        return found
+
+
+class Parts(NamedTuple):
+    """What stands by y, ẏ, c and h_{k−1}."""
+
+    y: Array
+    v: Array
+    c: Array
+    b: Array
+
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """Inputs u = (y, ẏ, c) and data of a law at states.
+    """Inputs u = (y, ẏ, c, h_{k−1}) and data of a law at states.
 
     Attributes
     ----------
     chosen : (i,) of the instances, or None for all
     u, data : (…, T, i)
-    moving, steady : int
-        Where ẏ, and c, begin in u.
+    moving, steady, brought : int
+        Where ẏ, c and h_{k−1} begin in u.
     """
 
     chosen: Index | None
@@ -139,6 +231,7 @@ class _At:
     data: Array
     moving: int
     steady: int
+    brought: int
 
     @property
     def y(self) -> slice:
@@ -153,7 +246,16 @@ class _At:
     @property
     def c(self) -> slice:
         """Of the constants."""
-        return slice(self.steady, len(self.u))
+        return slice(self.steady, self.brought)
+
+    @property
+    def b(self) -> slice:
+        """Of what is brought."""
+        return slice(self.brought, len(self.u))
+
+    def split(self, values: Array, axis: int) -> Parts:
+        """What stands by each along an axis."""
+        return Parts(*np.split(values, [self.moving, self.steady, self.brought], axis=axis))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +272,14 @@ class PointForces(Pointwise):
     placed: PlacedForce
     t_s: Array
     share: float = 1.0
+    brought: Brought | None = None
+    weighed: Array | None = None
     size = 0
+
+    @property
+    def carries(self) -> int:  # type: ignore[override]
+        """How many numbers the user's law leaves."""
+        return self.placed.force.carries
 
     @property
     def points(self) -> ForcePoints:  # type: ignore[override]
@@ -191,8 +300,8 @@ class PointForces(Pointwise):
         return replace(self, t_s=self.t_s[rows])
 
     def towards(self, other: Self, share: float) -> Self:
-        """With a share of the way to another time."""
-        return replace(self, t_s=self.t_s + share * (other.t_s - self.t_s))
+        """With a share of the way to another time, at what that brings."""
+        return replace(other, t_s=self.t_s + share * (other.t_s - self.t_s))
 
     def constants(self, states: States) -> Array:
         """Those of the body."""
@@ -205,7 +314,8 @@ class PointForces(Pointwise):
     def data(self, chosen: Index | None) -> Array:
         """Of an `AtNode`."""
         data = np.empty((DATA, len(self.t_s), self.points.count))
-        data[0], data[1:] = self.t_s[:, None], self.placed.data[:, None]
+        data[0], data[1:-2] = self.t_s[:, None], self.placed.data[:, None]
+        data[-2:] = np.array(self.began(len(self.t_s)))[..., None]
         return data
 
 

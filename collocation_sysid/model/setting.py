@@ -52,10 +52,6 @@ class Setting:
         """(k, nq) those by q: no φ changes θ."""
         return self.theta_p[:, : self.nq]
 
-    def columns(self, first: int = 1) -> Array:
-        """(k, first + m) θ's derivatives by what columns stand for, those by p from `first` on."""
-        return np.hstack([np.zeros((len(self.theta), first)), self.theta_p])
-
     def force_slopes(self, rows: int | slice, by_u: Array) -> Array:
         """∂F/∂p of total forces, (…, 3n, m), from ∂F/∂u (…, 3n, U) at some evaluations."""
         return by_u @ (self.by_p[0] if self._steady else self.by_p[rows])

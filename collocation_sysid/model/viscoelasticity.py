@@ -20,8 +20,8 @@ coefficients, which spares most of what generated rows of each point would cost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -29,6 +29,7 @@ import numpy as np
 from ..arrays import Array, Index
 from ..fem.body import Body, Curvature
 from ..fem.memory import Past, PointLayout, fading
+from .forces import Forces
 from .generated import Generated
 from .recursion import Recursion
 
@@ -176,6 +177,25 @@ class History:
         found.bends[:, fades.places[:, None], fades.places] = np.moveaxis(bent[..., rows], 3, 0)
         return found
 
+    def onto(self, forces: Forces, rows: slice) -> Forces:
+        """Forces of some evaluations with what these bring."""
+        return replace(forces, past=self.carried(rows))
+
+    def weighed(self, forces: Forces, mu: Array) -> Forces:
+        """The forces of all evaluations, where a_k S_k counts μ (N, all branches) besides."""
+        borne = replace(self.carried(slice(None)), stress_weights=self.stress_weights(mu))
+        return replace(forces, past=borne)
+
+    def forward(
+        self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
+    ) -> Slopes:
+        """Columns of what is carried, see `Slopes`; of an evaluation, those (U, c) of inputs."""
+        return Slopes(self, by_p(0)[: len(self.theta)], done, known)
+
+    def backward(self) -> Weights:
+        """Its weights, see `Weights`."""
+        return Weights(self)
+
     @property
     def last(self) -> Remembered:
         """After the last evaluation."""
@@ -207,14 +227,17 @@ class History:
             rows = slice(start, start + CHUNK)
             yield rows, self.body.stresses.stress_by(self.xi[rows], self.theta, theta_q)
 
-    def pulled(self, force_weights: Array, theta_q: Array) -> tuple[Array, Array]:
-        """Derivatives of Σ λ_k f_H(H_k) through H, by ξ (N, 3n) and by q.
+    def pulled(self, force_weights: Array, by_p: Array) -> tuple[Array, Array, Array]:
+        """Derivatives of Σ λ_k f_H(H_k) through H, by ξ and ν (N, 3n) and by p.
 
         Parameters
         ----------
         force_weights : (N, 3n) λ
-        theta_q : (k, q) derivatives of θ
+        by_p : (N, U, m) derivatives of the inputs
         """
+        theta_p = by_p[0, : len(self.theta)]
+        used = np.flatnonzero(theta_p.any(axis=0))
+        theta_q, found = theta_p[:, used], np.zeros(theta_p.shape[1])
         stresses, d = self.body.stresses, self.memory.spread(self.fading.d)
         pushes = self.memory.borne(stresses.against(self.xi, force_weights, self.theta))
         mu = np.zeros_like(pushes)
@@ -225,7 +248,8 @@ class History:
         sigma = self.stress_weights(mu)
         for rows, slopes in self.stress_by(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
-        return stresses.pulled(self.xi, sigma, self.theta), by_q
+        found[used] = by_q
+        return stresses.pulled(self.xi, sigma, self.theta), np.zeros_like(self.xi), found
 
     def add_curvature(self, curvature: Curvature, mu: Array) -> None:
         """Add those by g and τ, and those by another.
@@ -272,23 +296,22 @@ class Remembered:
         """In the start shape x (3n,)."""
         return History.of(body, x[None], theta, np.ones(1), loaded_s).last
 
-    @property
-    def now(self) -> Past:
-        """What this very state bears beside S."""
+    def now(self, forces: Forces) -> Forces:
+        """Forces in this very state, which bears this beside S."""
         found = self.body.memory.nothing(1)
         found.overstress[0] = self.body.memory.summed(self.overstress)
-        return found
+        return replace(forces, past=found)
 
-    def ahead(self, interval_s: float) -> Past:
-        """What a state after an interval brings from this one."""
+    def ahead(self, forces: Forces, interval_s: float) -> Forces:
+        """Forces in a state an interval later."""
         found, (brought, c) = self.body.memory.nothing(1), self._brought(interval_s)
         found.overstress[0] = self.body.memory.summed(brought)
         for branch, own in zip(self.body.memory.branches, c, strict=True):
             found.stiffening[0, branch.part] += own
-        return found
+        return replace(forces, past=found)
 
-    def after(self, x: Array, interval_s: float) -> Remembered:
-        """At the state x (3n,) an interval later."""
+    def following(self, forces: Forces, x: Array, v: Array, interval_s: float) -> Remembered:
+        """In the state x (3n,) an interval later."""
         memory, (brought, c) = self.body.memory, self._brought(interval_s)
         stress = self.body.stresses.stress(x[None], self.theta)[0]
         overstress = brought + memory.spread(c) * memory.borne(stress)
@@ -303,15 +326,16 @@ class Remembered:
         return memory.spread(e) * self.overstress - memory.spread(c) * borne, c
 
 
-def start_carried(body: Body, theta: Array, loaded_s: float) -> Past | None:
-    """What the start shape bears beside S, where a load has not been there for long."""
+def at_start(forces: Forces, loaded_s: float) -> Forces:
+    """Forces on a start shape that bears more than S, where a load has not been there for long."""
+    body = forces.body
     if not body.remembers or np.isinf(loaded_s):
-        return None
+        return forces
     found = body.memory.nothing(1)
-    c = Fading.of(body, theta, np.ones(1), loaded_s).c
+    c = Fading.of(body, forces.theta, np.ones(1), loaded_s).c
     for branch, own in zip(body.memory.branches, c, strict=True):
         found.stiffening[:, branch.part] += own
-    return found
+    return replace(forces, past=found)
 
 
 class Slopes:
@@ -350,10 +374,10 @@ class Slopes:
         self._state[:] = self.history.xi[self.next]
         return self.stresses.force(self._state, self.memory.summed(self.columns), self.theta).T
 
-    def advance(self, of_state: Array) -> None:
-        """Go past the next evaluation, whose state changes by (3n, columns)."""
+    def advance(self, of_state: Callable[[], Array], _: Callable[[], Array]) -> None:
+        """Go past the next evaluation, whose ξ changes by (3n, columns)."""
         k, history, stress, spread = self.next, self.history, self._stress, self.memory.spread
-        self._state[:], self._direction[:] = history.xi[k], of_state.T
+        self._state[:], self._direction[:] = history.xi[k], of_state().T
         # Of a single branch the stress itself is not needed.
         alone, a = len(self.memory.branches) == 1, self._a[k]
         self.columns *= self._d[k]
@@ -391,13 +415,15 @@ class Weights:
         self.history, self.next = history, len(history.xi) - 1
         self.columns = np.zeros(history.brought.shape[1])
 
-    def pulled(self) -> Array:
-        """What the state of the evaluation gets through S, (3n,)."""
+    def pulled(self) -> tuple[Array, Array]:
+        """What position and velocity of the evaluation get through S, (3n,) each."""
         history, k = self.history, self.next
         weights = history.memory.summed(
             history.memory.spread(history.fading.a[:, k]) * self.columns
         )
-        return history.body.stresses.pulled(history.xi[k][None], weights[None], history.theta)[0]
+        state = history.xi[k]
+        by_x = history.body.stresses.pulled(state[None], weights[None], history.theta)[0]
+        return by_x, np.zeros_like(by_x)
 
     def retreat(self, force_weight: Array) -> None:
         """Go before the evaluation, whose force has weights (3n,)."""

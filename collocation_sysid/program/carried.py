@@ -14,10 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, Index
-from ..model.viscoelasticity import History
 from .part import Part
 from .pattern_rows import Pattern
-from .segment import RowWeights, Segment
+from .segment import RowWeights, Segment, Weighed
 
 
 @dataclass(frozen=True)
@@ -124,9 +123,14 @@ class Carried(ABC):
         """(N, 3n) derivative of multipliers · its equations by what c has in newtons."""
         return 0.0
 
-    def remembered(self, part: Part, multipliers: Array) -> tuple[History, Array] | None:
-        """The history of a memory, and μ (N, …) such that multipliers · g has Σ μ (d m + a S)."""
+    @property
+    def history(self) -> int | None:
+        """Which of the histories of the motion it is, if any."""
         return None
+
+    def weighed(self, part: Part, multipliers: Array) -> Weighed:
+        """That history, and what each h_k counts in multipliers · its equations."""
+        raise NotImplementedError
 
     @property
     def nonzeros(self) -> tuple[int, int]:

@@ -370,9 +370,7 @@ class Collocation:
     def constraint_values(self, z: Array) -> Array:
         """g, scaled."""
         parts = self.parts(z)
-        rows = [
-            part.segment.constraint_values(part.x, part.setting, part.history) for part in parts
-        ]
+        rows = [part.segment.constraint_values(part.x, part.setting, part.along) for part in parts]
         further = [each.values(parts[each.number], z) for each in self.carried]
         return np.concatenate([*rows, *further])
 
@@ -428,18 +426,18 @@ class Collocation:
 
     @property
     def remembers(self) -> bool:
-        """Whether a memory is not in z: then ∂g/∂z has more than `jacobian` holds."""
-        return not self.explicit and any(segment.body.remembers for segment in self.segments)
+        """Whether something is carried that is not in z: ∂g/∂z has more than `jacobian` holds."""
+        return not self.explicit and any(segment.carries for segment in self.segments)
 
     def pulled_back(self, z: Array, multipliers: Array) -> Array:
-        """(∂g/∂z)ᵀ multipliers, through the memory of bodies too."""
+        """(∂g/∂z)ᵀ multipliers, through what is carried too."""
         slope = self.jacobian(z).T @ multipliers
         for part in self.parts(z) if self.remembers else ():
             segment = part.segment
-            of_rows = multipliers[segment.rows]
-            by_x, by_q = segment.through_memory(part.x, part.setting, of_rows)
-            slope[segment.columns] += by_x.ravel()
-            slope[: self.nq] += by_q
+            weights = segment.weights(multipliers[segment.rows]).forces
+            by_x, by_p = segment.pulled_through(part.x, part.setting, weights)
+            slope[segment.columns] += segment.length_m * by_x.ravel()
+            slope[segment.moving_in(self.of_phi.start)] += by_p
         return slope
 
     # Lagrangian -------------------------------------------------------------------------------
@@ -496,7 +494,7 @@ class Collocation:
             mine = [each for each in self.carried if each.number == number]
             of_rows = sum((each.row_weights(multipliers) for each in mine), start=0.0)
             weights.append(segment.weights(multipliers[segment.rows], of_rows))
-            carried = next((c for each in mine if (c := each.remembered(part, multipliers))), None)
+            carried = [each.weighed(part, multipliers) for each in mine if each.history is not None]
             at = part.x, part.phi, part.setting, weights[number], weight
             found, more = segment.hessian_values(*at, here, carried, bent)
             by_q, further, used = by_q + found, further + more, used + len(here)
@@ -546,7 +544,7 @@ class Collocation:
         largest = 0.0
         for part in self.parts(z):
             dynamics = part.setting.dynamics
-            total = dynamics.force(part.x, part.history)
+            total = dynamics.force(part.x, part.along)
             external = dynamics.evaluated.weight.external_n
             for force in (total - external, external):
                 # What a grasp bears counts too: where nothing else acts, all other forces vanish.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .carried import Carried, Places
+from .force_rows import ForceRows
 from .reaction_rows import Reactions
 from .segment import Segment
 from .viscoelastic_rows import Overstress
@@ -32,8 +33,12 @@ def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> t
             reactions = Reactions(*here, places)
             found.append(reactions)
             places = reactions.after
+        histories = 0
         if segment.body.remembers:
             found.append(Overstress(*here, places, reactions))
+            places, histories = found[-1].after, 1
+        for history, force in enumerate(segment.dynamics.forces.carrying, histories):
+            found.append(ForceRows(*here, places, history, force, reactions))
             places = found[-1].after
         for wrench in wrenches:
             assert reactions is not None

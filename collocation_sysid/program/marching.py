@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 
 import numpy as np
 
 from ..arrays import Array, Index
 from ..errors import SimulationError
-from ..fem.memory import Past
 from ..model.dynamics import Dynamics, StencilRow, weighted
+from ..model.histories import AnyLeft, ahead, following
 from ..recording.experiment import Experiment
 from .lapack import one_blas_thread
 from .newton import (
@@ -89,16 +89,14 @@ def march_on(
     forces = np.zeros_like(x)  # total force at every evaluation so far
     xi, nu = dynamics.evaluation_states(x)
     first, seen = dynamics.first_row, done - dynamics.first_row
-    history = dynamics.history(x[:done])
+    along, intervals = dynamics.histories(x[:done]), dynamics.until_next_s
     if seen > 0:
         here = slice(first, done)
-        carried = dynamics.carried(history, here)
-        forces[here] = dynamics.forces.rows(here).total(xi[:seen], nu[:seen], carried)
+        forces[here] = dynamics.forces_along(along, here).total(xi[:seen], nu[:seen])
     dynamics.without_taken(forces)
-    memory, intervals = history.last if history else None, dynamics.until_next_s
+    left = tuple(history.last for history in along)
     for t in range(done, dynamics.rows):
-        carried = memory.ahead(intervals[t - 1]) if memory else None
-        row = RowEquations(dynamics, x, forces, t, carried)
+        row = RowEquations(dynamics, x, forces, t, left)
         solver = solvers.holding(held[t])
         goal = dynamics.goals_m[t, solver.held]
         if not dynamics.static:
@@ -114,8 +112,9 @@ def march_on(
             return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
         forces[t] = row.force(x[t])
         forces[t, dynamics.taken[t]] = 0
-        if memory:
-            memory = memory.after(row.states(x[t])[0][0], intervals[t - 1])
+        if left:
+            (xi_t,), (nu_t,) = row.states(x[t])
+            left = following(row.forces, left, xi_t, nu_t, intervals[t - 1])
         if progress:
             progress(t / (dynamics.rows - 1))
     return x, None
@@ -146,10 +145,12 @@ class RowEquations:
         x: Array,
         forces: Array,
         t: int,
-        carried: Past | None = None,
+        left: Sequence[AnyLeft] = (),
     ) -> None:
         self.dynamics, self.row = dynamics, StencilRow.of(dynamics, t)
-        self.forces, self.carried = dynamics.forces.rows(slice(t, t + 1)), carried
+        self.forces = dynamics.forces.rows(slice(t, t + 1))
+        if left:
+            self.forces = ahead(self.forces, left, float(dynamics.until_next_s[t - 1]))
         self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
         row = self.row
         first, shape = max(0, t - dynamics.reach), x.shape[1:]
@@ -169,7 +170,7 @@ class RowEquations:
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        return self.forces.total(*self.states(x), self.carried)[0]
+        return self.forces.total(*self.states(x))[0]
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """ξ_t and ν_t, (1, 3n) each."""
@@ -186,7 +187,7 @@ class RowEquations:
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
-        at = self.forces.linearise(*self.states(x), carried=self.carried)
+        at = self.forces.linearise(*self.states(x))
         matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
         skew = self.row.skew_block(at.by_position_skew[0])
         return self.balanced(at.force[0], x), matrix, skew

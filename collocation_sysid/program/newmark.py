@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..model.forces import Forces
-from ..model.viscoelasticity import Remembered
+from ..model.histories import AnyLeft, ahead, following, left_at_start
 from ..model.weight import Weight
 from ..recording.experiment import Experiment
 from .channel import Forced
@@ -29,7 +29,7 @@ class _State:
     x: Array
     v: Array
     a: Array
-    memory: Remembered | None = None
+    left: tuple[AnyLeft, ...] = ()
 
 
 @one_blas_thread()
@@ -79,11 +79,8 @@ class _Stepper:
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
         x, v = start_state(self.experiment, self._forces(time_s), solver)
-        memory = None
-        if self.body.remembers:
-            loaded_s = self.experiment.loaded_since_s
-            memory = Remembered.at_start(self.body, x, self.theta, loaded_s)
-        state = _State(time_s, x, v, np.zeros_like(x), memory)
+        left = left_at_start(self._forces(time_s), x, v, self.experiment.loaded_since_s)
+        state = _State(time_s, x, v, np.zeros_like(x), left)
         return self._balanced(state, time_s, solver.free)
 
     def advance(self, state: _State, goal_s: float) -> _State:
@@ -113,8 +110,10 @@ class _Stepper:
 
     def _force(self, state: _State, load_s: float) -> Array:
         """All forces (3n,) in a state, under the loads of a time."""
-        now = state.memory.now if state.memory else None
-        return self._forces(load_s).total(state.x, state.v, now)[0]
+        forces = self._forces(load_s)
+        for each in state.left:
+            forces = each.now(forces)
+        return forces.total(state.x, state.v)[0]
 
     def _forces(self, load_s: float) -> Forces:
         return Forces.of(self.experiment, load_s, self.theta)
@@ -140,9 +139,9 @@ class _Stepper:
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
-        h, forces = end_s - state.t_s, self._forces(load_s)
+        h = end_s - state.t_s
+        forces = ahead(self._forces(load_s), state.left, h)
         mass = forces.mass.kg[0]
-        carried = state.memory.ahead(h) if state.memory else None
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
         known_v = -slope * state.x - state.v
@@ -156,11 +155,11 @@ class _Stepper:
 
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            return forces.total(x, v, carried)[0] - mass * a
+            return forces.total(x, v)[0] - mass * a
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
-            at = forces.linearise(x, v, carried=carried)
+            at = forces.linearise(x, v)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
             matrix[forces.pattern.diagonal] += slope**2 * mass
             return at.force[0] - mass * a, matrix, -at.by_position_skew[0]
@@ -171,8 +170,8 @@ class _Stepper:
             guess = state.x.copy()
             guess[solver.held] = x_held
         x = solver.newton(guess, residual, linearise)
-        memory = state.memory.after(x, h) if state.memory else None
-        return _State(end_s, x, *kinematics(x), memory)
+        v, a = kinematics(x)
+        return _State(end_s, x, v, a, following(forces, state.left, x, v, h))
 
     def _held_motion(
         self, solver: Solver, time_s: float, h: float, holding_s: float

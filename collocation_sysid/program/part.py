@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import Array
 from ..fem.body import Linearisation
+from ..model.histories import AnyHistory
 from ..model.setting import Setting
-from ..model.viscoelasticity import History
 from .channel import Motion
 from .segment import Segment
 from .sensing import Sensing
@@ -27,8 +27,8 @@ class Part:
     q : (nq,) shared parameters
     phi : (k,) its nuisance parameters
     x : (N, 3n) positions [m], or its first rows
-    brought : (N, …) or None
-        What the evaluations bring from the past, where that does not follow from x.
+    brought : mapping
+        Of what is carried, by number, what evaluations bring, where that does not follow from x.
     given : mapping
         Of readings, by their numbers, what they look at where that does not follow from x.
     bent : bool
@@ -39,7 +39,7 @@ class Part:
     q: Array
     phi: Array
     x: Array
-    brought: Array | None = None
+    brought: Mapping[int, Array] = field(default_factory=dict)
     given: Mapping[int, Array] = field(default_factory=dict)
     bent: bool = True
 
@@ -49,9 +49,9 @@ class Part:
         return self.segment.setting(self.q, self.phi)
 
     @cached_property
-    def history(self) -> History | None:
-        """What the evaluations went through, of a body with memory."""
-        return self.setting.dynamics.history(self.x, self.brought)
+    def along(self) -> tuple[AnyHistory, ...]:
+        """What the evaluations went through, of all that is carried."""
+        return self.setting.dynamics.histories(self.x, self.brought)
 
     @cached_property
     def sensing(self) -> Sensing:
@@ -61,7 +61,7 @@ class Part:
     @cached_property
     def motion(self) -> Motion:
         """What channels look at."""
-        return self.sensing.motion(self.x, self.history)
+        return self.sensing.motion(self.x, self.along)
 
     @cached_property
     def looked(self) -> list[Array]:
@@ -105,9 +105,9 @@ class Part:
     def forces(self) -> Linearisation:
         """Those of the evaluations with their slopes, valid until others are formed."""
         rows = self.segment.linearisation_rows
-        return self.setting.dynamics.linearise(self.x, rows, self.history)
+        return self.setting.dynamics.linearise(self.x, rows, self.along)
 
     @property
     def residual_n(self) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
-        return self.segment.residual_n(self.x, self.setting, self.history)
+        return self.segment.residual_n(self.x, self.setting, self.along)

@@ -16,6 +16,7 @@ out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..model.dynamics import Dynamics
-from ..model.viscoelasticity import History
+from ..model.histories import AnyHistory
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
@@ -66,10 +67,10 @@ class HeldForces:
         self.force[:done], self.slopes[:done] = known.force, known.slopes
 
 
-def forces_on(dynamics: Dynamics, x: Array, dofs: Index, history: History | None = None) -> Array:
+def forces_on(dynamics: Dynamics, x: Array, dofs: Index, along: Sequence[AnyHistory] = ()) -> Array:
     """F (N, g) on some dofs at the evaluations of x (N, 3n), also those that grasps take."""
     force = np.zeros((len(x), len(dofs)))
-    force[dynamics.first_row :] = dynamics.force(x, history)[:, dofs]
+    force[dynamics.first_row :] = dynamics.force(x, along)[:, dofs]
     return force
 
 

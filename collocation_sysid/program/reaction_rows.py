@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from .carried import Carried
 from .motion_rows import MotionRows
 from .part import Part
 from .reaction import reactions
+from .segment import Segment
 
 
 class Reactions(Carried):
@@ -80,7 +82,7 @@ class Reactions(Carried):
         segment, band = self.segment, self._motion.band
         equations = np.arange(self.rows.start, self.rows.stop)
         of_x = np.repeat(np.arange(segment.variables), np.diff(band.indptr))
-        of_p = np.concatenate([np.arange(segment.nq), self.phi_columns[segment.nuisance.moving]])
+        of_p = segment.moving_in(self.first_phi)
         columns = [segment.first.x + of_x, np.arange(self.variables.start, self.variables.stop)]
         rows = [self.places.row + band.indices, equations, np.repeat(equations, len(of_p))]
         return np.concatenate(rows), np.concatenate([*columns, np.tile(of_p, self.count)])
@@ -102,3 +104,31 @@ class Reactions(Carried):
         mass_kg = dynamics.mass.kg[:, self.dofs]
         rows = z[self.variables] - self._scaled(reactions(dynamics, mass_kg, force, acceleration))
         return rows, np.concatenate([by_x, np.ones(self.count), self._scaled(by_p)])
+
+
+class RowsOfMotion(NamedTuple):
+    """Rows that forces count in.
+
+    number : (3n,) of each dof among those of a grid time, −1 where it has none
+    first : where they begin
+    per_time : how many a grid time has
+    taken : whether those that grasps take do not count
+    """
+
+    number: Index
+    first: int
+    per_time: int
+    taken: bool
+
+
+def rows_of_motion(segment: Segment, reactions: Reactions | None) -> list[RowsOfMotion]:
+    """The equations of motion, and those of what grasps give, where the program has them."""
+    kinds = [(segment.free_dofs, segment.row_dofs, segment.first.row, True)]
+    if reactions is not None:
+        kinds.append((reactions.dofs, reactions.dofs, reactions.places.row, False))
+    found = []
+    for moving, dofs, first, taken in kinds:
+        number = np.full(segment.dofs, -1)
+        number[moving] = np.searchsorted(dofs, moving)
+        found.append(RowsOfMotion(number, first, len(dofs), taken))
+    return found

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..model.forces import Forces
-from ..model.viscoelasticity import start_carried
+from ..model.viscoelasticity import at_start
 from ..recording.experiment import Experiment
 from .factorisation import NONE
 from .lapack import one_blas_thread
@@ -48,17 +48,17 @@ def _at_rest(
     solver: Solver,
 ) -> Array:
     still, shape = np.zeros((1, len(goals_m))), experiment.rigid_positions([at_s])[0]
-    carried = start_carried(experiment.body, forces.theta, experiment.loaded_since_s)
+    forces = at_start(forces, experiment.loaded_since_s)
 
     def solve(x: Array, share: float) -> Array:
         loaded = forces.scaled(share)
 
         def residual(state: Array) -> Array:
-            return loaded.total(state, still, carried)[0]
+            return loaded.total(state, still)[0]
 
         def linearise(state: Array) -> tuple[Array, Array, Array]:
             # Nothing moves: there is no skew part.
-            at = loaded.linearise(state, still, carried=carried)
+            at = loaded.linearise(state, still)
             return at.force[0], -at.by_position[0], NONE
 
         # Grasps that are off are there at the end: the way there may be any.

@@ -6,7 +6,7 @@ In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, gra
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -19,12 +19,12 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics, StencilRow
 from ..model.grasp_constraint import Grasping, Held
+from ..model.histories import AnyHistory
 from ..model.inputs import Inputs, inputs_of, with_inputs
 from ..model.nuisance import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..model.setting import Setting
-from ..model.viscoelasticity import History
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
 from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_values
@@ -42,6 +42,7 @@ from .wrench_channel import Grid, sensed_dofs
 T = TypeVar("T", bound=np.generic)
 # Of what two stencils (p, q) of an evaluation make of its two matrices.
 Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+Weighed = tuple[AnyHistory, Array]
 
 CHARTED = ("markers", "readings", "local_loss", "_loss_scale")
 
@@ -361,6 +362,16 @@ class Segment:
         """Positions in (q, φ) of the parameters that change the motion."""
         return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.moving])
 
+    def moving_in(self, first_phi: int) -> Index:
+        """The same in z, where the φ of all experiments begin at `first_phi`."""
+        phi = first_phi - self.nq + self.local.places[self.nuisance.moving]
+        return np.concatenate([np.arange(self.nq), phi])
+
+    @property
+    def carries(self) -> bool:
+        """Whether its body or a force on it carries something."""
+        return self.body.remembers or bool(self.dynamics.forces.carrying)
+
     def setting(self, q: Array, phi: Array) -> Setting:
         """The equations of motion at (q, φ)."""
         p = np.concatenate([q, phi[self.nuisance.moving]])
@@ -404,10 +415,10 @@ class Segment:
     # Values ---------------------------------------------------------------------------------
 
     def constraint_values(
-        self, x: Array, setting: Setting, history: History | None = None
+        self, x: Array, setting: Setting, along: Sequence[AnyHistory] = ()
     ) -> Array:
         """(constraints,) scaled rows at x (N, 3n) in metres."""
-        return self._rows(x, setting.dynamics.residual(x, history), setting)
+        return self._rows(x, setting.dynamics.residual(x, along), setting)
 
     def _rows(self, x: Array, residual: Array, setting: Setting) -> Array:
         rows = residual / self.force_n
@@ -427,9 +438,9 @@ class Segment:
         grasped[:, self.held_dofs] = True
         return self.of_rows(grasped)
 
-    def residual_n(self, x: Array, setting: Setting, history: History | None = None) -> Array:
+    def residual_n(self, x: Array, setting: Setting, along: Sequence[AnyHistory] = ()) -> Array:
         """(N, free dofs) violation of the equations of motion in newtons."""
-        residual = setting.dynamics.residual(x, history)
+        residual = setting.dynamics.residual(x, along)
         return self.dynamics.without_taken(residual)[:, self.free_dofs]
 
     @cached_property
@@ -491,21 +502,18 @@ class Segment:
             forces = forces + dynamics.combine_transposed(t.w, of_reactions)
         return RowWeights(multipliers, rows, forces)
 
-    def through_memory(self, x: Array, setting: Setting, multipliers: Array) -> tuple[Array, Array]:
-        """Derivatives of multipliers · c through the memory, by scaled x (N, 3n) and by q."""
-        by_x, by_q = self.pulled_through_memory(x, setting, self.weights(multipliers).forces)
-        return self.length_m * by_x, by_q
+    def pulled_through(self, x: Array, setting: Setting, weights: Array) -> tuple[Array, Array]:
+        """Slopes of Σ weights · F through what is carried, by x and by what moves the body.
 
-    def pulled_through_memory(
-        self, x: Array, setting: Setting, weights: Array
-    ) -> tuple[Array, Array]:
-        """Slopes of Σ weights · F through the memory, by x and by q, at weights (N, 3n)."""
-        dynamics = setting.dynamics
-        history = dynamics.history(x)
-        if history is None:
-            return np.zeros_like(x), np.zeros(self.nq)
-        by_xi, by_q = history.pulled(weights, setting.theta_q)
-        return dynamics.combine_transposed(dynamics.state_weights, by_xi), by_q
+        Weights are (N, 3n).
+        """
+        dynamics, by_x, by_p = setting.dynamics, np.zeros_like(x), np.zeros(len(self.moving))
+        for history in dynamics.histories(x):
+            by_xi, by_nu, own = history.pulled(weights, setting.by_p)
+            by_x += dynamics.combine_transposed(dynamics.state_weights, by_xi)
+            by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu) / dynamics.step_s
+            by_p += own
+        return by_x, by_p
 
     @cached_property
     def linearisation_rows(self) -> Array:
@@ -572,7 +580,7 @@ class Segment:
         weights: RowWeights,
         loss_weight: float,
         values: Array,
-        carried: tuple[History, Array] | None = None,
+        carried: Sequence[Weighed] = (),
         bent: bool = True,
     ) -> tuple[Array, list[Array]]:
         """Second derivatives of loss_weight · L + weights · c.
@@ -581,8 +589,7 @@ class Segment:
         ----------
         values : (hessian.nnz,) out, of the dynamics in the columns of x
         bent : whether readings are, see `LocalLoss.hessian`
-        carried : optional, a history and μ (N, all branches)
-            Where the memory is given, Σ μ_k (d_k m_{k−1} + a_k S_k) is added; see `memory`.
+        carried : histories that are given, with what h_k of each counts besides, Σ μ_k h_k
 
         Returns
         -------
@@ -620,19 +627,16 @@ class Segment:
         return twice[: self.nq, : self.nq], further
 
     def _curvature(
-        self, x: Array, setting: Setting, weights: Array, carried: tuple[History, Array] | None
+        self, x: Array, setting: Setting, weights: Array, carried: Sequence[Weighed]
     ) -> Curvature:
-        """That of the forces and the memory at all N evaluations, a given start included."""
+        """That of the forces and what is left at all N evaluations, a given start included."""
         dynamics = setting.dynamics
-        xi = dynamics.combine(dynamics.state_weights, x)
-        nu = dynamics.combine(dynamics.tables.q, x) / dynamics.step_s
-        at = xi, nu, weights, self._curvature_rows
-        if carried is None:
-            return dynamics.forces.curvature(*at)
-        history, mu = carried
-        borne = history.carried(slice(None)), history.stress_weights(mu)
-        curvature = dynamics.forces.curvature(*at, *borne)
-        history.add_curvature(curvature, mu)
+        forces, (xi, nu) = dynamics.forces, dynamics.evaluated_at(x)
+        for history, mu in carried:
+            forces = history.weighed(forces, mu)
+        curvature = forces.curvature(xi, nu, weights, self._curvature_rows)
+        for history, mu in carried:
+            history.add_curvature(curvature, mu)
         return curvature
 
     @cached_property

@@ -5,14 +5,14 @@ Reactions follow from positions x by the equations of motion, see `reaction`; re
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..arrays import Array
+from ..model.histories import AnyHistory
 from ..model.setting import Setting
-from ..model.viscoelasticity import History
 from .block_band import Submatrix
 from .channel import Forced, Motion
 from .reaction import HeldForces, forces_on, reaction_slopes, reactions
@@ -49,13 +49,13 @@ class Sensing:
     setting: Setting
     phi: Array
 
-    def motion(self, x: Array, history: History | None = None) -> Motion:
+    def motion(self, x: Array, along: Sequence[AnyHistory] = ()) -> Motion:
         """Positions x (N, 3n), or the first rows, with the reactions that follow from them."""
-        return Motion(x, lambda: self._forced(x, history))
+        return Motion(x, lambda: self._forced(x, along))
 
-    def _forced(self, x: Array, history: History | None = None) -> Forced:
+    def _forced(self, x: Array, along: Sequence[AnyHistory] = ()) -> Forced:
         dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
-        force = forces_on(dynamics, x, dofs, history)
+        force = forces_on(dynamics, x, dofs, along)
         mass_kg = self._mass_kg[: len(x)]
         reaction = reactions(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
         return Forced(reaction, x[:, dofs])
@@ -178,6 +178,5 @@ class Sensing:
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
         inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)
         by_x[:, dofs] += inertia / dynamics.step_s**2
-        of_memory, of_q = segment.pulled_through_memory(x, setting, whole)
-        by_p[: segment.nq] += of_q
-        return by_x + of_memory, by_p
+        of_carried, own = segment.pulled_through(x, setting, whole)
+        return by_x + of_carried, by_p + own

@@ -28,8 +28,10 @@ from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from ..model.dynamics import Dynamics, StencilRow, weighted
+from ..model.force_history import Carrying
+from ..model.histories import AnyHistory
 from ..model.setting import Setting
-from ..model.viscoelasticity import History, Slopes, Weights
+from ..model.viscoelasticity import Slopes
 from .block_band import Submatrix
 from .factorisation import NONE, Choice, Factor, Factoriser
 from .lapack import one_blas_thread
@@ -82,13 +84,13 @@ class LastRows:
     solutions : (3n, c) Y_{t−i}
     increments : (free, c) dF_{t−j}
     forces : (free,) total forces F_{t−j} at the evaluations
-    overstress : (c, …) dm of all branches, where a body has a memory
+    carried : columns of what is carried
     """
 
     solutions: tuple[Array, ...]
     increments: tuple[Array, ...]
     forces: tuple[Array, ...] = ()
-    overstress: Array | None = None
+    carried: tuple[Array, ...] = ()
 
 
 class Step(NamedTuple):
@@ -222,12 +224,11 @@ class Columns:
             right[..., first:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
         return right, force
 
-    @property
-    def theta(self) -> Array:
-        """(k, c) derivatives of θ."""
-        if self.by_p:
-            return self.setting.columns(int(self.step))
-        return np.zeros((len(self.setting.theta), self.count))
+    def of_inputs(self, t: int) -> Array:
+        """(U, c) derivatives of the inputs of an evaluation."""
+        own = self.setting.by_p[t]
+        none = np.zeros((len(own), int(self.step) if self.by_p else self.count))
+        return np.hstack([none, own]) if self.by_p else none
 
 
 class Sweep:
@@ -327,18 +328,20 @@ class Sweep:
         """
         reach, free, y = self.dynamics.reach, self.free, np.zeros_like(x)
         pulled = -gradient[:, free]  # what is left for the rows that are still to come
-        history = self.dynamics_at(setting).history(x)
-        weights, later = Weights(history) if history else None, deque[StencilRow](maxlen=reach)
-        for chunk in self.chunks(x, setting, backward=True, history=history):
+        along, later = self.dynamics_at(setting).histories(x), deque[StencilRow](maxlen=reach)
+        carried = [history.backward() for history in along]
+        for chunk in self.chunks(x, setting, backward=True, along=along):
             for step in reversed(chunk.steps):
                 t, row = step.t, step.row
                 p, q, mass = row.p, row.q, row.mass_kg[free]
-                through_stress = weights.pulled()[free] if weights else 0.0
+                by_state = by_rate = 0.0
+                for own in (each.pulled() for each in carried):
+                    by_state, by_rate = by_state + own[0][free], by_rate + own[1][free]
                 known = np.zeros(x.shape[1])
                 for j, other in enumerate(later, 1):
                     known += other.w[j] * y[t + j]
                 known[self.dynamics.taken[t]] = 0
-                pulled[t] -= p[0] * through_stress
+                pulled[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
                     by_position = self.matrix.of(step.by_position, -step.skew) @ known
                     pulled[t] -= p[0] * by_position
@@ -348,10 +351,10 @@ class Sweep:
                 y[t, free] = -step.factor.solve(right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
                 by_position = self.matrix.of(step.by_position, -step.skew) @ force_weight
-                by_position += through_stress
-                by_velocity = self.matrix.of(step.by_velocity, NONE) @ force_weight
-                if weights:
-                    weights.retreat(force_weight)
+                by_position += by_state
+                by_velocity = self.matrix.of(step.by_velocity, NONE) @ force_weight + by_rate
+                for each in carried:
+                    each.retreat(force_weight)
                 for i in range(1, min(reach, t) + 1):
                     pulled[t - i] -= p[i] * by_position + q[i] * by_velocity
                     pulled[t - i] += row.s[i] * mass * y[t, free]
@@ -393,7 +396,7 @@ class Sweep:
         setting: Setting,
         backward: bool = False,
         first: int = 0,
-        history: History | None = None,
+        along: Sequence[AnyHistory] = (),
     ) -> Iterator[Chunk]:
         """Blocks and factors of every row from `first` on, computed side by side."""
         dynamics = self.dynamics_at(setting)
@@ -404,9 +407,7 @@ class Sweep:
             here = slice(start, min(start + self.chunk, dynamics.rows))
             seen = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
             with self.stopwatch.evaluating():
-                forces = setting.dynamics.forces.rows(here)
-                carried = dynamics.carried(history, here)
-                at = forces.linearise(xi[seen], nu[seen], carried=carried)
+                at = dynamics.forces_along(along, here).linearise(xi[seen], nu[seen])
             with self.stopwatch.solving():
                 rows = [StencilRow.of(dynamics, t) for t in range(start, here.stop)]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
@@ -476,32 +477,33 @@ class Forward:
         self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
-        self.slopes: Slopes | None = None
-        self._overstress = last.overstress
+        self.carried: list[Slopes | Carrying] = []
+        self._known = last.carried
 
     @property
     def last(self) -> LastRows:
         """What later rows depend on."""
-        overstress = self.slopes.columns if self.slopes else None
+        carried = tuple(each.columns for each in self.carried)
         past = tuple(self.past), tuple(self.past_increments), tuple(self.past_forces)
-        return LastRows(*past, overstress)
+        return LastRows(*past, carried)
 
     def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
         """Y_t (3n, c) at x (N, 3n) after rows that are done, also into `out` (N, 3n, c)."""
         solver, columns, setting = self.solver, self.columns, self.columns.setting
         dynamics, first = solver.dynamics_at(setting), solver.dynamics.first_row
-        history, acceleration = dynamics.history(x), dynamics.acceleration(x)
-        if history is not None:
-            self.slopes = Slopes(history, columns.theta, done, self._overstress)
+        along, acceleration = dynamics.histories(x), dynamics.acceleration(x)
+        known = self._known or [None] * len(along)
+        pairs = zip(along, known, strict=True)
+        self.carried = [each.forward(columns.of_inputs, done, own) for each, own in pairs]
         for t in range(done, first):  # the start is given
-            if self.slopes is not None:
-                self.slopes.advance(np.zeros(self.shape))
+            for each in self.carried:
+                each.advance(lambda: np.zeros(self.shape), lambda: np.zeros(self.shape))
             start = np.zeros(self.shape)
             if columns.grasped is not None:
                 columns.grasped.place(t, start)
             self.past.appendleft(start)
             yield np.zeros(self.shape)
-        for chunk in solver.chunks(x, setting, first=done, history=history):
+        for chunk in solver.chunks(x, setting, first=done, along=along):
             residual = None
             if columns.step:
                 residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
@@ -533,8 +535,8 @@ class Forward:
         if self.weighs_past:
             right += weighted(w, self.past_increments, self._of_free)
         right -= mass * weighted(s, self.past, self.shape).take(free, axis=0)
-        if self.slopes is not None:
-            force = force + self.slopes.force()
+        for each in self.carried:
+            force = force + each.force()
         forced = force.take(free, axis=0)
         forced += self._of_past(step, row)
         if given is not None:
@@ -547,8 +549,10 @@ class Forward:
         found[free] = solution
         if given is not None:
             given.place(t, found)
-        if self.slopes is not None:
-            self.slopes.advance(self._evaluated(row.p, found))
+        for each in self.carried:
+            each.advance(
+                lambda: self._evaluated(row.p, found), lambda: self._evaluated(row.q, found)
+            )
         if self.held is not None:
             self._sense(self.held, step, force, found)
         self.past.appendleft(found)

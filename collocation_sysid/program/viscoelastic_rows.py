@@ -22,8 +22,8 @@ from ..model.viscoelasticity import CHUNK, History
 from .carried import Carried, together
 from .entries import Outer
 from .part import Part
-from .reaction_rows import Reactions
-from .segment import RowWeights
+from .reaction_rows import Reactions, RowsOfMotion, rows_of_motion
+from .segment import RowWeights, Weighed
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +46,11 @@ class _Lag:
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """Rows of motion: of which slopes (K,), what number each has at its time, and where all begin.
-
-    `taken` says whether those that grasps take do not count.
-    """
+    """Rows of motion: of which slopes (K,), and what number each has at its time."""
 
     slopes: Index
     number: Index
-    first: int
-    per_time: int
-    taken: bool
+    rows: RowsOfMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +97,19 @@ class Overstress(Carried):
     def given(self, part: Part, z: Array) -> Part:
         """The experiment with m_{k−1} (N, width) at z."""
         later = z[self.variables].reshape(self.shape) * self.unit_pa
-        return replace(part, brought=np.concatenate([np.zeros((1, self.shape[1])), later]))
+        brought = np.concatenate([np.zeros((1, self.shape[1])), later])
+        return replace(part, brought={**part.brought, self.history: brought})
 
     def values(self, part: Part, z: Array) -> Array:
         """(count,) r at the m of the experiment."""
         return (_history(part).gaps / self.unit_pa).ravel()
 
-    def remembered(self, part: Part, multipliers: Array) -> tuple[History, Array]:
+    @property
+    def history(self) -> int:
+        """That of the body comes first."""
+        return 0
+
+    def weighed(self, part: Part, multipliers: Array) -> Weighed:
         """And μ (N, …) such that multipliers · r has −Σ μ_k (m_k − d_k m_{k−1} − …)."""
         return _history(part), self._mu(multipliers)
 
@@ -134,16 +135,10 @@ class Overstress(Carried):
     @cached_property
     def _moved(self) -> list[_Moved]:
         """Rows of motion that m is in, and by which slopes."""
-        segment, kinds = self.segment, []
-        kinds.append((segment.free_dofs, segment.row_dofs, segment.first.row, True))
-        if self.reactions is not None:
-            dofs = self.reactions.dofs
-            kinds.append((dofs, dofs, self.reactions.places.row, False))
-        found = []
-        for moving, dofs, first, taken in kinds:
-            slopes = np.flatnonzero(np.isin(self._slopes[2], moving))
-            number = np.searchsorted(dofs, self._slopes[2][slopes])
-            found.append(_Moved(slopes, number, first, len(dofs), taken))
+        found, dofs = [], self._slopes[2]
+        for rows in rows_of_motion(self.segment, self.reactions):
+            slopes = np.flatnonzero(rows.number[dofs] >= 0)
+            found.append(_Moved(slopes, rows.number[dofs[slopes]], rows))
         return found
 
     @cached_property
@@ -196,7 +191,7 @@ class Overstress(Carried):
         for moved in self._moved:
             for each in self._force_lags:
                 late = each.times + each.lag - self.segment.dynamics.first_row
-                rows = [moved.first, late * moved.per_time, moved.number]
+                rows = [moved.rows.first, late * moved.rows.per_time, moved.number]
                 found.append(Outer(rows, self._brought(each, own[moved.slopes])))
         return found
 
@@ -266,12 +261,12 @@ class Overstress(Carried):
 
         def slopes(times: slice) -> Array:
             found = history.body.stresses.force_slopes(history.xi[times], history.theta)
-            return np.where(moved.taken & taken[times, dofs], 0.0, found[:, place] * scale)
+            return np.where(moved.rows.taken & taken[times, dofs], 0.0, found[:, place] * scale)
 
         found = self._spread(self._force_lags, slopes)
         for each, values in zip(self._force_lags, found, strict=True):
             late = taken[each.start + each.lag : each.stop + each.lag, dofs]
-            values[moved.taken & late] = 0.0
+            values[moved.rows.taken & late] = 0.0
         return found
 
     def hessian_values(
@@ -311,5 +306,6 @@ class Overstress(Carried):
 
 
 def _history(part: Part) -> History:
-    assert part.history is not None
-    return part.history
+    history = part.along[0]
+    assert isinstance(history, History)
+    return history

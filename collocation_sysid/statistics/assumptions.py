@@ -112,7 +112,7 @@ class Fitted:
         still = (self.theta if theta is None else theta).copy()
         still[list(self.body.tied_shares)] = 0.0
         dynamics = self.dynamics.with_theta(still)
-        carried = dynamics.carried(dynamics.history(self.part.x))
+        carried = dynamics.forces_along(dynamics.histories(self.part.x)).past
         xi, nu = dynamics.evaluation_states(self.part.x)
         return self.of_rows(
             self.body.force(xi / scale, nu / (scale * slower), still, carried=carried)
