@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.program.channel import operator_of
 from collocation_sysid.recording import Markers, Placement, place_markers
 
@@ -25,7 +26,9 @@ def box_body(divisions=(2, 2, 3), edge_m=0.1) -> Any:
             corners.append(corners[-1] + np.eye(3, dtype=int)[axis])
         cells.append(np.stack([np.ravel_multi_index(c.T, counts) for c in corners], axis=1))
     element = SimpleNamespace(shape_functions=lambda barycentric: barycentric)
-    return SimpleNamespace(nodes_m=nodes, cells=np.concatenate(cells), element=element)
+    tetrahedra = np.concatenate(cells)
+    mesh = TetMesh(nodes, tetrahedra)
+    return SimpleNamespace(nodes_m=nodes, cells=tetrahedra, element=element, mesh=mesh)
 
 
 def quadratic(body) -> Any:
@@ -41,7 +44,7 @@ def quadratic(body) -> Any:
         return np.column_stack([local * (2 * local - 1), *mid])
 
     element = SimpleNamespace(shape_functions=shape_functions)
-    return SimpleNamespace(nodes_m=nodes, cells=cells, element=element)
+    return SimpleNamespace(nodes_m=nodes, cells=cells, element=element, mesh=body.mesh)
 
 
 def bend(nodes_m):

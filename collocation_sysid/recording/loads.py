@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,19 +91,32 @@ def ramp(u: Any) -> Any:
     return (abs(u) < 1) * (0.5 + u - 0.5 * u * abs(u)) + (u >= 1)
 
 
-def _begin(load: PointMass | Force, what: str) -> None:
-    """Check the times of a load, and note what selected its nodes."""
-    if not load.from_s < load.until_s:
-        raise InputError(
-            f"a {what} is there from {load.from_s:g} s until {load.until_s:g} s; "
-            "expected from_s < until_s"
-        )
-    if isinstance(load.nodes, Selection):
-        vars(load)["selection"] = load.nodes
+class Load:
+    """Something that is on nodes of a body for a while."""
+
+    nodes: Index
+    from_s: float
+    until_s: float
+    called: ClassVar[str]
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __post_init__(self) -> None:
+        if not self.from_s < self.until_s:
+            raise InputError(
+                f"a {self.called} is there from {self.from_s:g} s until {self.until_s:g} s; "
+                "expected from_s < until_s"
+            )
+        if isinstance(self.nodes, Selection):
+            vars(self)["selection"] = self.nodes
+
+    def on(self, body: Body) -> Self:
+        """The same on the nodes of a body that are selected."""
+        nodes = on_body(self.nodes, body)
+        return self if nodes is self.nodes else replace(self, nodes=nodes)
 
 
 @stated
-class PointMass:
+class PointMass(Load):
     """A rigid point mass tied to nodes: inertia and weight.
 
     Like all mass that moves it is damped by γ_m.
@@ -127,13 +140,7 @@ class PointMass:
     selection: Selection | None = None
     until_s: float = key(Finite | None, default=np.inf)
 
-    def __post_init__(self) -> None:
-        _begin(self, "point mass")
-
-    def on(self, body: Body) -> PointMass:
-        """The same mass on the nodes of a body that are selected."""
-        nodes = on_body(self.nodes, body)
-        return self if nodes is self.nodes else replace(self, nodes=nodes)
+    called: ClassVar[str] = "point mass"
 
     def at_nodes(self, node_count: int) -> Array:
         """Mass that each node carries, (n,) [kg]."""
@@ -148,7 +155,7 @@ _TABLE = Key(
 
 
 @stated
-class Force:
+class Force(Load):
     """A force on nodes besides gravity.
 
     It is constant, or linear between the rows of a table.
@@ -176,15 +183,12 @@ class Force:
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
 
+    called: ClassVar[str] = "force"
+
     def __post_init__(self) -> None:
-        _begin(self, "force")
+        super().__post_init__()
         course = Course(self.force_n, self.t_s, "force_n", (3,))
         vars(self).update(force_n=course.values, t_s=course.t_s)
-
-    def on(self, body: Body) -> Force:
-        """The same force on the nodes of a body that are selected."""
-        nodes = on_body(self.nodes, body)
-        return self if nodes is self.nodes else replace(self, nodes=nodes)
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
         """Force on each node at the times `t_s` (T,) while it acts, (T, n, 3) [N]."""

@@ -81,9 +81,17 @@ class Markers:
         m = tracks.shape[1]
         if self.names is None:
             vars(self)["names"] = tuple(f"m{k}" for k in range(1, m + 1))
-        vars(self).update(
-            positions_m=tracks, sigma_m=_deviations(self.sigma_m, _distinct(self.names, m))
-        )
+        if len(self.names) != m:
+            message = f"{len(self.names)} marker names for {m} tracks; expected one for each"
+            raise InputError(message)
+        if repeated := [name for name in self.names if self.names.count(name) > 1]:
+            raise InputError(f"the marker name '{repeated[0]}' is given more than once")
+        each = np.broadcast_to(self.sigma_m, m) if self.sigma_m.ndim == 0 else self.sigma_m
+        sigma_m = read_only_floats(each, (m,), "sigma_m")
+        for name, sigma in zip(self.names, sigma_m, strict=True):
+            if not sigma > 0:
+                raise InputError(f"sigma_m of marker '{name}' is {sigma:g}; expected > 0")
+        vars(self).update(positions_m=tracks, sigma_m=sigma_m)
         self._find_places(m)
 
     def _find_places(self, m: int) -> None:
@@ -102,7 +110,8 @@ class Markers:
             known = np.isfinite(places_m).all(axis=1)
         vars(self).update(places_m=places_m, located=np.ones(m, bool) if known is None else known)
         if self.places_sigma_m is not None:
-            each = np.broadcast_to(self.places_sigma_m, m)
+            each = self.places_sigma_m
+            each = np.broadcast_to(each, m) if each.ndim == 0 else each
             sigma_m = read_only_floats(each, (m,), "places_sigma_m", finite=False)
             vars(self)["places_sigma_m"] = sigma_m
 
@@ -137,7 +146,11 @@ class Markers:
             points_m, times_s = self.first_samples
             back = points_m if carried_back is None else carried_back(points_m, times_s)
             for m in np.flatnonzero(~known).tolist():
-                self._require_seen(m)
+                if not self.present[:, m].any():
+                    raise InputError(
+                        f"marker '{self.names[m]}' is never seen and has no place on the body; "
+                        "give its reference_m, or leave it out"
+                    )
                 nodes, weights = shape.nearest(back[m])
                 places[m] = weights @ body.nodes_m[nodes]
         nodes_m = body.nodes.points_m
@@ -145,13 +158,6 @@ class Markers:
             places, nodes_m, body, self.attach, self.max_distance_m, self.names
         )
         return replace(self, places_m=None, placement=placement)
-
-    def _require_seen(self, m: int) -> None:
-        if not self.present[:, m].any():
-            raise InputError(
-                f"marker '{self.names[m]}' is never seen and has no place on the body; give its "
-                "reference_m, or leave it out"
-            )
 
     @classmethod
     def none(cls, t_s: ArrayLike) -> Markers:
@@ -189,21 +195,3 @@ class Markers:
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         around = nodes_m[..., self.placement.nodes, :]
         return np.einsum("mk,...mkd->...md", self.placement.weights, around)
-
-
-def _distinct(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    if len(names) != count:
-        raise InputError(f"{len(names)} marker names for {count} tracks; expected one for each")
-    repeated = [name for name in names if names.count(name) > 1]
-    if repeated:
-        raise InputError(f"the marker name '{repeated[0]}' is given more than once")
-    return names
-
-
-def _deviations(sigma_m: ArrayLike, names: tuple[str, ...]) -> Array:
-    each = np.broadcast_to(sigma_m, len(names)) if np.ndim(sigma_m) == 0 else sigma_m
-    sigma = read_only_floats(each, (len(names),), "sigma_m")
-    if not (sigma > 0.0).all():
-        worst = int(np.argmin(sigma))
-        raise InputError(f"sigma_m of marker '{names[worst]}' is {sigma[worst]:g}; expected > 0")
-    return sigma

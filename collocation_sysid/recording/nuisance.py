@@ -207,16 +207,16 @@ CALIBRATION_DISTORTION = NuisanceRow("calibration_distortion_1_m2", "1/m²", Non
     label="distortion of the cameras", told="cameras' distortion {signed}",
     said="radial distortion of first order about the body's middle: a factor 1 + k r²",
     reading=_distorted)
-CLOCK_RATE = NuisanceRow("clock_rate", "1", None, key="clock_rate", considered=1e-4,
-    changes=("clock",), applies=lambda experiment: _moves(experiment) and _seen(experiment),
-    label="rate of the markers' clock", told="the markers' clock {signed} slow",
-    said="how much slower than the grasps' clock that of the markers goes",
-    clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]))
 TIME = NuisanceRow("time_shift_s", "s", 5e-3, key="time_shift", changes=("clock",), applies=_moves,
     label="time shift", told="markers seen {size} {way} than their times say{limit}",
     said="how much later than their times say markers were seen, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values)
+CLOCK_RATE = NuisanceRow("clock_rate", "1", None, key="clock_rate", considered=1e-4,
+    changes=("clock",), applies=lambda experiment: _moves(experiment) and _seen(experiment),
+    label="rate of the markers' clock", told="the markers' clock {signed} slow",
+    said="how much slower than the grasps' clock that of the markers goes",
+    clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]))
 TURN = NuisanceRow("pose_turn_rad", "rad", None, key="pose", axes="x y z",
     changes=("reading", "gravity"), by="length",
     label="turn of the pose, {axis}", told="poses turned by {size}",
@@ -301,31 +301,10 @@ TOOL_CENTRE = NuisanceRow("tool_m", "m", None, key="tool", of="sensor", axes="x 
     said="its centre about the sensor's point; in the world's frame that of the grasped nodes")
 # fmt: on
 
+# In the order of φ; neighbours of one component stand together.
+ROWS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
 GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
-
-# In the order of φ; neighbours of one component stand together.
-ROWS = (
-    *(
-        PLACE,
-        OFFSET,
-        CALIBRATION_SCALE,
-        CALIBRATION_DISTORTION,
-        TIME,
-        CLOCK_RATE,
-        TURN,
-        SHIFT,
-        TILT,
-        GRASP_TURN,
-        GRASP_SHIFT,
-        ZERO,
-        OBSTACLE_OFFSET,
-        OBSTACLE_TILT,
-        OBSTACLE_TIME,
-    ),
-    *(TENSION_FACTOR, TENSION_LOST, PRESSURE_FACTOR, PRESSURE_LOST, JOINING),
-    *(TARE, SENSOR_TIME, SENSOR_LAG, TOOL_MASS, TOOL_CENTRE),
-)
 
 
 class _Deviations:

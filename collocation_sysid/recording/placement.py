@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -79,7 +78,7 @@ def place_markers(
     node_positions_m : (n, 3) array
         Node positions at that moment.
     body : Body
-        Provides `cells` and `element`.
+        Provides `mesh`, `cells` and `element`.
     attach : {"auto", "vertex", "embedded"}
         "vertex": the nearest node. "embedded": the tetrahedron holding the marker, or nearest to
         it. "auto": the nearest node if within 5 % of the mean edge length, else embedded.
@@ -137,17 +136,12 @@ class Shape:
     def __init__(self, nodes_m: Array, body: Body) -> None:
         self.nodes_m = nodes_m
         self.body = body
-        corners = body.cells[:, :4]
-        pairs = np.concatenate([corners[:, pair] for pair in combinations(range(4), 2)])
-        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-        self.mean_edge_m = float(
-            np.linalg.norm(nodes_m[pairs[:, 0]] - nodes_m[pairs[:, 1]], axis=1).mean()
-        )
+        corners, ends = body.cells[:, :4], nodes_m[body.mesh.edges]
+        self.mean_edge_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.origin = nodes_m[corners[:, 0]]
         edges = nodes_m[corners[:, 1:]] - self.origin[:, None]
         self.inverse = np.linalg.inv(edges)  # L1..L3 = (x − origin) @ inverse
-        faces, self.face_owner = _boundary_faces(corners)
-        self.triangles = nodes_m[faces]
+        self.triangles = nodes_m[body.mesh.surface]
 
     def vertex(self, node: int) -> tuple[Index, Array]:
         """Nodes and weights of a marker on a node: an element around it, all weight on the node."""
@@ -165,10 +159,10 @@ class Shape:
         cell = int(np.argmax(depth))
         if depth[cell] >= -_INSIDE_TOLERANCE:
             return cell, 0.0
-        to_faces = _distance_to_triangles(point, self.triangles)
+        to_faces = np.linalg.norm(point - _nearest(point, self.triangles), axis=1)
         distance = float(to_faces.min())
         # Where an edge or corner is nearest, extrapolate from the element that must the least.
-        nearest = self.face_owner[to_faces <= distance + 1e-9 * self.mean_edge_m]
+        nearest = self.body.mesh.surface_cells[to_faces <= distance + 1e-9 * self.mean_edge_m]
         return int(nearest[np.argmax(depth[nearest])]), distance
 
     def nearest(self, point: Array) -> tuple[Index, Array]:
@@ -181,10 +175,10 @@ class Shape:
 
     def on_surface(self, point: Array) -> tuple[Array, Array]:
         """The nearest point of the surface, and two directions (3, 2) in its face."""
-        face = int(np.argmin(_distance_to_triangles(point, self.triangles)))
-        corners = self.triangles[face]
-        along = np.asarray(np.linalg.qr((corners[1:] - corners[0]).T)[0], dtype=np.float64)
-        return _nearest_in_triangle(point, corners), along
+        nearest = _nearest(point, self.triangles)
+        face = int(np.linalg.norm(point - nearest, axis=1).argmin())
+        sides = self.triangles[face, 1:] - self.triangles[face, 0]
+        return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
         """Barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in cells (k,)."""
@@ -216,47 +210,18 @@ class Shape:
         return best
 
 
-def _nearest_in_triangle(point: Array, corners: Array) -> Array:
-    """The point of a triangle (3, 3) that is nearest to a point (3,)."""
-    a, edges = corners[0], (corners[1:] - corners[0]).T
-    share = np.linalg.lstsq(edges, point - a, rcond=None)[0]
-    if (share >= 0).all() and share.sum() <= 1:
-        return np.asarray(a + edges @ share, dtype=np.float64)
-    ends = [(corners[i], corners[j]) for i, j in combinations(range(3), 2)]
-    feet = [
-        p + np.clip((point - p) @ (q - p) / ((q - p) @ (q - p)), 0.0, 1.0) * (q - p)
-        for p, q in ends
-    ]
-    nearest = int(np.argmin([np.linalg.norm(point - foot) for foot in feet]))
-    return np.asarray(feet[nearest], dtype=np.float64)
-
-
-def _boundary_faces(corners: Index) -> tuple[Index, Index]:
-    """Triangles that belong to one tetrahedron only, and that tetrahedron."""
-    faces = np.concatenate([corners[:, triple] for triple in combinations(range(4), 3)])
-    owner = np.tile(np.arange(len(corners)), 4)
-    _, first, uses = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    outer = first[uses == 1]
-    return faces[outer], owner[outer]
-
-
-def _distance_to_triangles(point: Array, triangles: Array) -> Array:
-    """Distance from a point (3,) to each triangle (F, 3, 3)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    normal = np.cross(b - a, c - a)
-    area_squared = np.einsum("fi,fi->f", normal, normal)
-    in_c = np.einsum("fi,fi->f", np.cross(b - a, point - a), normal) / area_squared
-    in_b = np.einsum("fi,fi->f", np.cross(point - a, c - a), normal) / area_squared
+def _nearest(point: Array, triangles: Array) -> Array:
+    """The points of triangles (F, 3, 3), each (F, 3), that are nearest to a point (3,)."""
+    ends = np.roll(triangles, -1, axis=1)
+    sides, away = ends - triangles, point - triangles
+    share = np.einsum("fci,fci->fc", away, sides) / np.einsum("fci,fci->fc", sides, sides)
+    on_sides = triangles + np.clip(share, 0.0, 1.0)[:, :, None] * sides
+    best = np.linalg.norm(point - on_sides, axis=2).argmin(axis=1)
+    ab, ac, ap = sides[:, 0], -sides[:, 2], away[:, 0]
+    normal = np.cross(ab, ac)
+    squared = np.einsum("fi,fi->f", normal, normal)
+    in_c = np.einsum("fi,fi->f", np.cross(ab, ap), normal) / squared
+    in_b = np.einsum("fi,fi->f", np.cross(ap, ac), normal) / squared
     above = (in_b >= 0.0) & (in_c >= 0.0) & (in_b + in_c <= 1.0)
-    to_plane = np.abs(np.einsum("fi,fi->f", point - a, normal)) / np.sqrt(area_squared)
-    to_edges = np.min([_distance_to_segments(point, p, q) for p, q in ((a, b), (b, c), (c, a))], 0)
-    return np.where(above, to_plane, to_edges)
-
-
-def _distance_to_segments(point: Array, start: Array, end: Array) -> Array:
-    along = end - start
-    fraction = np.einsum("fi,fi->f", point - start, along) / np.einsum("fi,fi->f", along, along)
-    nearest = start + np.clip(fraction, 0.0, 1.0)[:, None] * along
-    return np.linalg.norm(point - nearest, axis=1)
+    within = triangles[:, 0] + in_b[:, None] * ab + in_c[:, None] * ac
+    return np.where(above[:, None], within, on_sides[np.arange(len(best)), best])
