@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 from pydantic import AfterValidator, Field, model_validator
-from scipy.spatial.transform import Rotation
 
-from ..arrays import Array
 from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
-from ..recording import Experiment, Gauge, Grasp, Wrench
-from ..recording.poses import QUATERNION_NORM_TOLERANCE
+from ..recording import Experiment, Gauge, Grasp, Markers, Wrench
 from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
@@ -30,24 +25,6 @@ class TransformSection(Section):
 
     position_m: Vector = (0.0, 0.0, 0.0)
     quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 1.0)
-
-    @model_validator(mode="after")
-    def _unit_norm(self) -> TransformSection:
-        norm = math.hypot(*self.quaternion_xyzw)
-        if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
-            raise ValueError(
-                f"found quaternion_xyzw of the norm {norm:.6g}; expected 1 within "
-                f"{QUATERNION_NORM_TOLERANCE:g} (order x, y, z, w)"
-            )
-        return self
-
-    @property
-    def matrix(self) -> Array:
-        """(4, 4) [[R, p], [0, 1]]."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
-        matrix[:3, 3] = self.position_m
-        return matrix
 
 
 class TableSection(Section):
@@ -165,15 +142,6 @@ class GraspSection(section_of(Grasp, "GraspSection")):
     wrench: WrenchSection | None = None
 
     @model_validator(mode="after")
-    def _window(self) -> GraspSection:
-        if self.from_s is not None and self.until_s is not None and self.from_s > self.until_s:
-            raise ValueError(
-                f"found from_s = {self.from_s:g} and until_s = {self.until_s:g}; "
-                "expected from_s <= until_s"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _one_source_of_poses(self) -> GraspSection:
         sources = given_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
@@ -184,17 +152,18 @@ class GraspSection(section_of(Grasp, "GraspSection")):
                 "in markers are on the undeformed body already"
             )
         for owner, keys in (
-            ("poses", given_keys(self, "quaternion", "length_unit", "gripper_to_body")),
-            (
-                "markers",
-                [*given_keys(self, "max_residual_m"), *(["weights"] if self.weights else [])],
-            ),
+            ("poses", ("quaternion", "length_unit", "gripper_to_body")),
+            ("markers", ("max_residual_m", "weights")),
         ):
-            if keys and getattr(self, owner) is None:
-                raise ValueError(f"found {keys[0]} without {owner}; it belongs to {owner}")
-        if self.markers is not None:
-            _at_least_three(self.markers, "markers")
-            _all_among(self.weights, self.markers, "weights")
+            there = [key for key in keys if getattr(self, key)]
+            if there and getattr(self, owner) is None:
+                raise ValueError(f"found {there[0]} without {owner}; it belongs to {owner}")
+        _at_least_three(self.markers, "markers")
+        for name in self.weights:
+            if name not in (names := self.markers or ()):
+                raise ValueError(
+                    f"found {name!r} in weights; expected names among {', '.join(names)}"
+                )
         return self
 
 
@@ -203,7 +172,7 @@ Sigma = Annotated[dict[str, Positive] | Positive, ByForm(dict)]
 ReferenceSigma = Annotated[dict[str, NotNegative] | NotNegative, ByForm(dict)]
 
 
-class MarkersSection(Section):
+class MarkersSection(section_of(Markers, "MarkersSection")):
     """Tracked points.
 
     Attributes
@@ -236,10 +205,6 @@ class MarkersSection(Section):
     reference_sigma_m : ReferenceSigma, optional
         Standard deviation of the places in reference_m, for all or by marker name; 0 for exact
         ones. That of nuisance.marker_offsets by default.
-    places : {"free", "surface"}
-        Places that are estimated may be anywhere, or stay on the surface.
-    max_distance_m : float, optional
-        Farthest a marker may be from the body; the mean edge length by default.
     """
 
     file: Text | None = None
@@ -254,9 +219,6 @@ class MarkersSection(Section):
     max_template_residual_m: Positive | None = None
     reference_m: dict[str, Vector] = Field(default_factory=dict)
     reference_sigma_m: ReferenceSigma | None = None
-    places: Literal["free", "surface"] = "free"
-    attach: Literal["auto", "vertex", "embedded"] = "auto"
-    max_distance_m: Positive | None = None
 
     @model_validator(mode="after")
     def _template(self) -> MarkersSection:
@@ -266,8 +228,7 @@ class MarkersSection(Section):
                 f"found {', '.join(given)}; expected template_m and template_window_s, both or "
                 "neither"
             )
-        if self.template_m is not None:
-            _at_least_three(self.template_m, "template_m")
+        _at_least_three(self.template_m, "template_m")
         if (window := self.template_window_s) is not None and not window[0] <= window[1]:
             raise ValueError(
                 f"found template_window_s = {list(window)}; expected [start, end] with start <= end"
@@ -377,9 +338,9 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     def _static(self) -> ExperimentSection:
         if self.kind == "dynamic":
             return self
-        moving = [key for key in ("start", "start_rule", "resample_hz") if self._differs(key)]
-        shift = getattr(self.nuisance, "time_shift", None)
-        if isinstance(shift, Section):
+        usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}
+        moving = [key for key, value in usual.items() if getattr(self, key) != value]
+        if isinstance(getattr(self.nuisance, "time_shift", None), Section):
             moving.append("nuisance.time_shift")
         if moving:
             raise ValueError(
@@ -388,18 +349,9 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
             )
         return self
 
-    def _differs(self, key: str) -> bool:
-        return getattr(self, key) != type(self).model_fields[key].default
 
-
-def _at_least_three(places: dict[str, Any], key: str) -> None:
-    if len(places) < 3:
+def _at_least_three(places: dict[str, Any] | None, key: str) -> None:
+    if places is not None and len(places) < 3:
         raise ValueError(
             f"found {len(places)} in {key}; expected at least three, to fix a rotation"
         )
-
-
-def _all_among(asked: dict[str, Any], names: dict[str, Any], key: str) -> None:
-    for name in asked:
-        if name not in names:
-            raise ValueError(f"found {name!r} in {key}; expected names among {', '.join(names)}")

@@ -71,6 +71,11 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
     return nodes
 
 
+def triple(point: ArrayLike) -> str:
+    """A point (3,) in a message."""
+    return f"({', '.join(f'{x:.4g}' for x in np.asarray(point))})"
+
+
 def _require_shape(shape: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:
     matches = len(shape) == len(expected) and all(
         want is None or have == want for have, want in zip(shape, expected, strict=True)

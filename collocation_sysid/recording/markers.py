@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Index
+from ..checked import Positive
 from ..errors import InputError
-from ..stated import as_given, key, stated
+from ..stated import Key, as_given, key, stated
 from .arrays import floats, read_only_floats, read_only_tracks
 from .placement import Attachment, Placement, Shape, place_markers
 
@@ -24,6 +25,16 @@ __all__ = ["Markers", "Placement", "place_markers"]
 SHOWN = 4
 
 CarriedBack = Callable[[Array, Array], Array]
+
+
+_FARTHEST = Key("max_distance_m", Positive | None)
+_PLACES = Key(
+    "places",
+    Literal["free", "surface"],
+    lambda word: word == "surface",
+    said="Places that are estimated may be anywhere, or stay on the surface.",
+    default="free",
+)
 
 
 @stated
@@ -70,10 +81,10 @@ class Markers:
     places_m: Array | None = key(converter=np.asarray, default=None)
     placement: Placement = key(converter=as_given, default=None)
     places_sigma_m: Array | None = key(converter=np.asarray, default=None)
-    on_surface: bool = False
+    on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
     attach: Attachment = key(Attachment, default="auto")
-    max_distance_m: float | None = None
+    max_distance_m: float | None = key(_FARTHEST, converter=as_given, default=None)
 
     def __post_init__(self) -> None:
         shape = len(self.t_s), None, 3

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import read_only_floats, read_only_nodes
+from .arrays import read_only_floats, read_only_nodes, triple
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -122,7 +122,7 @@ def place_markers(
             nodes[k], weights[k], distance[k] = shape.embed(point)
         if distance[k] > limit_m:
             raise InputError(
-                f"marker '{labels[k]}' at ({', '.join(f'{x:.4g}' for x in point)}) m is "
+                f"marker '{labels[k]}' at {triple(point)} m is "
                 f"{distance[k]:.4g} m away from the body, more than the {limit_m:.4g} m allowed; "
                 "check length_unit, the frame of the poses and the marker's reference_m, "
                 "or raise max_distance_m"

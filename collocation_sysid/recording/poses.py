@@ -76,7 +76,7 @@ class PoseSequence:
         positions_m = read_only_floats(self.positions_m, (m, 3), "positions_m", False)
         quaternions = read_only_floats(self.quaternions_xyzw, (m, 4), "quaternions_xyzw", False)
         if fault := first_pose_fault(t_s, positions_m, quaternions):
-            raise InputError(fault[1], where=f"row {fault[0] + 1}")
+            raise InputError(fault[1], where=f"row {fault[0] + 1}" if m > 1 else None)
         continuous = _unit_and_continuous(quaternions)
         vars(self).update(positions_m=positions_m, quaternions_xyzw=continuous)
 
@@ -103,7 +103,7 @@ class PoseSequence:
         quaternions = Rotation.from_matrix(given[:, :3, :3]).as_quat()
         return cls(times, given[:, :3, 3], quaternions, interpolation)
 
-    def after(self, matrix: ArrayLike) -> PoseSequence:
+    def after(self, matrix: ArrayLike | PoseSequence) -> PoseSequence:
         """Return the poses that move by a 4×4 matrix [[R, p], [0, 1]] first, then as these do.
 
         Where these are poses U_t of a gripper and the matrix G says where the undeformed body is
@@ -112,9 +112,11 @@ class PoseSequence:
         Raises
         ------
         InputError
-            If the matrix is no rigid motion.
+            If the matrix, which may be one pose, is no rigid motion.
         """
-        first = PoseSequence.from_matrices([0.0], np.asarray(matrix)[None])
+        first = matrix
+        if not isinstance(first, PoseSequence):
+            first = PoseSequence.from_matrices([0.0], np.asarray(first)[None])
         rotations, positions_m = self._rotations, self.positions_m
         return replace(
             self,
@@ -226,9 +228,10 @@ def first_pose_fault(
     off = np.flatnonzero(np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE)
     if off.size:
         row = int(off[0])
+        at = f" at t_s = {t_s[row]:.9g}" if len(t_s) > 1 else ""
         return row, (
-            f"the quaternion at t_s = {t_s[row]:.9g} has the norm {norms[row]:.6g}; expected 1 "
-            f"within {QUATERNION_NORM_TOLERANCE:g} (order x, y, z, w)"
+            f"the quaternion{at} has the norm {norms[row]:.6g}; expected 1 within "
+            f"{QUATERNION_NORM_TOLERANCE:g} (order x, y, z, w)"
         )
     return None
 

@@ -15,7 +15,7 @@ from ..fem.shape import Length
 from ..section import Vector
 from ..stated import Key, key, stated
 from .actuator import Actuator, Placed
-from .arrays import floats
+from .arrays import floats, triple
 from .loads import Course
 from .placement import Shape
 from .tables import read_tension
@@ -95,12 +95,12 @@ class Tendon(Actuator[Length]):
 
     def _measure_on(self, body: Body) -> Length:
         shape = Shape(body.nodes_m, body)
-        found = [shape.embed(point) for point in self.points_m]
-        nodes, weights, distances = (np.array(part) for part in zip(*found, strict=True))
+        embedded = [shape.embed(point) for point in self.points_m]
+        nodes, weights, distances = (np.array(part) for part in zip(*embedded, strict=True))
         worst = int(distances.argmax())
         if distances[worst] > FARTHEST * shape.mean_edge_m:
             raise InputError(
-                f"{self.name}: point {worst + 1} at {_triple(self.points_m[worst])} m is "
+                f"{self.name}: point {worst + 1} at {triple(self.points_m[worst])} m is "
                 f"{distances[worst]:.4g} m outside the body, more than the mean edge length of "
                 f"{shape.mean_edge_m:.4g} m; expected points_m on the undeformed body, in metres"
             )
@@ -110,7 +110,3 @@ class Tendon(Actuator[Length]):
         """The tension at the body: a tendon only pulls."""
         pull = factor * stated - lost
         return (stated > 0) * (pull > 0) * pull
-
-
-def _triple(point: Array) -> str:
-    return f"({', '.join(f'{x:.4g}' for x in point)})"
