@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from problem_files import run_command, write_problem
-from problems_small import hung_cube
+from problems_small import GUESS, hung_cube
+from problems_small import TRUTH as LAME
 from scipy.interpolate import CubicSpline
 
 from collocation_sysid import (
@@ -21,6 +22,8 @@ from collocation_sysid import (
     UncertaintyOptions,
     Unknown,
     run,
+    simulate,
+    with_markers,
 )
 from collocation_sysid.display import plain_text
 from collocation_sysid.model.parameters import Parameters
@@ -100,6 +103,24 @@ def test_windows_of_time_have_the_stiffness_of_their_time():
     first, _, last = (named(drifting, w).moves["young_pa"].change for w in WINDOWS)
     assert first > 0 > last
     assert (first - last) / TRUTH["young_pa"] == pytest.approx(0.05 * 2 / 3, rel=0.3)
+
+
+def test_each_of_several_recordings_says_what_it_has_alone():
+    rng, swings = np.random.default_rng(2), []
+    for k, damping in enumerate((5e-3, 9e-3)):
+        swing = replace(hung_cube(25), name=f"swing {k}")
+        tracks = simulate(swing, LAME | {"gamma_r_s": damping}, "midpoint").markers_m
+        tracks = tracks + swing.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
+        swings.append(with_markers(swing, tracks))
+    exact = Assumptions(**{name: "none" for name in Assumptions().deviations})
+    options = UncertaintyOptions(assumptions=exact)
+    problem = Problem(swings, GUESS, substeps=1, uncertainty=options)
+    solved = run(problem, seek_causes=False, probe=True)
+    alone = {p.name: p for p in solved.probes if p.kind == "recording"}
+    assert set(alone) == {"swing 0", "swing 1"}
+    less, more = (alone[f"swing {k}"].moves["gamma_r_s"].value for k in range(2))
+    assert less < solved.parameters["gamma_r_s"] < more
+    assert all("gamma_r_s" in p.told and p.chi_squared > 10 for p in alone.values())
 
 
 def test_shares_of_both_intervals_stand_beside_every_change():

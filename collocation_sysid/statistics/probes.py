@@ -126,7 +126,7 @@ class Answered:
         went = {}
         for name, each in {**found.estimates, **found.derived}.items():
             error, joint = each.std_error, self.estimates[name]
-            if error and error < TELLING * abs(each.value) and joint.std_error:
+            if error and error < TELLING * abs(each.value):
                 change = each.value - joint.value
                 whole95 = self.budget[name].whole95 if name in self.budget else None
                 of = _share(change, joint.ci95), _share(change, whole95)
@@ -144,8 +144,10 @@ def probes(at: Answered) -> tuple[Probe, ...]:
     parts, freed = [*_windows(at), *_recordings(at)], [*_freed(at)]
     tests = sum(len(probe.moves) for probe in parts) + len(freed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
-    elsewhere = (replace(each, told=tuple(_elsewhere(at, each, limit))) for each in parts)
-    return (*elsewhere, *(_released(at, probe, limit) for probe in freed))
+    return (
+        *(_elsewhere(each, limit) for each in parts),
+        *(_released(at, probe, limit) for probe in freed),
+    )
 
 
 def _share(change: float, interval: tuple[float, float] | None) -> float | None:
@@ -202,16 +204,13 @@ def _part(
     yield Probe(kind, name, falls, at.moves(found))
 
 
-def _elsewhere(at: Answered, probe: Probe, limit: float) -> Iterator[str]:
-    """Estimates that a part of the data has elsewhere than by chance.
+def _elsewhere(probe: Probe, limit: float) -> Probe:
+    """Told are estimates that are farther away than by chance.
 
-    A part scatters about the whole by what its variance is more (Hausman 1978); that of the whole
-    is taken where that is more, as error bars are uncertain themselves.
+    A part scatters about the whole by less than its own error bar (Hausman 1978).
     """
-    for name, move in probe.moves.items():
-        joint = at.estimates[name].std_error or 0.0
-        if move.change**2 > limit**2 * max(move.std_error**2 - joint**2, joint**2):
-            yield name
+    far = (n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error)
+    return replace(probe, told=tuple(far))
 
 
 # Freed assumptions --------------------------------------------------------------------------------

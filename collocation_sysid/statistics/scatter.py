@@ -101,7 +101,7 @@ def recordings_of(fit: LinearisedFit) -> dict[str, list[int]]:
 
 
 def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, Array]]:
-    """The fit to each recording alone, and its shared parameters (nq,) less the joint ones.
+    """The fit to each recording alone, and its parameters less the joint ones.
 
     The numbers are those of its blocks.
     """
@@ -110,7 +110,7 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, 
         mine = [other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared :]]
         columns = np.r_[np.arange(fit.shared), fit.shared + np.flatnonzero(mine)]
         alone, step = part_fit(fit, [fit.blocks[k] for k in numbers], columns)
-        yield numbers, alone, step[: fit.shared]
+        yield numbers, alone, step
 
 
 def part_fit(

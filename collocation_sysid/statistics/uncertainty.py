@@ -321,7 +321,7 @@ def _scatter(
         found = uncertainty_of(alone, parameters, q, noise, errors, own)
         independent = least_squares(alone).errors[: fit.shared] ** 2
         variances = np.diag(found.covariance) / sizes**2
-        known[alone.blocks[0].name] = step, variances, independent
+        known[alone.blocks[0].name] = step[: fit.shared], variances, independent
     return scatter_of(fit, known) if len(known) > 1 else None
 
 
