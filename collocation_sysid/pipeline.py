@@ -135,31 +135,31 @@ def run(
         As `solve` does.
     """
     say = log or (lambda _: None)
-    found = Run(problem, solve(problem, method, watch, start, scheduler), {}, None)
+    answer = Run(problem, solve(problem, method, watch, start, scheduler), {}, None)
     missing = "no forward simulation has checked the answer, and there are no error bars"
     try:
-        found, fit = _checked(problem, found.solution, say)
+        answer, fit = _checked(problem, answer.solution, say)
         missing = "what comes after the error bars is left out: finer steps, causes of the misfit"
         if problem.substeps == "auto":
-            found, fit = _fine_enough(found, fit, problem.solver(method), watch, say, scheduler)
-        substeps = found.solution.collocation.substeps
+            answer, fit = _fine_enough(answer, fit, problem.solver(method), watch, say, scheduler)
+        substeps = answer.solution.collocation.substeps
         turns = (c.sentence for e in problem.experiments for c in turn_concerns(e, substeps))
-        found = replace(found, notes=(*turns, *found.notes))
-        if found.uncertainty is not None and fit is not None:
-            profiles = _profiles(found, fit, say)
-            sources = _sources(found, fit, found.uncertainty, say)
-            found = replace(found, profiles=profiles, sources=sources)
-            found = replace(found, probes=_probes(found, fit, say)) if probe else found
-        if not seek_causes or found.solution.status is Status.INTERRUPTED:
-            return found
+        answer = replace(answer, notes=(*turns, *answer.notes))
+        if answer.uncertainty is not None and fit is not None:
+            profiles = _profiles(answer, fit, say)
+            sources = _sources(answer, fit, answer.uncertainty, say)
+            answer = replace(answer, profiles=profiles, sources=sources)
+            answer = replace(answer, probes=_probes(answer, fit, say)) if probe else answer
+        if not seek_causes or answer.solution.status is Status.INTERRUPTED:
+            return answer
         say("looking for causes of the misfit")
-        found = replace(found, causes=likely_causes(found.solution))
-        if problem.uncertainty.numerical and found.uncertainty is not None:
-            return refine(found, say=say)
-        return found
+        answer = replace(answer, causes=likely_causes(answer.solution))
+        if problem.uncertainty.numerical and answer.uncertainty is not None:
+            return refine(answer, say=say)
+        return answer
     except KeyboardInterrupt:
         unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
-        return replace(found, rollouts=unsimulated | dict(found.rollouts), missing=missing)
+        return replace(answer, rollouts=unsimulated | dict(answer.rollouts), missing=missing)
 
 
 def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
@@ -175,9 +175,9 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
         extra, noises = pose_noise_draws(solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
-    found = Run(problem, solution, rollouts, None, diagnose(fit, extra))
+    answer = Run(problem, solution, rollouts, None, diagnose(fit, extra))
     if not solution.collocation.nq:
-        return found, fit
+        return answer, fit
     options = problem.uncertainty
     try:
         uncertainty = uncertainty_of(
@@ -185,40 +185,40 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
         )
     except InputError as error:
         raise error.located(problem.path) from error
-    found = replace(found, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
-    error = step_error(problem, solution, fit, rollouts, found.noise_estimates)
-    return replace(found, refinement=error), fit
+    answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
+    error = step_error(problem, solution, fit, rollouts, answer.noise_estimates)
+    return replace(answer, refinement=error), fit
 
 
-def _sources(found: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> Sources:
+def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> Sources:
     """What moves the estimates beside the noise."""
     say("finding what is assumed is worth")
-    solution, stated = found.solution, found.problem.uncertainty.assumptions
+    solution, stated = answer.solution, answer.problem.uncertainty.assumptions
     changes = assumed(solution.collocation, solution.z, stated.deviations)
     parameters = solution.collocation.parameters
     return Sources.of(fit, changes, parameters, solution.q, known)
 
 
-def _probes(found: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
+def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
     """Refits of parts of the data, and with assumptions freed."""
     say("refitting parts of the data, and with assumptions freed")
-    solution, options = found.solution, found.problem.uncertainty
+    solution, options = answer.solution, answer.problem.uncertainty
     collocation, z = solution.collocation, solution.z
     extra, known = pose_noise_draws(collocation, z)[0], options.assumptions.deviations
     how = options.noise, options.errors, extra
-    return probes(Answered(collocation, z, fit, *how, found.estimates, found.budget, known))
+    return probes(Answered(collocation, z, fit, *how, answer.estimates, answer.budget, known))
 
 
-def _profiles(found: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
+def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
     """The profile likelihoods that are asked for."""
     profiles = []
-    assert found.uncertainty is not None
-    for name in found.problem.uncertainty.profile:
+    assert answer.uncertainty is not None
+    for name in answer.problem.uncertainty.profile:
         say(f"profile likelihood of {name}")
         try:
-            profiles.append(profile_of(found.solution, fit, found.uncertainty, name))
+            profiles.append(profile_of(answer.solution, fit, answer.uncertainty, name))
         except InputError as error:
-            raise error.located(found.problem.path) from error
+            raise error.located(answer.problem.path) from error
     return tuple(profiles)
 
 

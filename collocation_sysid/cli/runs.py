@@ -51,16 +51,16 @@ def refine(options: Refine) -> None:
             errors.print(Text(what, style="dim"), soft_wrap=True)
 
     try:
-        found, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
+        refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", *sys.argv[1:]])
         said = f"interrupted: what was solved is kept in {options.run_folder}; go on with: {again}"
         errors.print(Text(said), soft_wrap=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
     if options.as_json:
-        typer.echo(as_json({**content(found), "trust": result.trust}))
+        typer.echo(as_json({**content(refinement), "trust": result.trust}))
     else:
-        show([refinement_table(found.errors), verdict_of(result.trust)])
+        show([refinement_table(refinement.errors), verdict_of(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,13 @@ from ..runs.solving import solve
 from ..statistics.autocorrelation import ErrorProcess, error_processes
 from ..statistics.budget import Sources, budget
 from ..statistics.considered import assumed
-from ..statistics.linearised import Derived, FitBlock, LinearisedFit, information, linearised_fit
+from ..statistics.linearised import (
+    FitBlock,
+    LinearisedFit,
+    information,
+    linearised_fit,
+    values_of,
+)
 from ..statistics.noise import ROUNDING
 from ..statistics.uncertainty import uncertainty_of
 from .laws import Disagreement, disagreements
@@ -362,7 +368,7 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
         "status": solution.status.value,
         "converged": solution.status.converged,
         "rms": {"m": solution.rms_m, "N": pooled_wrench_rms(solution)[0]},
-        "parameters": solution.parameters | _derived(solution),
+        "parameters": values_of(solution.collocation, solution.q),
         "free": [item.name for item in problem.parameters.free],
         "time_s": solution.timing.total,
     }
@@ -445,9 +451,3 @@ def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[st
     blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
     rms = float(np.sqrt(squares.sum() / samples)) if samples else None
     return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}
-
-
-def _derived(solution: Solution) -> dict[str, float]:
-    """Moduli that follow from the parameters."""
-    constants = (segment.constants for segment in solution.collocation.segments)
-    return dict(Derived.of(constants, solution.q).values)

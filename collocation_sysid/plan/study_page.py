@@ -280,11 +280,11 @@ def _method_sentence(row: Row) -> str:
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
     """How many runs converged, and how far each estimate moves over them."""
-    found = [row for row in rows if row["converged"]]
-    said = [f"{len(found)} of {len(rows)} runs converged."]
+    converged = [row for row in rows if row["converged"]]
+    said = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
-        values = [row[f"value_{name}"] for row in found]
-        errors = [e for row in found if (e := row[f"std_error_{name}"]) is not None]
+        values = [row[f"value_{name}"] for row in converged]
+        errors = [e for row in converged if (e := row[f"std_error_{name}"]) is not None]
         if len(values) > 1:
             spread = f"; the standard errors are {max(errors):.2g} at most" if errors else ""
             low, high = f"{min(values):.4g}", f"{max(values):.4g} {unit_of(name)}".strip()

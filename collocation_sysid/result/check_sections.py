@@ -11,9 +11,9 @@ from .run_sections import how_to
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
-def glance_table(found: Glance | Findings) -> list[Shown]:
+def glance_table(seen: Glance | Findings) -> list[Shown]:
     """What a check sees at once."""
-    return [*map(_body_section, found.bodies), _measurements_section(found)]
+    return [*map(_body_section, seen.bodies), _measurements_section(seen)]
 
 
 def closer_table(findings: Findings) -> list[Shown]:

@@ -30,30 +30,30 @@ def write_run(finished: Answer, folder: str | Path, frames: bool = True) -> Path
     arrays' names and the frames' folders have the experiment's name in front.
     """
     solution = finished.solution
-    found = result_of(finished)
+    result = result_of(finished)
     with run_folder(folder) as place:
         origin = finished.problem.origin
         if origin is not None:
             (place / "problem.toml").write_text(origin.text, encoding="utf-8")
-        (place / "result.json").write_text(as_json(found) + "\n", encoding="utf-8")
+        (place / "result.json").write_text(as_json(result) + "\n", encoding="utf-8")
         if finished.refinement is not None and finished.refinement.levels:
             text = as_json(finished.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
         seen = replays(finished)
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
-        _write_pictures(finished, found, seen, place)
+        _write_pictures(finished, result, seen, place)
         if frames:
             _write_all_frames(solution, place)
     return Path(folder)
 
 
-def _write_pictures(finished: Answer, found: Result, seen: Sequence[Replay], place: Path) -> None:
+def _write_pictures(finished: Answer, result: Result, seen: Sequence[Replay], place: Path) -> None:
     # matplotlib takes a while to import, and nothing else needs it.
     from .pictures import album, jacobian_sparsity, save_pictures
 
     solution = finished.solution
     jacobian = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(place, album(seen, found) | {"jacobian": jacobian})
+    save_pictures(place, album(seen, result) | {"jacobian": jacobian})
 
 
 def _write_all_frames(solution: Solution, place: Path) -> None:
@@ -88,7 +88,7 @@ def replays(finished: Answer) -> list[Replay]:
             solution.collocation.segments, solution.positions_m, solution.readings_m, strict=True
         )
     }
-    found = []
+    seen = []
     for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
@@ -100,21 +100,21 @@ def replays(finished: Answer) -> list[Replay]:
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _places_m(finished, experiment.name)
             read = _sensed(finished, experiment), _own_readings(finished, experiment)
-            found.append(Replay.of(experiment, fit, rolled_out, natural, places_m, *read))
-    return found
+            seen.append(Replay.of(experiment, fit, rolled_out, natural, places_m, *read))
+    return seen
 
 
 def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
     """(S, 19) of each sensor: time, and the wrench as measured, fitted and simulated."""
     sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
     rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
-    found = []
+    readings = []
     for k, sensor in enumerate(sensors):
         nothing = np.full_like(sensor.values, np.nan)
         fit = fitted[experiment.name][k] if experiment.name in fitted else nothing
         rolled = rollout.wrenches[k] if isinstance(rollout, Rollout) else nothing
-        found.append(np.column_stack([sensor.t_s, sensor.values, fit, rolled]))
-    return found
+        readings.append(np.column_stack([sensor.t_s, sensor.values, fit, rolled]))
+    return readings
 
 
 def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
@@ -137,8 +137,8 @@ def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
 def _places_m(finished: Answer, experiment: str) -> Array | None:
     """(M, 3) of the markers as estimated; None where that failed."""
     if experiment in finished.places:
-        found = [place.position_m for place in finished.places[experiment].values()]
-        return np.array(found).reshape(-1, 3)
+        places = [place.position_m for place in finished.places[experiment].values()]
+        return np.array(places).reshape(-1, 3)
     rollout = finished.rollouts[experiment]
     if not isinstance(rollout, Rollout):
         return None

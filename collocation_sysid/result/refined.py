@@ -55,25 +55,25 @@ def refine_run(
     problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
     problem = replace(problem, substeps=before.problem.substeps)
 
-    def keep(found: Refinement) -> Result:
-        after = refined(before, found)
+    def keep(refinement: Refinement) -> Result:
+        after = refined(before, refinement)
         with whole_file(beside) as levels, whole_file(file) as draft:
-            levels.write_text(as_json(found) + "\n", encoding="utf-8")
+            levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
         return after
 
-    found = refinement_of(problem, answer, estimates, levels, say, known, keep)
-    return found, keep(found)
+    refinement = refinement_of(problem, answer, estimates, levels, say, known, keep)
+    return refinement, keep(refinement)
 
 
-def refined(before: Result, found: Refinement) -> Result:
+def refined(before: Result, refinement: Refinement) -> Result:
     """A result with what was measured of the numerical error in place of what was estimated."""
 
     def allowing(values: Mapping[str, FoundValue]) -> dict[str, FoundValue]:
         after = dict(values)
-        for name in values.keys() & found.errors.keys():
-            error = found.errors[name]
-            holds = () if error.ci95 is None else found.holds
+        for name in values.keys() & refinement.errors.keys():
+            error = refinement.errors[name]
+            holds = () if error.ci95 is None else refinement.holds
             after[name] = replace(
                 values[name], numerical_error=error, ci95=error.ci95, ci95_holds=holds
             )
@@ -85,7 +85,7 @@ def refined(before: Result, found: Refinement) -> Result:
         before,
         parameters=allowing(before.parameters),
         derived=allowing(before.derived),
-        trust=Trust.of((*kept, *numerical_concerns(estimates, found))),
+        trust=Trust.of((*kept, *numerical_concerns(estimates, refinement))),
     )
 
 

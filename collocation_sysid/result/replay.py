@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,10 @@ from ..recording.experiment import Experiment
 from ..runs.result import Result
 
 ARRAYS_FILE = "trajectory.npz"
+# What stands before the number of a wrench, and the name of a reading of one's own.
+WRENCH, READING = "wrench_", "reading_"
 # Of the body, and so the same for all experiments of a run.
-# What stands before the name of a reading of one's own.
-READING = "reading_"
-SHARED = ("undeformed_m", "tetrahedra", "surface", "surface_parts")
+OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes.
 LAYOUT = {
     "undeformed_m": ("f", "n3"),
@@ -160,33 +160,19 @@ class Replay:
 
     def arrays(self, prefix: str = "") -> dict[str, Array]:
         """Arrays for a file; those of the body without the prefix, and some as single numbers."""
-        own: dict[str, Any] = {
-            "t_s": self.t_s,
-            "positions_m": self.positions_m,
-            "markers_m": self.markers_m,
-            "measured_m": self.measured_m,
-            "residuals_m": None if self.markers_m is None else self.markers_m - self.measured_m,
-            "marker_names": np.array(self.marker_names),
-            "marker_places_m": self.marker_places_m,
-            "given_places_m": self.given_places_m,
-            "rolled_out_m": self.rolled_out_m,
-            "rolled_out_positions_m": _single(self.rolled_out_positions_m),
-            "held": self.held,
-            "up": self.up,
-            "natural_hz": self.natural_hz,
-            "tendons_m": self.tendons_m,
-            "static": np.array(True) if self.static else None,
-        } | {f"wrench_{k}": values for k, values in enumerate(self.wrenches, start=1)}
-        own |= {f"{READING}{name}": values for name, values in self.readings.items()}
-        shared: dict[str, Any] = {
-            "undeformed_m": self.undeformed_m,
-            "tetrahedra": self.tetrahedra.astype(np.int32),
-            "surface": self.surface.astype(np.int32),
-            "surface_parts": self.surface_parts.astype(np.int32),
-            "surface_nodes": self.surface_nodes.astype(np.int32),
-            "part_names": np.array(self.part_names),
+        stored: dict[str, Any] = {key: getattr(self, key) for key in LAYOUT}
+        stored |= {
+            k: stored[k].astype(np.int32) for k, (kinds, _) in LAYOUT.items() if "i" in kinds
         }
-        return shared | {prefix + key: value for key, value in own.items() if value is not None}
+        if self.rolled_out_positions_m is not None:
+            stored["rolled_out_positions_m"] = self.rolled_out_positions_m.astype(np.float32)
+        stored |= {key: np.array(getattr(self, key)) for key in ("part_names", "marker_names")}
+        stored["static"] = np.array(True) if self.static else None
+        stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
+        stored |= {f"{WRENCH}{k}": values for k, values in enumerate(self.wrenches, start=1)}
+        stored |= {f"{READING}{name}": values for name, values in self.readings.items()}
+        there = {key: value for key, value in stored.items() if value is not None}
+        return {key if key in OF_BODY else prefix + key: value for key, value in there.items()}
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> Replay:
@@ -198,33 +184,25 @@ class Replay:
             If an array is missing.
         """
         prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
-        needed = ("t_s", "held", "up", "marker_places_m", "given_places_m", "measured_m")
-        optional = (
-            "positions_m",
-            "markers_m",
-            "rolled_out_positions_m",
-            "rolled_out_m",
-            "natural_hz",
-            "tendons_m",
-        )
-        found: dict[str, Any] = {key: arrays[key] for key in SHARED}
-        found["surface_nodes"] = arrays.get("surface_nodes", found["surface"])
-        found |= {key: arrays[prefix + key] for key in needed}
-        found |= {key: arrays.get(prefix + key) for key in optional}
-        keys = (f"{prefix}wrench_{k}" for k in count(1))
-        found["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
-        own = f"{prefix}{READING}"
-        found["readings"] = {k.removeprefix(own): arrays[k] for k in arrays if k.startswith(own)}
-        found["static"] = bool(arrays.get(f"{prefix}static", False))
-        _require_shapes(found)
-        names = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
-        parts = [str(part) for part in arrays["part_names"]]
-        numbers = found["surface_parts"]
-        if len(names) != len(found["marker_places_m"]):
-            raise ValueError(f"{len(names)} marker_names")
-        if numbers.min() < 0 or numbers.max() >= len(parts):
+        own = {key: key if key in OF_BODY else prefix + key for key in LAYOUT}
+        needed = {each.name for each in fields(cls) if each.default is MISSING}
+        stored: dict[str, Any] = {
+            key: arrays[at] if key in needed else arrays.get(at) for key, at in own.items()
+        }
+        keys = (f"{prefix}{WRENCH}{k}" for k in count(1))
+        stored["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
+        said = f"{prefix}{READING}"
+        stored["readings"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
+        stored["static"] = bool(arrays.get(f"{prefix}static", False))
+        _require_shapes(stored)
+        stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
+        stored["part_names"] = [str(part) for part in arrays["part_names"]]
+        numbers = stored["surface_parts"]
+        if len(stored["marker_names"]) != len(stored["marker_places_m"]):
+            raise ValueError(f"{len(stored['marker_names'])} marker_names")
+        if numbers.min() < 0 or numbers.max() >= len(stored["part_names"]):
             raise ValueError("surface_parts names parts that are not there")
-        return cls(name=name, marker_names=names, part_names=parts, **found)
+        return cls(name=name, **stored)
 
 
 def _apart(lines_m: Sequence[Array]) -> Array | None:
@@ -269,10 +247,6 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             raise ValueError(f"{key} names nodes that are not there")
     if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(np.linalg.norm(arrays["up"]), 1.0):
         raise ValueError("t_s does not increase, or up is no direction")
-
-
-def _single(array: Array | None) -> NDArray[np.float32] | None:
-    return None if array is None else array.astype(np.float32)
 
 
 def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:

@@ -144,10 +144,10 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
         )
     with _reading_frames(run):
         sets = ElementTree.parse(listing).getroot().iter("DataSet")
-        found = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
-        if not found or not all(is_own(run, file) for _, file in (*found, (0.0, listing))):
+        frames = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
+        if not frames or not all(is_own(run, file) for _, file in (*frames, (0.0, listing))):
             raise ValueError("it names no frames, or frames that are not in the folder")
-        return found
+        return frames
 
 
 def _reading_frames(run: Path) -> AbstractContextManager[None]:

@@ -215,8 +215,8 @@ def _remove_stale(target: Path) -> None:
         return
     for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
         left = rf".*\.{re.escape(platform.node())}-(\d+)-\w+\.partial"
-        found = re.fullmatch(left, folder.name)
-        if found and not _runs(int(found[1])):
+        match = re.fullmatch(left, folder.name)
+        if match and not _runs(int(match[1])):
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -76,10 +76,10 @@ class Answer:
     def __repr__(self) -> str:
         solution = self.solution
         free = [item.name for item in self.problem.parameters.free]
-        found = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
+        values = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
         said = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
-        return f"Run({said}: {found}; {rms})"
+        return f"Run({said}: {values}; {rms})"
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -137,8 +137,8 @@ class Answer:
     @cached_property
     def noise_estimates(self) -> dict[str, Estimate]:
         """The same with intervals for the noise alone."""
-        found = self.uncertainty
-        known = {} if found is None else {**found.estimates, **found.derived}
+        bars = self.uncertainty
+        known = {} if bars is None else {**bars.estimates, **bars.derived}
         values = self.parameters | self.derived
         return {name: known.get(name, Estimate(value)) for name, value in values.items()}
 
@@ -151,14 +151,14 @@ class Answer:
     @cached_property
     def trust(self) -> Trust:
         """How far the answer can be trusted, in one word, with the reasons."""
-        found = concerns(
+        of_fit = concerns(
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
         numerical = numerical_concerns(self.estimates, self.refinement)
         if not self.missing:
-            return Trust.of((*cause_concerns(self.causes), *found, *numerical))
+            return Trust.of((*cause_concerns(self.causes), *of_fit, *numerical))
         interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
-        return Trust.of((interrupted, *(found if self.uncertainty is not None else ())))
+        return Trust.of((interrupted, *(of_fit if self.uncertainty is not None else ())))
 
     @cached_property
     def motions(self) -> dict[str, Motion]:

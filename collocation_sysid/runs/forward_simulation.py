@@ -21,7 +21,7 @@ from ..program.simulation import Trajectory, simulate
 from ..program.wrench_channel import Grid
 from ..recording import Experiment
 from ..statistics.estimates import Estimate
-from ..statistics.linearised import Derived, LinearisedFit
+from ..statistics.linearised import LinearisedFit, values_of
 from ..statistics.numerical import Refinement, changes_towards, numerical_errors
 
 # Grid steps over those of a forward simulation that tells the step's error, with room for rounding.
@@ -63,8 +63,8 @@ class Rollout:
 def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
     """Those of all experiments by their names, see `roll_out`."""
     threads = solution.collocation.threads
-    found = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
-    return {e.name: each for e, each in zip(problem.experiments, found, strict=True)}
+    rollouts = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
+    return {e.name: each for e, each in zip(problem.experiments, rollouts, strict=True)}
 
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
@@ -85,7 +85,11 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     readings = segment.markers.of_samples(trajectory.positions_m, phi)
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
     present = distances[experiment.markers.present]
-    nuisance, wrenches = segment.nuisance, _read(segment, phi, trajectory)
+    grid, forced = trajectory.reactions
+    wrenches = [sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors]
+    nuisance, validation = segment.nuisance, experiment.validation
+    own = zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)
+    places = zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True)
     x = trajectory.positions_m.reshape(len(trajectory.positions_m), -1)
     gauged = {
         gauge.gauge.name: gauge.said(read)
@@ -97,23 +101,13 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         root_mean(present**2),
         float(present.max(initial=0.0)),
         replace(trajectory, markers_m=readings),
-        dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True))
-        if experiment.validation
-        else {},
-        dict(zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True))
-        if experiment.validation
-        else {},
+        dict(own if validation else ()),
+        dict(places if validation else ()),
         wrenches,
         wrench_rms(experiment, wrenches),
         gauged,
         reading_rms(experiment, gauged),
     )
-
-
-def _read(segment: Segment, phi: Array, trajectory: Trajectory) -> list[Array]:
-    """What the experiment's sensors read, with its φ, of what was simulated."""
-    grid, forced = trajectory.reactions
-    return [sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors]
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
@@ -122,12 +116,12 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     for part in collocation.parts(solution.z):
         if part.segment.experiment is experiment:
             return part.segment, part.phi
-    found, body = solution.parameters, experiment.body
+    values, body = solution.parameters, experiment.body
     alone = replace(
         collocation,
         experiments=[replace(experiment, validation=False)],
         parameters=collocation.parameters.fixed_at(
-            {name: found[name] for name in body.used_names(list(found))}
+            {name: values[name] for name in body.used_names(list(values))}
         ),
     )
     (segment,) = alone.segments
@@ -167,10 +161,8 @@ def step_error(
         apart += _of_gauges(solution, segment, rollout.trajectory, share)
     change = changes_towards(fit, apart)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
-    moduli = Derived.of((s.constants for s in collocation.segments), q).values
-    halved = {**moduli, **collocation.parameters.values(q)}
     linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
-    return Refinement(numerical_errors(estimates, [halved], [], order, linear))
+    return Refinement(numerical_errors(estimates, [values_of(collocation, q)], [], order, linear))
 
 
 def _of_gauges(

@@ -44,8 +44,8 @@ def refine(finished: A, levels: int = 2, say: Callable[[str], None] | None = Non
     """A converged run with its numerical error, see `refinement_of`."""
     answer = Earlier.of(finished.solution)
     problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
-    found = refinement_of(problem, answer, finished.noise_estimates, levels, say)
-    return replace(finished, refinement=found)
+    estimates = finished.noise_estimates
+    return replace(finished, refinement=refinement_of(problem, answer, estimates, levels, say))
 
 
 def refinement_of(
@@ -90,23 +90,23 @@ def refinement_of(
     coarse = replace(problem, experiments=fitted, notes=())
     moving = any(not experiment.static for experiment in fitted)
     solved = {(each.halved, each.times): each for each in known}
-    found: list[Level] = []
+    reached: list[Level] = []
     for kind, finer in FINER.items():
         at, start = coarse, answer
         for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
             at = finer(at)
             if (kind, level) in solved:
-                found.append(solved[kind, level])
-                start = replace(answer, values={**answer.values, **found[-1].values})
+                reached.append(solved[kind, level])
+                start = replace(answer, values={**answer.values, **reached[-1].values})
                 continue
             if say is not None:
                 say(f"solving again: {kind} halved {level}×")
             solution = _solved(at, start, f"{kind} halved {level}×")
             start = Earlier.of(solution)
-            found.append(_level(kind, level, solution))
+            reached.append(_level(kind, level, solution))
             if keep is not None:
-                keep(_of_levels(found, problem, estimates))
-    return _of_levels(found, problem, estimates)
+                keep(_of_levels(reached, problem, estimates))
+    return _of_levels(reached, problem, estimates)
 
 
 def _of_levels(

@@ -253,9 +253,9 @@ class Result:
             If it is no run folder, or damaged.
         """
         folder = Path(run)
-        found = read_json(folder / RESULT_FILE, what)
+        content = read_json(folder / RESULT_FILE, what)
         with damage_refused(folder, RESULT_FILE, "solve the problem again"):
-            return read(cls, found)
+            return read(cls, content)
 
     @property
     def values(self) -> dict[str, FoundValue]:

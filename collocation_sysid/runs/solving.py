@@ -17,7 +17,7 @@ from ..methods.workers import Workers, workers_of
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..statistics.linearised import Derived
+from ..statistics.linearised import values_of
 from .check.cost import require_memory
 from .warm_start import Earlier
 
@@ -126,9 +126,9 @@ def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | 
     if scan is None:
         return None, lost
     again = placed_at_guess(replace(lost.collocation, parameters=scan.parameters))
-    found = read_where_found(solver, again, watch)
-    ended = found.status.converged or found.status is Status.INTERRUPTED
-    return (scan, found) if ended else (None, lost)
+    solution = read_where_found(solver, again, watch)
+    ended = solution.status.converged or solution.status is Status.INTERRUPTED
+    return (scan, solution) if ended else (None, lost)
 
 
 def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Solution:
@@ -178,9 +178,7 @@ def second_start(solution: Solution) -> Parameters | None:
 
     Only ratios that were estimated count, by both of the moduli that tell them.
     """
-    collocation, found = solution.collocation, solution.parameters
-    constants = (segment.constants for segment in collocation.segments)
-    values = {**Derived.of(constants, solution.q).values, **found}
+    collocation, values = solution.collocation, values_of(solution.collocation, solution.q)
     free = {item.name: item for item in collocation.parameters.free}
     changed: dict[str, float] = {}
     for name, ratio in values.items():
@@ -192,7 +190,7 @@ def second_start(solution: Solution) -> Parameters | None:
                 changed |= {each: _usual(each, young_pa) for each in own}
     if not changed or any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
         return None
-    return collocation.parameters.with_guess({name: found[name] for name in free} | changed)
+    return collocation.parameters.with_guess({name: values[name] for name in free} | changed)
 
 
 def _usual(name: str, young_pa: float) -> float:

@@ -114,11 +114,11 @@ def _of_rollout(
     if isinstance(rollout, Rollout):
         fitted = name in fit_rms_m
         fit_m = fit_rms_m.get(name, solution.rms_m)
-        found = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+        of_markers = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
         predicted_n, fit_n = rollout.wrench_rms[0], pooled_wrench_rms(solution)[0]
-        if not fitted and not found and predicted_n is not None and fit_n is not None:
-            found = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
-        return found
+        if not fitted and not of_markers and predicted_n is not None and fit_n is not None:
+            return rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+        return of_markers
     return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
 
 
@@ -134,15 +134,15 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
 
 def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
     """How each body oscillates with the answer; a solve that failed has none worth the search."""
-    found, substeps = {}, solution.collocation.substeps
+    motions, substeps = {}, solution.collocation.substeps
     scheme = as_scheme(solution.collocation.scheme)
     moving = [experiment for experiment in problem.experiments if not experiment.static]
     for experiment in moving if solution.status.converged else ():
         theta = experiment.body.theta(solution.parameters)
         try:
-            found[experiment.name] = motion_of(
+            motions[experiment.name] = motion_of(
                 experiment, scheme, experiment.timestep_s / substeps, theta
             )
         except SimulationError:
             continue
-    return found
+    return motions

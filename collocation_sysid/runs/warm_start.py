@@ -16,7 +16,7 @@ from ..methods.start import marched
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.segment import Segment
-from ..statistics.linearised import Derived
+from ..statistics.linearised import values_of
 from .result import Result
 
 
@@ -85,8 +85,7 @@ class Earlier:
             markers = segment.experiment.markers.names
             places = segment.places_m(part.phi)
             places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))
-        moduli = Derived.of((s.constants for s in collocation.segments), solution.q).values
-        return cls(Path(), {**moduli, **solution.parameters}, nuisance, places_m)
+        return cls(Path(), values_of(collocation, solution.q), nuisance, places_m)
 
     def started(self, problem: Problem) -> Problem:
         """The problem with what was found as its guesses, clipped to its bounds.
@@ -118,9 +117,10 @@ class Earlier:
         return collocation.placed_at(places_m)
 
     def _known_places(self, segment: Segment) -> dict[int, Array]:
-        found = self.places_m.get(segment.experiment.name, {})
+        places_m = self.places_m.get(segment.experiment.name, {})
         names = segment.experiment.markers.names
-        return {m: found[names[m]] for m in segment.chart.estimated.tolist() if names[m] in found}
+        estimated = segment.chart.estimated.tolist()
+        return {m: places_m[names[m]] for m in estimated if names[m] in places_m}
 
     def nuisance_of(self, collocation: Collocation) -> tuple[Array, int]:
         """Return p at the guess with the nuisance parameters that were found, and how many were.

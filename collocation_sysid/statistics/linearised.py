@@ -177,6 +177,12 @@ class Derived:
         return cls(values, by_q)
 
 
+def values_of(collocation: Collocation, q: Array) -> dict[str, float]:
+    """Moduli that follow from the parameters, and the parameters, by name."""
+    constants = (segment.constants for segment in collocation.segments)
+    return {**Derived.of(constants, q).values, **collocation.parameters.values(q)}
+
+
 @dataclass(frozen=True, eq=False)
 class LinearisedFit:
     """The least-squares problem at its answer.

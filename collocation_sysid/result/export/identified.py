@@ -144,7 +144,7 @@ class Identified:
             body = segment.body
             if replay.undeformed_m.shape != body.nodes_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
-        found = segment.corrected(phi)
+        corrected = segment.corrected(phi)
         return cls(
             problem.title,
             result.trust.verdict,
@@ -152,7 +152,7 @@ class Identified:
             result.parameters,
             body,
             body.theta(values),
-            found,
+            corrected,
             replay.rolled_out_positions_m,
         )
 
@@ -215,13 +215,13 @@ class Identified:
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
         """The parts of the body."""
-        body, found = self.body, []
+        body, regions = self.body, []
         lame, shares = body.lame(self.theta), body.split(self.theta)
         densities = body.densities(self.theta)
         for part, share, density in zip(body.parts, shares, densities, strict=True):
             values = {c.name: float(v) for c, v in zip(part.constants, share, strict=True)}
             young, poisson = engineering(*lame[part.name])
-            found.append(
+            regions.append(
                 IdentifiedRegion(
                     part.name or "body",
                     part.cells,
@@ -240,7 +240,7 @@ class Identified:
                     ),
                 )
             )
-        return tuple(found)
+        return tuple(regions)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, for a file."""
@@ -251,8 +251,8 @@ class Identified:
             "verdict": self.verdict,
             "warnings": self.warnings,
             "parameters": {
-                name: {key: getattr(found, key) for key in names}
-                for name, found in self.parameters.items()
+                name: {key: getattr(value, key) for key in names}
+                for name, value in self.parameters.items()
             },
             "element": body.element.name,
             "nodes_m": self.nodes_m,
@@ -290,14 +290,14 @@ class Identified:
 
 def _warnings(result: Result) -> tuple[str, ...]:
     """Why not to trust the numbers as they are."""
-    found = []
+    warnings = []
     if not result.converged:
-        found.append("the run did not converge")
+        warnings.append("the run did not converge")
     if (verdict := result.trust.verdict) != "good":
-        found.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
+        warnings.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
     for name, each in result.parameters.items():
         if each.at_bound and not each.fixed:
-            found.append(
+            warnings.append(
                 f"{name} = {each.value:.4g} ended at a bound: the data would have it elsewhere"
             )
-    return tuple(found)
+    return tuple(warnings)

@@ -154,8 +154,8 @@ def _start(body: Identified) -> str:
     """Displacements and velocities at the first sample, as we simulate it."""
     free = ~body.grasped
     shape = body.nodes_m if body.rolled_out_m is None else body.rolled_out_m[0]
-    given = body.experiment.start_velocities_m_s
-    velocity = np.zeros_like(shape) if given is None else given
+    started = body.experiment.start_velocities_m_s
+    velocity = np.zeros_like(shape) if started is None else started
     grasps = body.experiment.grasps
     carriers = [np.concatenate(_pose(grasp, body.start_s)) for grasp in grasps]
     places = numbers(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
@@ -192,10 +192,10 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
     except ValueError as error:
         raise InputError(f"MuJoCo refuses the model: {error}", folder / MODEL) from error
-    found = [_first_frequency(body, mujoco, model)]
+    compared = [_first_frequency(body, mujoco, model)]
     if not body.experiment.static and body.rolled_out_m is not None:
-        found.append(_motion(body, mujoco, model))
-    return found
+        compared.append(_motion(body, mujoco, model))
+    return compared
 
 
 def _mujoco() -> ModuleType:

@@ -24,7 +24,7 @@ from .spectrum import spectrum
 
 
 def album(
-    replays: Sequence[Replay], found: Result, truth: Mapping[str, float] | None = None
+    replays: Sequence[Replay], result: Result, truth: Mapping[str, float] | None = None
 ) -> dict[str, Figure]:
     """All pictures of a run but that of its Jacobian, by file name.
 
@@ -32,20 +32,20 @@ def album(
     ----------
     replays : sequence of Replay
         The experiments; the mesh is drawn with grasps and markers of the first.
-    found : Result
+    result : Result
     truth : mapping, optional
         See `convergence`.
     """
-    names = [name for name, item in found.parameters.items() if not item.fixed]
-    pictures = {"convergence": convergence(found.history, names, truth)} if found.history else {}
-    if (scan := found.scan) is not None:
+    names = [name for name, item in result.parameters.items() if not item.fixed]
+    pictures = {"convergence": convergence(result.history, names, truth)} if result.history else {}
+    if (scan := result.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
-    confidence = Confidence.of(found)
+    confidence = Confidence.of(result)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
-    if found.budget:
-        pictures["budget"] = budget_picture(found.budget)
+    if result.budget:
+        pictures["budget"] = budget_picture(result.budget)
     if replays:
         body = replays[0]
         pictures["mesh"] = mesh_picture(body)

@@ -109,7 +109,7 @@ class Camera:
         area = _cross(b - a, c - a)
         facing = area > 1e-9 * size**2
         a, b, c, area, depth = a[facing], b[facing], c[facing], area[facing], corners[facing, :, 2]
-        found = np.zeros(len(points), dtype=bool)
+        behind = np.zeros(len(points), dtype=bool)
         for k, point in enumerate(points):
             place = point[:2]
             weights = np.stack(
@@ -119,8 +119,8 @@ class Camera:
             over = (weights >= 0).all(axis=1)
             ahead = np.einsum("kc,kc->k", weights[over], depth[over])
             # A marker on the surface, or a noise's breadth below, is not hidden by it.
-            found[k] = bool((ahead > point[2] + 0.05 * size).any())
-        return found
+            behind[k] = bool((ahead > point[2] + 0.05 * size).any())
+        return behind
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -67,18 +67,18 @@ class Confidence:
         return cls(names, values, found.covariance[np.ix_(kept, kept)], found.quantiles[kept])
 
 
-def ellipse(found: Confidence, i: int, j: int, points: int = 181) -> Array:
+def ellipse(known: Confidence, i: int, j: int, points: int = 181) -> Array:
     """Outline (points, 2) of the 95 % region of two logarithms about their estimates."""
     pair = [i, j]
     angle = np.linspace(0.0, 2 * np.pi, points)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    deviation = np.sqrt(np.diag(found.covariance)[pair])
-    rho = float(np.clip(found.covariance[i, j] / deviation.prod(), -1.0, 1.0))
+    deviation = np.sqrt(np.diag(known.covariance)[pair])
+    rho = float(np.clip(known.covariance[i, j] / deviation.prod(), -1.0, 1.0))
     root = np.array([[1.0, 0.0], [rho, np.sqrt(1 - rho**2)]])
-    return JOINT * found.quantiles[pair] * deviation * (circle @ root.T)
+    return JOINT * known.quantiles[pair] * deviation * (circle @ root.T)
 
 
-def confidence_ellipses(found: Confidence) -> Figure:
+def confidence_ellipses(known: Confidence) -> Figure:
     """Draw the 95 % region of every pair of parameters.
 
     Axes are deviations from the estimate, in per cent, or factors where these are large; the
@@ -87,10 +87,10 @@ def confidence_ellipses(found: Confidence) -> Figure:
 
     Parameters
     ----------
-    found : Confidence of two parameters at least
+    known : Confidence of two parameters at least
     """
-    count = len(found.names) - 1
-    half = (found.quantiles * np.sqrt(np.diag(found.covariance))).tolist()
+    count = len(known.names) - 1
+    half = (known.quantiles * np.sqrt(np.diag(known.covariance))).tolist()
     scales = [_Scale.of(1.15 * min(JOINT * each, WIDEST)) for each in half]
     figure = framed_figure(COLUMN_MM, COLUMN_MM if count > 1 else 62, 14, 2, 11, 2)
     spaces = {"wspace": 0.12, "hspace": 0.12}
@@ -100,15 +100,15 @@ def confidence_ellipses(found: Confidence) -> Figure:
             axes.set_axis_off()
             continue
         i, j = column, row + 1
-        _draw_pair(axes, ellipse(found, i, j), half[i], half[j])
+        _draw_pair(axes, ellipse(known, i, j), half[i], half[j])
         dress(axes)
         axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
         last, first = row == count - 1, column == 0
         axes.set_xticks(scales[i].ticks, scales[i].labels if last else [""] * 3)
         axes.set_yticks(scales[j].ticks, scales[j].labels if first else [""] * 3)
-        axes.set_xlabel(scales[i].title(found.names[i]) if last else "", fontsize=TEXT_PT)
+        axes.set_xlabel(scales[i].title(known.names[i]) if last else "", fontsize=TEXT_PT)
         if first:
-            axes.set_ylabel(scales[j].title(found.names[j]), fontsize=TEXT_PT)
+            axes.set_ylabel(scales[j].title(known.names[j]), fontsize=TEXT_PT)
             axes.yaxis.set_label_coords(-0.13 * count, 0.5)
     note = "deviation from the estimate:\n95 % region of each pair,\n95 % interval of each alone"
     figure.text(0.98, 0.97, note if count > 1 else "", ha="right", va="top", fontsize=SMALL_PT)
@@ -154,15 +154,15 @@ def _label(name: str) -> str:
     return mathematical(name)
 
 
-def correlation_matrix(found: Confidence) -> Figure:
+def correlation_matrix(known: Confidence) -> Figure:
     """Draw the correlation of every pair of parameters, as colours and numbers.
 
     Parameters
     ----------
-    found : Confidence of two parameters at least
+    known : Confidence of two parameters at least
     """
-    correlation = correlation_of(found.covariance)
-    count = len(found.names)
+    correlation = correlation_of(known.covariance)
+    count = len(known.names)
     figure = framed_figure(64, 52, 8, 7, 6, 5)
     axes, beside = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
@@ -171,7 +171,7 @@ def correlation_matrix(found: Confidence) -> Figure:
             j, i, f"{value:.2f}".replace("-", "−"), ha="center", va="center",
             fontsize=SMALL_PT, color="white" if abs(value) > 0.65 else BLACK,
         )  # fmt: skip
-    symbols = [_label(name) for name in found.names]
+    symbols = [_label(name) for name in known.names]
     dress(axes, "correlation")
     axes.grid(False)
     axes.set_xticks(range(count), symbols, fontsize=TEXT_PT)

@@ -73,7 +73,8 @@ def tracks(
     """
     drawn = models(fitted_m, rolled_out_m)
     shown = _worst_markers(measured_m, [model for _, model, _ in drawn], max_markers)
-    title = _chosen(len(shown), len(names))
+    some = f"{len(shown)} of {len(names)} markers, those with the largest errors"
+    title = some if len(shown) < len(names) else ""
     head = LEGEND_MM + (5.0 if title else 0.0)
     height = head + len(shown) * (ROW_MM + GAP_MM) - GAP_MM + FOOT_MM
     figure = Picture(figsize=(PAGE_MM / 25.4, height / 25.4))
@@ -135,10 +136,6 @@ def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> 
     squares = np.nan_to_num(np.sum((models_m[0] - measured_m) ** 2, axis=2)).sum(axis=0)
     present = np.maximum(1, np.isfinite(measured_m[:, :, 0]).sum(axis=0))
     return sorted(np.argsort(-squares / present)[:count].tolist())
-
-
-def _chosen(shown: int, total: int) -> str:
-    return "" if shown == total else f"{shown} of {total} markers, those with the largest errors"
 
 
 # Errors whose ratio is larger are drawn on a logarithmic axis.
