@@ -306,20 +306,6 @@ class Sweep:
         """
         return Forward(self, Columns.by_parameters(self, setting), held=held).rows(x)
 
-    def response(
-        self, x: Array, setting: Setting, moved: Array, held: HeldForces | None = None
-    ) -> Iterator[Array]:
-        """How every row of x, (3n, c), follows grasped dofs that move by `moved` (N, g, c).
-
-        `held` is filled on the way.
-
-        Raises
-        ------
-        SimulationError
-            Where a timestep's equations are singular or not finite.
-        """
-        return Forward(self, Columns.along(self, setting, moved), held=held).rows(x)
-
     @one_blas_thread()
     def backward(self, x: Array, setting: Setting, gradient: Array) -> Array:
         """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].

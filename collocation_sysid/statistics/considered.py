@@ -17,9 +17,10 @@ import numpy as np
 from ..arrays import Array, Index
 from ..fem.body import Linearisation
 from ..program.channel import Forced, Motion
-from ..program.collocation import Collocation
+from ..program.collocation import Collocation, Part
 from ..program.lapack import one_blas_thread
 from ..program.reaction import HeldForces
+from ..program.reading import Reading
 from ..program.sweep import Columns, Forward, GraspMotion, Sweep
 from ..recording.experiment import Experiment
 from ..recording.nuisance import ROWS
@@ -136,7 +137,6 @@ def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iter
         if effect.moved_m is not None:
             moved[..., k] = sigma * np.where(np.isnan(held.positions_m), 0.0, effect.moved_m)
     forces[: at.dynamics.first_row] = rows[: at.dynamics.first_row] = 0.0
-    sensed = HeldForces.nothing(len(x), len(segment.sensed_dofs), count)
     solver = Sweep(segment)
     columns = _Changed(
         part.setting,
@@ -146,23 +146,35 @@ def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iter
         forces_n=forces,
         rows_n=rows,
     )
+    for reading, _, looked, by in followed(part, solver, columns, rows[:, segment.sensed_dofs]):
+        yield reading.changes(looked, by, part.phi)
+
+
+def followed(
+    part: Part, solver: Sweep, columns: Columns, inertia_n: Array | float = 0.0
+) -> Iterator[tuple[Reading, Motion, Array, Array]]:
+    """Each reading along columns that are no parameters: its motion, what it looks at, and by them.
+
+    Parameters
+    ----------
+    inertia_n : (N, g, c), optional
+        What the rows of sensed dofs change by themselves: reactions are what they lack.
+    """
+    segment, x, phi = part.segment, part.x, part.phi
+    sensed = HeldForces.nothing(len(x), len(segment.sensed_dofs), columns.count)
     response = part.sensing.read_along(Forward(solver, columns, held=sensed).rows(x), sensed)
-    of_sensed = rows[:, segment.sensed_dofs]
-    for reading, motion in zip(
-        segment.readings, part.sensing.moving(x, response, by_p=False), strict=True
-    ):
-        motion = _with_inertia(motion, of_sensed)
-        numbers, size = np.arange(count), count + len(part.phi)
-        looked, slopes = reading.channel.linearised(motion, part.phi, numbers, size)
-        yield reading.changes(looked, slopes.by[..., :count], part.phi)
+    numbers, size = np.arange(columns.count), columns.count + len(phi)
+    motions = part.sensing.moving(x, response, by_p=False)
+    for reading, motion in zip(segment.readings, motions, strict=True):
+        motion = _with_inertia(motion, inertia_n)
+        looked, slopes = reading.channel.linearised(motion, phi, numbers, size)
+        yield reading, motion, looked, slopes.by[..., : columns.count]
 
 
-def _with_inertia(motion: Motion, rows_n: Array) -> Motion:
-    """Reactions are what the rows of grasped dofs lack, with their own change."""
-
+def _with_inertia(motion: Motion, inertia_n: Array | float) -> Motion:
     def forced() -> Forced:
         lacking = motion.forced
         assert lacking.reaction_by is not None  # along columns
-        return replace(lacking, reaction_by=lacking.reaction_by - rows_n)
+        return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)
 
     return Motion(motion.x, forced, motion.by)

@@ -19,10 +19,10 @@ from scipy.special import binom
 from ..arrays import Array
 from ..program.collocation import Collocation, Part
 from ..program.lapack import one_blas_thread
-from ..program.reaction import HeldForces
-from ..program.sweep import Sweep
+from ..program.sweep import Columns, Sweep
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
+from .considered import followed
 
 # Samples of D η, and the fewest and the memory where bodies are large.
 DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
@@ -124,14 +124,9 @@ def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) ->
         shifts, turns = _poses_drawn(part, grasp, noise, rng, count)
         _add_noise(moved, part, grasp, shifts, turns)
         off.append((grasp, shifts, turns))
-    forces = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), count)
-    rows = Sweep(segment).response(part.x, part.setting, moved, forces)
-    response = part.sensing.read_along(rows, forces)
-    motions, changes = part.sensing.moving(part.x, response, by_p=False), []
-    for reading, motion in zip(segment.readings, motions, strict=True):
-        columns, size = np.arange(count), count + len(part.phi)
-        looked, slopes = reading.channel.linearised(motion, part.phi, columns, size)
-        by = slopes.by[..., :count]
+    solver, changes = Sweep(segment), []
+    columns = Columns.along(solver, part.setting, moved)
+    for reading, motion, looked, by in followed(part, solver, columns):
         for grasp, shifts, turns in off:
             by = by + reading.channel.carried(grasp, motion, part.phi, shifts, turns)
         changes.append(np.moveaxis(reading.changes(looked, by, part.phi), 3, 0))
