@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array
+from ..checked import Finite, Positive
 from ..errors import InputError, hint_at
 from ..fem.body import Body
 from ..fem.constants import (
@@ -51,12 +52,12 @@ class Unknown:
         What a linear parameter may change by in a step; its guess where its constant tells none.
     """
 
-    guess: float | None = None
-    lower: float | None = None
-    upper: float | None = None
+    guess: Finite | None = None
+    lower: Finite | None = None
+    upper: Finite | None = None
     prior: tuple[float, float] | None = None
     scale: Scale | None = None
-    typical: float | None = None
+    typical: Positive | None = None
 
 
 @dataclass(frozen=True)

@@ -4,105 +4,123 @@ from __future__ import annotations
 
 import runpy
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from ..errors import InputError, hint_at, located
 from ..fem.materials import Energy, Material
 from ..fem.node_force import NodeForce
-from ..files import reason
+from ..files import reason, require_regular
 from ..recording.nuisance import NuisanceRow
 from ..recording.selected import selection
 from .nuisance_schema import OwnRow
-from .recording import existing_file
 from .schema import CodeSection, NodeForceSection
 
 
-def load_material(section: CodeSection, folder: Path, key: str, allowed: bool) -> Material:
-    """Run the file and make a material of its function.
+def existing_file(folder: Path, name: str, key: str) -> Path:
+    """The file that a key of the problem file names.
 
     Raises
     ------
     InputError
-        See `load_function`; or if the function is no energy density, see `Material.of`.
+        If there is none.
     """
-    file, loaded = load_function(section.file, section.function, folder, f"{key}.file", allowed)
-    if isinstance(loaded, Material):
-        return loaded
-    with located(file):
-        return Material.of(cast(Energy, loaded), section.function)
+    file = folder / name
+    require_regular(file, key)
+    if not file.is_file():
+        fault = "is a folder" if file.is_dir() else "does not exist"
+        hint = folder / "README.md"
+        see = f"; see {hint} for how to get it" if hint.is_file() else ""
+        message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
+        raise InputError(message, where=key)
+    return file
 
 
-def load_force(section: NodeForceSection, folder: Path, key: str, allowed: bool) -> NodeForce:
-    """Run the file and make a force on nodes of its function.
+@dataclass(frozen=True)
+class Code:
+    """Python files that a problem names, which are run only where that is allowed.
 
-    Raises
-    ------
-    InputError
-        See `load_function`; or if the function is no force, see `NodeForce.of`.
+    Attributes
+    ----------
+    folder : Path
+        Where they are sought.
+    allowed : bool
     """
-    file, loaded = load_function(section.file, section.function, folder, f"{key}.file", allowed)
-    nodes = None if section.nodes is None else selection(section.nodes)
-    if isinstance(loaded, NodeForce):
-        return loaded if nodes is None else replace(loaded, nodes=nodes)
-    with located(file):
-        return NodeForce.of(loaded, nodes=nodes, name=section.function, on=section.on)
 
+    folder: Path
+    allowed: bool
 
-def load_function(
-    name: str, function: str, folder: Path, key: str, allowed: bool
-) -> tuple[Path, Callable[..., Any]]:
-    """Run a file, which a key names, and take a function of it; the file's path too.
+    def material(self, section: CodeSection, key: str) -> Material:
+        """A material of a function.
 
-    Raises
-    ------
-    InputError
-        If running code is not allowed, the file or the function is not there, or the file fails.
-    """
-    file, names = _run(name, folder, key, allowed)
-    loaded = names.get(function)
-    if not callable(loaded) and not isinstance(loaded, NodeForce):
-        functions = [n for n, v in names.items() if callable(v) and not n.startswith("_")]
-        raise InputError(
-            f"there is no function {function!r}; expected one of "
-            f"{', '.join(functions) or 'none'}{hint_at(function, functions)}",
-            file,
-        )
-    return file, cast(Callable[..., Any], loaded)
+        Raises
+        ------
+        InputError
+            See `function`; or if it is no energy density, see `Material.of`.
+        """
+        file, loaded = self.function(section.file, section.function, f"{key}.file")
+        if isinstance(loaded, Material):
+            return loaded
+        with located(file):
+            return Material.of(cast(Energy, loaded), section.function)
 
+    def force(self, section: NodeForceSection, key: str) -> NodeForce:
+        """A force on nodes of a function.
 
-def load_row(section: OwnRow, folder: Path, key: str, allowed: bool) -> NuisanceRow:
-    """Run the file and take a nuisance parameter from it.
+        Raises
+        ------
+        InputError
+            See `function`; or if it is no force, see `NodeForce.of`.
+        """
+        file, loaded = self.function(section.file, section.function, f"{key}.file")
+        nodes = None if section.nodes is None else selection(section.nodes)
+        if isinstance(loaded, NodeForce):
+            return loaded if nodes is None else replace(loaded, nodes=nodes)
+        with located(file):
+            return NodeForce.of(loaded, nodes=nodes, name=section.function, on=section.on)
 
-    Raises
-    ------
-    InputError
-        If running code is not allowed, the file or the row is not there, or the file fails.
-    """
-    file, names = _run(section.file, folder, f"{key}.file", allowed)
-    row = names.get(section.row)
-    if not isinstance(row, NuisanceRow):
-        rows = [name for name, value in names.items() if isinstance(value, NuisanceRow)]
-        raise InputError(
-            f"there is no NuisanceRow {section.row!r}; expected one of "
-            f"{', '.join(rows) or 'none'}{hint_at(section.row, rows)}",
-            file,
-        )
-    return row
+    def row(self, section: OwnRow) -> NuisanceRow:
+        """A nuisance parameter; see `function` for the errors."""
 
+        def fits(value: Any) -> bool:
+            return isinstance(value, NuisanceRow)
 
-def _run(name: str, folder: Path, key: str, allowed: bool) -> tuple[Path, dict[str, Any]]:
-    """The file, and the names that are in it after it has run."""
-    if not allowed:
-        raise InputError(
-            f"found the file {name}, which would be run as Python code; allow that with "
-            "--allow-code (allow_code=True from Python) if you trust it",
-            None,
-            key.rpartition(".")[0],
-        )
-    file = existing_file(folder, name, key)
-    try:
-        return file, runpy.run_path(str(file))
-    except (Exception, SystemExit) as error:
-        raise InputError(f"running it failed: {reason(error)}", file) from error
+        key = "nuisance.own.file"
+        return self._named(section.file, section.row, key, "NuisanceRow", fits)[1]
+
+    def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
+        """A function of a file that a key names, and the file's path.
+
+        Raises
+        ------
+        InputError
+            If running code is not allowed, the file or the function is not there, or the file
+            fails.
+        """
+
+        def fits(value: Any) -> bool:
+            return callable(value) or isinstance(value, NodeForce)
+
+        return self._named(file, name, key, "function", fits)
+
+    def _named(
+        self, name: str, wanted: str, key: str, what: str, fits: Callable[[Any], bool]
+    ) -> tuple[Path, Any]:
+        """What is called so in a file after it has run."""
+        if not self.allowed:
+            message = (
+                f"found the file {name}, which would be run as Python code; allow that with "
+                "--allow-code (allow_code=True from Python) if you trust it"
+            )
+            raise InputError(message, where=key.rpartition(".")[0])
+        file = existing_file(self.folder, name, key)
+        try:
+            names = runpy.run_path(str(file))
+        except (Exception, SystemExit) as error:
+            raise InputError(f"running it failed: {reason(error)}", file) from error
+        if not fits(names.get(wanted)):
+            there = [n for n, value in names.items() if fits(value) and not n.startswith("_")]
+            known = f"{', '.join(there) or 'none'}{hint_at(wanted, there)}"
+            raise InputError(f"there is no {what} {wanted!r}; expected one of {known}", file)
+        return file, names[wanted]

@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.constants import constant_named
-from ..fem.materials import Material
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
-from ..recording.nuisance import NuisanceRow
 from ..recording.selected import selection
 from ..stated import keys_of, tables_of
 from ..statistics.assumptions import Assumptions
 from ..statistics.plausible import oddities
-from .code import load_force, load_function, load_material, load_row
+from .code import Code, existing_file
 from .densities import completed, guessed
-from .nuisance_schema import OwnRow
 from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
-from .recording import RecordingReader, existing_file
-from .recording_schema import ReadingSection
+from .recording import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
-
-T = TypeVar("T")
 
 
 def contents_of(
@@ -47,32 +42,21 @@ def contents_of(
             "every experiment has validation = true; expected at least one to fit", path
         )
     folder = path.parent if folder is None else Path(folder)
-    mesh = _located(path, "object", lambda: _load_mesh(file.object, folder))
-    unknowns = file.parameters
-    body = _located(
-        path,
-        "object",
-        lambda: _load_body(completed(file.object, unknowns), mesh, folder, allow_code),
-    )
-    body = body.with_free_densities(body.weighed_by(unknowns))
-    parameters = _located(
-        path, "parameters", lambda: _load_parameters(guessed(unknowns, body), body)
-    )
-    odd = _located(path, "object", lambda: [oddity.sentence for oddity in oddities(body)])
+    unknowns, code = file.parameters, Code(folder, allow_code)
+    with _in_table(path, "object"):
+        mesh = _load_mesh(file.object, folder)
+        body = _load_body(completed(file.object, unknowns), mesh, code)
+        body = body.with_free_densities(body.weighed_by(unknowns))
+        odd = [oddity.sentence for oddity in oddities(body)]
+    with _in_table(path, "parameters"):
+        stated = guessed(unknowns, body)
+        parameters = Parameters.of({name: _stated(name, each) for name, each in stated.items()})
+        parameters.fit([body])
     experiments, notes = [], []
-
-    def row_of(section: OwnRow) -> NuisanceRow:
-        return load_row(section, folder, "nuisance.own", allow_code)
-
-    def expression_of(section: ReadingSection, key: str) -> Callable[..., Any]:
-        code = section.code, section.function
-        return load_function(*code, folder, f"{key}.code", allow_code)[1]
-
-    own = row_of, expression_of
     for section in file.experiment:
-        reader = RecordingReader(section, folder, body, parameters, simulation, *own)
-        with _blamed_on(odd):
-            experiments.append(_located(path, f"experiment '{section.name}'", reader.read))
+        reader = RecordingReader(section, folder, body, parameters, simulation, code)
+        with _in_table(path, f"experiment '{section.name}'", odd):
+            experiments.append(reader.read())
         notes += reader.notes
     return {
         "experiments": experiments,
@@ -109,26 +93,17 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
 
 
 @contextmanager
-def _blamed_on(odd: Sequence[str]) -> Iterator[None]:
-    """Errors that follow from an odd size or density name that first."""
+def _in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
+    """Errors get the file and the table they lack, and say first what is odd about the body."""
     try:
         yield
     except InputError as error:
-        message = "; ".join([*odd, error.message])
-        raise InputError(message, error.source, error.where) from error
-
-
-def _located(path: Path, table: str, build: Callable[[], T]) -> T:
-    """Run a step of loading; its errors get the file and the table they lack."""
-    try:
-        return build()
-    except InputError as error:
-        if error.source is not None:
-            raise  # it speaks of a file of its own
-        inner = error.where if error.where != table else None
-        separator = ": " if " " in table else "."
-        where = separator.join(part for part in (table, inner) if part)
-        raise InputError(error.message, path, where) from error
+        source, where = error.source, error.where
+        if source is None:  # else it speaks of a file of its own
+            inner = where if where != table else None
+            separator = ": " if " " in table else "."
+            source, where = path, separator.join(part for part in (table, inner) if part)
+        raise InputError("; ".join([*odd, error.message]), source, where) from error
 
 
 def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
@@ -138,9 +113,8 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     assert section.edge_length_m is not None  # by the schema
     if section.cylinder is not None:
         shape = section.cylinder
-        return cylinder_of_edge(
-            shape.diameter_m, shape.height_m, section.edge_length_m, shape.quarter
-        )
+        size_m = shape.diameter_m, shape.height_m, section.edge_length_m
+        return cylinder_of_edge(*size_m, shape.quarter)
     if section.box_m is not None:
         return box_of_edge(section.box_m, section.edge_length_m)
     assert section.surface is not None
@@ -149,20 +123,21 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     return TetMesh.from_surface(surface, section.edge_length_m, section.length_unit, cache)
 
 
-def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: bool) -> Body:
-    def material(law: str | CodeSection, key: str) -> str | Material:
-        if isinstance(law, CodeSection):
-            return load_material(law, folder, key, allow_code)
-        return law
+def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
+    def material(law: str | CodeSection | None, key: str) -> Any:
+        return code.material(law, key) if isinstance(law, CodeSection) else law
+
+    def branches(region: str | None) -> list[str]:
+        return [branch.name for branch in section.prony if branch.region == region]
 
     regions = [
         Region(
             region.name,
             selection(region.cells),
-            None if region.material is None else material(region.material, f"region.{k}.material"),
+            material(region.material, f"region.{k}.material"),
             region.density_kg_m3,
             region.damping,
-            _branches(section, region.name) or None,
+            branches(region.name) or None,
         )
         for k, region in enumerate(section.region)
     ]
@@ -174,23 +149,10 @@ def _load_body(section: ObjectSection, mesh: TetMesh, folder: Path, allow_code: 
         element=section.element,
         damping=section.damping,
         regions=regions,
-        prony=_branches(section, None),
-        forces=[
-            load_force(force, folder, f"force.{k}", allow_code)
-            for k, force in enumerate(section.force)
-        ],
+        prony=branches(None),
+        forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         evaluator=section.evaluator,
     )
-
-
-def _branches(section: ObjectSection, region: str | None) -> list[str]:
-    return [branch.name for branch in section.prony if branch.region == region]
-
-
-def _load_parameters(sections: Mapping[str, ParameterSection | float], body: Body) -> Parameters:
-    parameters = Parameters.of({name: _stated(name, section) for name, section in sections.items()})
-    parameters.fit([body])
-    return parameters
 
 
 def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
@@ -202,14 +164,8 @@ def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | fl
     if section.tied_to is not None:
         return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
     linear = (section.scale or constant_named(name).scale) == "linear"
-    return Unknown(
-        section.guess,
-        section.lower,
-        section.upper,
-        section.prior and _prior(section.prior, linear),
-        section.scale,
-        section.typical,
-    )
+    said = section.model_dump(include={each.name for each in fields(Unknown)})
+    return Unknown(**said | {"prior": section.prior and _prior(section.prior, linear)})
 
 
 def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:

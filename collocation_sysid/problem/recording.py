@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,6 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, hint_at, located
 from ..fem.body import Body
-from ..files import require_regular
 from ..methods.scan import usual_constants
 from ..model.parameters import Parameters
 from ..recording import (
@@ -33,13 +32,13 @@ from ..recording import (
 )
 from ..recording.arrays import triple
 from ..recording.clock import TIME_TOLERANCE_S
-from ..recording.nuisance import NuisanceRow
 from ..recording.poses import refuse_untold
 from ..recording.tables import read_gauge, within
 from ..section import stated_in
 from ..stated import keys_of, tables_of
 from ..statistics.modal import doubts
-from .nuisance_schema import OwnRow, nuisance_of
+from .code import Code, existing_file
+from .nuisance_schema import nuisance_of
 from .recording_schema import (
     ExperimentSection,
     GraspSection,
@@ -53,25 +52,6 @@ from .tracking import gripper_markers, into_body_frame, poses_from_markers, read
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
 
 
-def existing_file(folder: Path, name: str, key: str) -> Path:
-    """The file that a key of the problem file names.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    file = folder / name
-    require_regular(file, key)
-    if not file.is_file():
-        fault = "is a folder" if file.is_dir() else "does not exist"
-        hint = folder / "README.md"
-        see = f"; see {hint} for how to get it" if hint.is_file() else ""
-        message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
-        raise InputError(message, where=key)
-    return file
-
-
 @dataclass
 class RecordingReader:
     """Reads one experiment's files; `notes` tells what was assumed."""
@@ -81,8 +61,7 @@ class RecordingReader:
     body: Body
     parameters: Parameters
     simulation: bool
-    row_of: Callable[[OwnRow], NuisanceRow]
-    expression_of: Callable[[ReadingSection, str], Callable[..., Any]]
+    code: Code
     notes: list[str] = field(default_factory=list)
 
     def read(self) -> Experiment:
@@ -113,7 +92,7 @@ class RecordingReader:
             grasps=grasps,
             readings=[self._reading(k, each, t_s) for k, each in enumerate(section.reading)],
             markers=self._markers(t_s, table),
-            nuisance=nuisance_of(section.nuisance, self.row_of),
+            nuisance=nuisance_of(section.nuisance, self.code.row),
             **stated_in(section, Experiment, ""),
             **loads,
         )
@@ -223,7 +202,7 @@ class RecordingReader:
         """What is measured within the experiment's time; to be simulated without a file."""
         key = f"reading.{k}"
         told: dict[str, Any] = {"name": section.name, **stated_in(section, Gauge, key)}
-        told["expression"] = self.expression_of(section, key)
+        _, told["expression"] = self.code.function(section.code, section.function, f"{key}.code")
         if section.grasp and section.grasp > (count := len(self.section.grasps)):
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")

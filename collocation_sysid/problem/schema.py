@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from ..checked import Finite, Flag, Positive, Text
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
+from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.selected import Nodes
 from ..section import ByForm, Section, Unit, given_keys, require_one, section_of
@@ -204,32 +205,21 @@ class PriorSection(Section):
         return self
 
 
-class ParameterSection(Section):
+class ParameterSection(section_of(Unknown, "ParameterSection")):
     """One parameter: estimated within bounds, fixed, or tied to another; {} is estimated.
 
     Attributes
     ----------
-    guess : float, optional
-        Where the search starts; found by a scan where none is given.
     fixed : float, optional
         Value that is not estimated.
-    scale : {"log", "linear"}, optional
-        Estimate the logarithm, or the number itself, which may be negative.
-    typical : float, optional
-        What a linear parameter may change by in a step.
     tied_to : str, optional
         Parameter that this one is a multiple of.
     ratio : float, optional
         The multiple, 1 by default.
     """
 
-    guess: Finite | None = None
-    lower: Finite | None = None
-    upper: Finite | None = None
     fixed: Finite | None = None
-    prior: PriorSection | None = None
-    scale: Literal["log", "linear"] | None = None
-    typical: Positive | None = None
+    prior: PriorSection | None = Field(None, description=None)
     tied_to: Text | None = None
     ratio: Finite | None = None
 
