@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -75,7 +76,9 @@ def test_motions_are_those_of_the_same_equations_solved_by_another_hand():
     for integrator, steps in (("midpoint", (4, 8)), ("bdf2", (8, 16)), ("newmark", (4, 8))):
         for count in steps:
             step = experiment.timestep_s / count
-            own = {"timestep_s": step} if integrator == "newmark" else {"substeps": count}
+            own: dict[str, Any] = (
+                {"timestep_s": step} if integrator == "newmark" else {"substeps": count}
+            )
             found = simulate(experiment, STATED, integrator, **own)
             off.append(np.abs(found.positions_m.reshape(expected.shape) - expected).max())
     without = simulate(experiment, {**STATED, "spring_n_m": 1e-9}, "midpoint", substeps=4)

@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from problem_files import Outcome, run_command
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from scipy.spatial.transform import Rotation
-from test_gauge import instrumented, strain_gauge
+from test_gauge import CLAMPED, accelerometer, instrumented, strain_gauge
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -571,7 +571,115 @@ def test_memory_is_bounded():
     assert len(live.track.sweep.read) <= 30
 
 
+# Readings of one's own -------------------------------------------------------------------------
+
+
+@cache
+def felt(bias_m_s2: float = 0.3) -> cs.Problem:
+    """A cube swung by its top and seen bluntly, with a chip and a foil of clocks of their own."""
+    (seen,) = swing().experiments
+    seen = replace(seen, markers=replace(seen.markers, sigma_m=1e-3))
+    inner = np.linspace(seen.t_s[0] + 1e-3, seen.t_s[-1], 2 * len(seen.t_s))
+    made = instrumented(seen, accelerometer(inner), strain_gauge(seen.t_s))
+    accelerations, strains = cs.simulate(made, TRUTH, "midpoint").readings
+    rng = np.random.default_rng(2)
+    accelerations = accelerations + [0, 0, bias_m_s2] + 0.05 * rng.normal(size=(len(inner), 3))
+    accelerations[5, 1] = accelerations[7] = np.nan
+    strains = strains + 1e-4 * rng.normal(size=strains.shape)
+    return cs.Problem([cs.with_readings(made, [accelerations, strains])], GUESS)
+
+
+def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
+    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    problem = felt()
+    live = streamed(problem)
+    (seen,), count = problem.experiments, len(live.log)
+    last_s = seen.t_s[len(live.log) - 2] - 1e-5
+    taken = [np.where(g.times[:, None] < last_s, g.measured, np.nan) for g in seen.readings]
+    whole = cs.Problem([cs.with_readings(seen, taken)], GUESS)
+    collocation = whole.collocation()
+    horizon, p = Horizon(collocation, [count], prior=model.WEAK), collocation.guess_p
+    reached, _ = horizon.extend(p)
+    point = horizon.evaluate(p, reached)
+    point = horizon.evaluate(p, [each.x + each.tangent.step for each in point.trajectories])
+    flat = live.model.flat(p)
+    rows = np.column_stack([point.fit.slope, point.fit.residual - point.fit.slope @ flat])
+    batch, ours = rows.T @ rows, normal_equations(live.track.information.triangle)
+    scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
+    np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
+
+
+def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
+    problem = felt()
+    live = Estimator(problem, replace(NO_TIME, rows=8))
+    for frame in frames_of(problem, live):
+        update = live.take(frame)
+    blind = [replace(e, readings=[]) for e in problem.experiments]
+    alone = Estimator(cs.Problem(blind, GUESS), replace(NO_TIME, rows=8))
+    for frame in frames_of(problem, live):
+        without = alone.take(replace(frame, told=()))
+    for name, estimate in update.estimates.items():
+        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.std_error
+        assert estimate.std_error < without.estimates[name].std_error
+    bias = live.p[live.model.collocation.nq :] * live.model.segment.nuisance.scales
+    assert bias[0] == pytest.approx(0.3, abs=0.05)
+    settled, batch = live.settle(), cs.run(problem, seek_causes=False)
+    for name, estimate in settled.estimates.items():
+        assert estimate.value == pytest.approx(batch.parameters[name], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ('{"foil": 0.1}', [(2, 1.0, [0.1])]),
+        ('{"accelerometer": [1, null, 3]}', [(1, 1.0, [1, np.nan, 3])]),
+        ('{"foil": {"t_s": 0.9, "values": [0.2]}}', [(2, 0.9, [0.2])]),
+        (
+            '{"foil": [{"t_s": 0.9, "values": 0.2}, {"t_s": 1, "values": 0.3}]}',
+            [(2, 0.9, [0.2]), (2, 1.0, [0.3])],
+        ),
+        ('{"foil": null}', []),
+    ],
+)
+def test_frames_bring_readings_with_times_of_their_own(given, expected):
+    reader = FrameReader([1], ["a"], gauges=felt().experiments[0].readings)
+    found = reader.read(f'{{"t_s": 1.0, "readings": {given}}}').told
+    assert [(number, t_s) for number, t_s, _ in found] == [each[:2] for each in expected]
+    for (*_, values), (*_, numbers) in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(values, numbers)
+
+
+def test_tables_of_frames_have_readings_in_their_columns():
+    reader = FrameReader([1], ["a"], gauges=felt().experiments[0].readings)
+    names = [f"accelerometer_{k}" for k in (1, 2, 3)]
+    assert reader.read(",".join(["t_s,x_m,y_m,z_m,qx,qy,qz,qw", *names, "foil"])) is None
+    ((number, t_s, values),) = reader.read("1,1,2,3,0,0,0,1,0.5,,0.7,").told
+    assert (number, t_s) == (1, 1.0)
+    np.testing.assert_array_equal(values, [0.5, np.nan, 0.7])
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ('{"chip": 1}', "a reading 'chip'; expected accelerometer, foil"),
+        ('{"foil": [1, 2]}', "the reading 'foil': found 2 numbers; expected 1 numbers"),
+        ('{"foil": "much"}', "the reading 'foil': found 'much'; expected 1 numbers"),
+        ('{"foil": {"t_s": 1}}', "a sample of 'foil' has 't_s'; expected t_s and values"),
+        ('{"foil": {"t_s": null, "values": 1}}', "t_s is None"),
+        ("[1]", r"readings are \[1\]; expected samples by name"),
+    ],
+)
+def test_readings_that_are_none_are_told_with_their_line(given, said):
+    reader = FrameReader([1], ["a"], gauges=felt().experiments[0].readings)
+    with pytest.raises(InputError, match=f"input, line 1: {said}"):
+        reader.read(f'{{"t_s": 1.0, "readings": {given}}}')
+
+
 # What cannot be live --------------------------------------------------------------------------
+
+
+def on_clamp(t_s: np.ndarray) -> cs.Gauge:
+    return cs.Gauge("clamp", CLAMPED["expression"], t_s, np.ones((len(t_s), 3)), 0.1, grasp=0)
 
 
 def test_problems_that_cannot_be_live_are_refused_in_words():
@@ -581,7 +689,7 @@ def test_problems_that_cannot_be_live_are_refused_in_words():
     for changed, said in (
         ([still], "never move"),
         ([hung, replace(hung, name="again")], "2 experiments"),
-        ([instrumented(hung, strain_gauge(hung.t_s))], "the readings 'foil', which frames do not"),
+        ([instrumented(hung, on_clamp(hung.t_s))], "the readings 'clamp' of grasps"),
     ):
         with pytest.raises(InputError, match=said):
             Estimator(cs.Problem(changed, GUESS))

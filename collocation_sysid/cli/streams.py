@@ -83,7 +83,12 @@ def live(options: Live) -> None:
     lines, source = as_text(sys.stdin.buffer), "standard input"
     if options.udp is not None:
         lines, source = datagrams(options.udp, opened), f"UDP port {options.udp}"
-    reader = FrameReader(estimator.model.moved_grasps + 1, estimator.names, source)
+    reader = FrameReader(
+        estimator.model.moved_grasps + 1,
+        estimator.names,
+        source,
+        estimator.model.experiment.readings,
+    )
     bad = 0
     with collected_before():
         for line in lines:

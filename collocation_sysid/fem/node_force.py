@@ -26,7 +26,7 @@ from .force_points import ForcePoints
 from .mesh import Nodes
 from .selection import Indices, Selection
 
-Law = Callable[..., ca.SX]
+Law = Callable[..., Any]
 On = Literal["nodes", "faces"]
 # A slope is symmetric when its skew part is this small beside it.
 SYMMETRIC = 1e-9

@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,11 +34,11 @@ from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
 from ..statistics.trust import GROSS_MISFIT, Trust
 from .budget import Budget
-from .frames import Frame, Pose, as_pose, as_time, as_tracks
+from .frames import Frame, Pose, as_pose, as_readings, as_time, as_tracks
 from .intake import LONGEST, Intake
 from .model import TOGETHER, Model, Poses
 from .search import SEEN, Search
-from .sweep import LoggedRow, Tracks
+from .sweep import LoggedRow, Sample
 from .track import JoinedPasses, Track
 from .trust import UNSETTLED, Scatter, data_concerns, estimate_concerns, widened
 from .whole import recording_of, solved
@@ -184,6 +184,7 @@ class Estimator:
         pose: Pose | Mapping[str, Pose] | None,
         markers: ArrayLike | Mapping[str, ArrayLike],
         wrench: object = None,
+        readings: Mapping[str, Any] | None = None,
     ) -> Update:
         """Take a frame.
 
@@ -196,7 +197,10 @@ class Estimator:
         markers : (M, 3) array, or mapping of name to (3,)
             NaN, or left out, where missing.
         wrench : optional
-            Not read: frames tell the motion only.
+            Not read.
+        readings : mapping of name to numbers, optional
+            Of readings of one's own, at the time of the frame; or a mapping with ``t_s`` and
+            ``values``, or a list of such. NaN, or None, where missing.
 
         Raises
         ------
@@ -205,7 +209,8 @@ class Estimator:
         """
         poses = as_pose(pose, self.model.moved_grasps + 1)
         tracks = as_tracks(markers, self.names)
-        return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None))
+        told = as_readings(readings, self.model.experiment.readings, as_time(t_s))
+        return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None, told))
 
     @one_blas_thread()
     def take(self, frame: Frame) -> Update:
@@ -218,7 +223,7 @@ class Estimator:
             else:
                 self._begin_anew()
                 notes.append("nothing was seen for long: begun anew, as if at rest here")
-        rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m)
+        rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m, frame.told)
         notes += said
         self.budget.forget()
         caught = self._catch_up(began, notes)
@@ -295,7 +300,9 @@ class Estimator:
         if frame.has_wrench:
             self.counts["with a wrench"] += 1
             if self.counts["with a wrench"] == 1:
-                notes.append("wrenches are not read: live takes poses and markers")
+                notes.append(
+                    "wrenches are not read: live takes poses, markers and readings of points"
+                )
         if frame.pose is not None:
             self._held_m = frame.pose[0]
         away_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
@@ -331,7 +338,7 @@ class Estimator:
             said += self._read(row.readings, squares, done - k)
         return done, said
 
-    def _read(self, readings: Sequence[Tracks], squares: list[Array], rows: int = 0) -> list[str]:
+    def _read(self, readings: Sequence[Sample], squares: list[Array], rows: int = 0) -> list[str]:
         """Take what is read so many rows before the last one, without samples that jump."""
         track = self.track
         if track is None:
@@ -340,17 +347,17 @@ class Estimator:
         for reading in readings:
             if not track.failed:
                 said = track.sweep.linearised(reading, rows)
-                here = said.at(self.model.flat(self.p))
-                wild = self._wild(here)
-                if wild.any():
-                    notes.append(self._left_out(wild))
-                    reading = reading._replace(
-                        tracks_m=np.where(wild[:, None], np.nan, reading.tracks_m)
-                    )
-                    said.at_zero[wild] = here[wild] = np.nan
+                if not reading.of:
+                    here = said.at(self.model.flat(self.p))
+                    wild = self._wild(here)
+                    if wild.any():
+                        notes.append(self._left_out(wild))
+                        seen = np.where(wild[:, None], np.nan, reading.values)
+                        reading = reading._replace(values=seen)
+                        said.at_zero[wild] = here[wild] = np.nan
+                    near = np.sum((here * sigma_m) ** 2, axis=1)
+                    squares.append(near[np.isfinite(near)])
                 track.read([said])
-                near = np.sum((here * sigma_m) ** 2, axis=1)
-                squares.append(near[np.isfinite(near)])
             self.log[-1].readings.append(reading)
         return notes
 
@@ -380,7 +387,7 @@ class Estimator:
         nowhere[0] = 0.0
         try:
             trial = Track(self.model, self.p, self.prior, self._block_rows)
-            row = LoggedRow(moved, [Tracks(0.0, nowhere)])
+            row = LoggedRow(moved, [Sample(0.0, nowhere)])
             for _ in range(self.model.rows + 2):
                 trial.again([row])
         except SimulationError:
@@ -410,7 +417,8 @@ class Estimator:
             guesses = [((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()]
         track = Track(model, self.p, self.prior, self._block_rows)
         track.advance([row.poses], guesses)
-        first = row.readings[0].tracks_m if row.readings else np.full((len(self.names), 3), np.nan)
+        seen = [reading.values for reading in row.readings if not reading.of]
+        first = seen[0] if seen else np.full((len(self.names), 3), np.nan)
         self.model = model.placed(first, track.blocks[0].kept[0].x)
         if self.model is not model:
             self._bounds()

@@ -15,13 +15,16 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..recording.formats.text import written_number
+from ..recording.gauge import Gauge
 from ..recording.poses import first_matrix_fault, first_pose_fault
 
 Pose = Any
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-_KEYS = ("t_s", "pose", "markers", "wrench")
+_KEYS = ("t_s", "pose", "markers", "wrench", "readings")
 _POSE_KEYS = ("position_m", "quaternion_xyzw")
+# A sample of a reading of one's own: its number from 1 on, time, and numbers (m,), NaN if missing.
+Told = tuple[int, float, Array]
 # Beyond so many metres or seconds numbers no longer tell micrometres and microseconds apart.
 LARGEST = 1e10
 
@@ -36,12 +39,15 @@ class Frame:
     pose : positions (G, 3) and quaternions (G, 4) of the grasps that move, or None
     tracks_m : (M, 3) NaN where missing
     has_wrench : bool
+    told : tuple of Told
+        Samples of readings of one's own, at times of their own.
     """
 
     t_s: float
     pose: tuple[Array, Array] | None
     tracks_m: Array
     has_wrench: bool = False
+    told: tuple[Told, ...] = ()
 
 
 def as_pose(given: Pose | None, numbers: Sequence[int] | Index) -> tuple[Array, Array] | None:
@@ -113,6 +119,46 @@ def as_tracks(given: ArrayLike | Mapping[str, Any] | None, names: Sequence[str])
     return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
 
 
+def as_readings(
+    given: Mapping[str, Any] | None, gauges: Sequence[Gauge], t_s: float
+) -> tuple[Told, ...]:
+    """Samples of readings of one's own, at the time of the frame where they have none.
+
+    Raises
+    ------
+    InputError
+        For readings that are not there, or what are no numbers of them.
+    """
+    if given is None:
+        return ()
+    if not isinstance(given, Mapping):
+        raise InputError(f"readings are {reprlib.repr(given)}; expected samples by name")
+    names, found = [gauge.name for gauge in gauges], []
+    for name, samples in given.items():
+        if name not in names:
+            known = ", ".join(names) or "none, as the problem has none"
+            raise InputError(f"a reading {reprlib.repr(name)}; expected {known}")
+        number = names.index(name)
+        several = isinstance(samples, Sequence) and any(isinstance(s, Mapping) for s in samples)
+        for sample in samples if several else [samples]:
+            if sample is not None:
+                found.append((number + 1, *_sample(sample, gauges[number], t_s)))
+    return tuple(found)
+
+
+def _sample(given: Any, gauge: Gauge, t_s: float) -> tuple[float, Array]:
+    if isinstance(given, Mapping):
+        if set(given) != {"t_s", "values"}:
+            keys = ", ".join(map(reprlib.repr, given)) or "nothing"
+            raise InputError(f"a sample of '{gauge.name}' has {keys}; expected t_s and values")
+        t_s, given = as_time(given["t_s"]), given["values"]
+    one = isinstance(given, (int, float)) and not isinstance(given, bool)
+    try:
+        return t_s, _numbers([given] if one else given, (gauge.measured.shape[1],))
+    except InputError as error:
+        raise InputError(f"the reading '{gauge.name}': {error.message}") from error
+
+
 def _numbers(given: Any, shape: tuple[int, ...]) -> Array:
     size = " × ".join(map(str, shape))
     try:
@@ -138,12 +184,19 @@ class FrameReader:
         Markers.
     source : str
         For messages.
+    gauges : sequence of Gauge
+        The problem's readings of one's own; in a table they are in the columns they name.
     """
 
     def __init__(
-        self, grasps: Sequence[int] | Index, names: Sequence[str], source: str = "input"
+        self,
+        grasps: Sequence[int] | Index,
+        names: Sequence[str],
+        source: str = "input",
+        gauges: Sequence[Gauge] = (),
     ) -> None:
         self.grasps, self.names, self.source = list(grasps), list(names), source
+        self.gauges = gauges
         self.line = 0
         self._columns: list[str] | None = None
 
@@ -176,7 +229,10 @@ class FrameReader:
             raise InputError("there is no t_s; expected the time in seconds")
         pose = as_pose(found.get("pose"), self.grasps)
         tracks = as_tracks(found.get("markers"), self.names)
-        return Frame(as_time(found["t_s"]), pose, tracks, found.get("wrench") is not None)
+        t_s, has_wrench = as_time(found["t_s"]), found.get("wrench") is not None
+        return Frame(
+            t_s, pose, tracks, has_wrench, as_readings(found.get("readings"), self.gauges, t_s)
+        )
 
     def _of_row(self, cells: list[str]) -> Frame | None:
         if self._columns is None:
@@ -188,7 +244,12 @@ class FrameReader:
         poses = [self._pose_of(by_name, number) for number in self.grasps]
         pose = None if any(one is None for one in poses) else as_pose(_alone(poses), self.grasps)
         tracks = [[by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")] for m in self.names]
-        return Frame(as_time(by_name["t_s"]), pose, as_tracks(tracks, self.names))
+        t_s, told = as_time(by_name["t_s"]), list[Told]()
+        for number, gauge in enumerate(self.gauges, 1):
+            values = np.array([by_name.get(column, np.nan) for column in gauge.columns])
+            if np.isfinite(values).any():
+                told.append((number, t_s, values))
+        return Frame(t_s, pose, as_tracks(tracks, self.names), told=tuple(told))
 
     def _pose_of(self, by_name: Mapping[str, float], number: int) -> Pose | None:
         values = [by_name[name] for name in self._pose_columns(number)]
@@ -206,6 +267,7 @@ class FrameReader:
                 f"expected {', '.join(needed)} and the markers' columns"
             )
         known = {*needed, *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z"))}
+        known |= {column for gauge in self.gauges for column in gauge.columns}
         if unknown := [name for name in columns if name not in known]:
             raise InputError(
                 f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array
 from ..program.reading import lagrange_weights
 from ..recording.clock import TIME_TOLERANCE_S
-from .sweep import LATEST, LoggedRow, Tracks
+from .frames import Told
+from .sweep import LATEST, LoggedRow, Sample, rows_around
 
 # Frames this near in time, in samples, are of one time.
 TOLERANCE = 0.1
@@ -61,7 +62,7 @@ class Intake:
         self.last_s = -np.inf
         self._times: deque[float] = deque(maxlen=8 * LATEST)
         self._poses: deque[tuple[float, Array, Array]] = deque(maxlen=4)
-        self._waiting: list[tuple[float, Array]] = []
+        self._waiting: list[Told] = []
         self._too_late = 0
 
     @property
@@ -71,11 +72,17 @@ class Intake:
 
     def seen(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
         """When markers were seen, in samples from the first row on, and where, (M, 3)."""
+        for of, when, tracks_m in self.told(log):
+            if not of:
+                yield when, tracks_m
+
+    def told(self, log: Sequence[LoggedRow]) -> Iterator[Told]:
+        """All that was read, markers being number 0, its times in samples from the first row on."""
         for number, row in enumerate(log):
-            for back, tracks_m in row.readings:
-                yield (number - back) / self.substeps, tracks_m
-        for t_s, tracks_m in self._waiting:
-            yield (t_s - (self.start_s or 0.0)) / self.interval_s, tracks_m
+            for back, values, of in row.readings:
+                yield of, (number - back) / self.substeps, values
+        for of, t_s, values in self._waiting:
+            yield of, (t_s - (self.start_s or 0.0)) / self.interval_s, values
 
     def is_lost(self, t_s: float) -> bool:
         """Whether a time is so long after the last pose that nothing is known of the motion.
@@ -88,8 +95,12 @@ class Intake:
         return gone_s > (LONGEST + TOLERANCE) * self.interval_s
 
     def take(
-        self, t_s: float, pose: tuple[Array, Array] | None, tracks_m: Array
-    ) -> tuple[list[LoggedRow], list[Tracks], list[str]]:
+        self,
+        t_s: float,
+        pose: tuple[Array, Array] | None,
+        tracks_m: Array,
+        told: Sequence[Told] = (),
+    ) -> tuple[list[LoggedRow], list[Sample], list[str]]:
         """The rows a frame completes, what can be read after the last row, and what was odd.
 
         Parameters
@@ -97,6 +108,7 @@ class Intake:
         t_s : float
         pose : positions (G, 3) and quaternions (G, 4) of the grasps that move; None where missing
         tracks_m : (M, 3), NaN where missing
+        told : what else came with it
         """
         sample_s, said = self.interval_s, []
         if any(abs(t_s - other) <= TOLERANCE * sample_s for other in self._times):
@@ -113,8 +125,12 @@ class Intake:
         self._too_late = 0
         self._times.append(t_s)
         begun = self.start_s is not None or pose is not None
-        if begun and not self.is_lost(t_s) and np.isfinite(tracks_m).any():
-            self._waiting.append((t_s, tracks_m))
+        if begun and not self.is_lost(t_s):
+            if np.isfinite(tracks_m).any():
+                self._waiting.append((0, t_s, tracks_m))
+            near = [each for each in told if abs(each[1] - t_s) <= LATEST * sample_s]
+            self.counts["late"] += len(told) - len(near)
+            self._waiting += near
         if not late:
             if pose is not None and self._leaps(t_s, pose[0]):
                 pose = None
@@ -165,7 +181,7 @@ class Intake:
 
     def _due(self) -> list[LoggedRow]:
         """The rows that there are poses for."""
-        found: list[tuple[Array, Array, list[Tracks]]] = []
+        found: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
             return []
         until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
@@ -195,15 +211,21 @@ class Intake:
         )
         return position_m, quaternion
 
-    def _ready(self) -> list[Tracks]:
+    def _ready(self) -> list[Sample]:
         """What can be read after the rows there are."""
         if self.start_s is None or not self.rows:
             return []
         now_s = self._time_s(self.rows - 1)
-        step_s = self.interval_s / self.substeps
-        latest_s = now_s - self.around * self.interval_s + TOLERANCE * self.interval_s
-        ready = [each for each in self._waiting if each[0] <= latest_s]
-        self._waiting = [each for each in self._waiting if each[0] > latest_s]
+        step_s, room_s = self.interval_s / self.substeps, TOLERANCE * self.interval_s
+        latest_s = now_s - self.around * self.interval_s + room_s
+
+        def ready(of: int, t_s: float) -> bool:
+            if not of:
+                return t_s <= latest_s
+            return rows_around(self.rows - 1 - (now_s - t_s) / step_s).stop <= self.rows
+
+        found = [each for each in self._waiting if ready(*each[:2])]
+        self._waiting = [each for each in self._waiting if not ready(*each[:2])]
         # Before the first row nothing is known.
-        ready = [each for each in ready if each[0] >= self.start_s - TOLERANCE * self.interval_s]
-        return [Tracks((now_s - t_s) / step_s, tracks) for t_s, tracks in ready]
+        found = [each for each in found if each[1] >= self.start_s - (0 if each[0] else room_s)]
+        return [Sample((now_s - t_s) / step_s, values, of) for of, t_s, values in found]

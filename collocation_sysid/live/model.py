@@ -20,7 +20,10 @@ from ..methods.scan import usual_parameters
 from ..model.dynamics import StencilRow
 from ..model.point_forces import generated
 from ..problem import Problem
+from ..program.channel import Points
 from ..program.collocation import Collocation
+from ..program.gauge import NEIGHBOURS as GAUGE_NEIGHBOURS
+from ..program.gauge import GaugeReading, points_of
 from ..program.least_squares import LeastSquares
 from ..program.markers import NEIGHBOURS, MarkerReading
 from ..program.newton import NewtonOptions, Solver
@@ -179,6 +182,18 @@ class Model:
         return MarkerReading.of(origin, *where, earlier=around)
 
     @cached_property
+    def gauges(self) -> tuple[GaugeReading, ...]:
+        """Readings of one's own, which look at as many rows as one sample needs."""
+        pairs = zip(self.segment.gauges, self.looked, strict=True)
+        return tuple(replace(gauge, channel=points) for gauge, points in pairs)
+
+    @cached_property
+    def looked(self) -> tuple[Points, ...]:
+        """The places they look at."""
+        still = self.segment.experiment
+        return tuple(points_of(still, gauge, GAUGE_NEIGHBOURS) for gauge in still.readings)
+
+    @cached_property
     def moved_grasps(self) -> Index:
         """Numbers of the grasps whose poses come with the frames; others never move."""
         grasps = self.experiment.grasps
@@ -273,9 +288,9 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a force that carries something from step to step", "none")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
-    if experiment.readings:
-        names = ", ".join(repr(gauge.name) for gauge in experiment.readings)
-        raise refused(f"the readings {names}, which frames do not bring,", "none")
+    if felt := [gauge.name for gauge in experiment.readings if gauge.grasp is not None]:
+        names = ", ".join(map(repr, felt))
+        raise refused(f"the readings {names} of grasps", "readings of points")
     own = (generated(each.force, each.points.dofs) for each in experiment.body.placed_forces)
     if any(law.takes(0) for law in own):
         raise refused("a force that depends on time", "one that does not")
@@ -303,11 +318,16 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
     markers = experiment.markers
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
+    gauges = [
+        replace(g, t_s=t_s, values=np.zeros((count, g.measured.shape[1])))
+        for g in experiment.readings
+    ]
     return replace(
         experiment,
         t_s=t_s,
         grasps=[replace(g, wrench=None) for g in _held_at(experiment, _first_poses(experiment))],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
+        readings=gauges,
     )
 
 

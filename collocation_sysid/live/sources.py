@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..problem import Problem
+from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
 from ..runs.result import Result
 from .estimator import Update
@@ -70,10 +71,18 @@ def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:
     """The frames of an experiment's recording."""
     moved = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moved_grasps]
     turns = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in moved]
+    told = [
+        (number, float(at_s), values)
+        for number, gauge in enumerate(experiment.readings, 1)
+        for at_s, values in zip(gauge.times, gauge.measured, strict=True)
+    ]
+    frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in told])
     for k, t_s in enumerate(experiment.t_s):
         positions_m = np.array([translations[k] for _, translations in moved])
         quaternions = np.array([each[k] for each in turns])
-        yield Frame(float(t_s), (positions_m, quaternions), experiment.markers.positions_m[k])
+        own = tuple(each for each, frame in zip(told, frame_of, strict=True) if frame == k)
+        seen_m = experiment.markers.positions_m[k]
+        yield Frame(float(t_s), (positions_m, quaternions), seen_m, told=own)
 
 
 def paced(

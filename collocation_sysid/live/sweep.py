@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..model.dynamics import StencilRow
+from ..program.channel import Slopes
+from ..program.gauge import NEIGHBOURS
 from ..program.least_squares import LeastSquares
 from ..program.marching import RowEquations, extrapolated, solve_row
 from ..program.newton import NewtonFailure, simulation_error
@@ -37,18 +39,28 @@ NEAR = 1e-3
 LATEST = 5
 
 
-class Tracks(NamedTuple):
-    """Markers (M, 3), NaN where missing, so many rows before the row they are read after."""
+def rows_around(row: float) -> range:
+    """The rows that a reading of one's own is read from, as in a recording that goes on."""
+    first = max(int(np.floor(row + NEAR)) - (NEIGHBOURS - 1) // 2, 0)
+    return range(first, first + NEIGHBOURS)
+
+
+class Sample(NamedTuple):
+    """Numbers, NaN where missing, so many rows before the row they are read after.
+
+    Markers are (M, 3); a reading of one's own has a number from 1 on, and is (m,).
+    """
 
     back: float
-    tracks_m: Array
+    values: Array
+    of: int = 0
 
 
 class LoggedRow(NamedTuple):
     """What came with one row of the grid."""
 
     poses: Poses
-    readings: list[Tracks]
+    readings: list[Sample]
 
 
 class Kept(NamedTuple):
@@ -60,17 +72,21 @@ class Kept(NamedTuple):
 
 
 class Said(NamedTuple):
-    """Residuals (M, 3) of a reading, NaN where missing, as if flat were 0; slopes by flat."""
+    """Residuals (G, 3) of a reading, NaN where missing, as if flat were 0; slopes by flat.
+
+    `of` is what it is, see `Sample`.
+    """
 
     at_zero: Array
     slope: Array
+    of: int = 0
 
     def at(self, flat: Array) -> Array:
         """(M, 3) the residuals, to first order."""
         return self.at_zero + self.slope @ flat
 
 
-# A row, and x and the columns of the markers, (3M, 1 + m).
+# A row, and x and the columns of the markers and then of what readings look at, (3M + …, 1 + m).
 Read = tuple[Kept, Array]
 
 
@@ -134,6 +150,12 @@ class LiveSweep:
         self.dynamics = self.setting.dynamics
         self.carried = model.carried(self.phi)
         self.shape_functions = segment.markers.channel.shape(self.phi)
+        looks = [self.shape_functions, *(points.shape(self.phi) for points in model.looked)]
+        self._looked = tuple(
+            np.concatenate(part)
+            for part in zip(*((nodes, at.weights) for nodes, at in looks), strict=True)
+        )
+        self._ends = np.cumsum([len(nodes) for nodes, _ in looks]).tolist()
         self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
         self.count = 1 + len(self.moving)
@@ -329,10 +351,10 @@ class LiveSweep:
         return found
 
     def _seen(self, whole: Array) -> Array:
-        """What the markers have of columns (…, 3n, k) of the body, (…, 3M, k)."""
-        (nodes, places), (*rows, dofs, count) = self.shape_functions, whole.shape
+        """What is looked at has of columns (…, 3n, k) of the body, (…, 3M + …, k)."""
+        (nodes, weights), (*rows, dofs, count) = self._looked, whole.shape
         at = whole.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
-        return np.einsum("ma,...maik->...mik", places.weights, at).reshape(*rows, -1, count)
+        return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
 
     def _carefully(self, t: int, poses: Poses) -> Array:
         """x_t, with the grasp's way taken in parts where that is needed."""
@@ -350,26 +372,42 @@ class LiveSweep:
         time_s = self.row * model.interval_s / model.substeps
         raise simulation_error(model.newton, failure, time_s, what) from failure
 
-    # Markers ----------------------------------------------------------------------------------
+    # Readings ---------------------------------------------------------------------------------
 
-    def linearised(self, reading: Tracks, rows: int = 0) -> Said:
+    def linearised(self, reading: Sample, rows: int = 0) -> Said:
         """What was read so many `rows` before the last one."""
-        residual, slope = self._by_p(reading, rows)
+        residual, slope = (self._of_gauge if reading.of else self._of_markers)(reading, rows)
         slope /= self.rates
-        return Said(residual - slope @ self.flat, slope)
+        return Said(residual - slope @ self.flat, slope, reading.of)
 
-    def _by_p(self, reading: Tracks, rows: int) -> tuple[Array, Array]:
+    def _of_gauge(self, reading: Sample, rows: int) -> tuple[Array, Array]:
+        """The same as `_of_markers` of a reading of one's own, from the rows around it."""
+        model, gauge = self.model, self.model.gauges[reading.of - 1]
+        row, last = self.row - 1 - reading.back - rows, self.row - 1
+        here = rows_around(row)
+        seen = np.array([self.read[k - last - 1][1] for k in here])
+        looked = slice(3 * self._ends[reading.of - 1], 3 * self._ends[reading.of])
+        seen = seen[:, looked].reshape(len(seen), -1, 3, self.count)
+        step_s, begins_s = model.interval_s / model.substeps, float(model.experiment.t_s[0])
+        at_s = begins_s + step_s * np.array(here)
+        one = gauge.of_one(at_s, begins_s + step_s * row, reading.values)
+        slopes = Slopes.along(self.moving, seen[..., 1:])
+        residual, slope = one.linearised(seen[..., 0], slopes, self.phi, model.size)
+        return np.where(one.components[0], residual[0], np.nan), slope[0]
+
+    def _of_markers(self, reading: Sample, rows: int) -> tuple[Array, Array]:
         """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P) by p."""
         model, around, markers = self.model, self.model.samples_around, self.model.markers
         back = reading.back + rows
         backs = [back - k * model.substeps for k in range(-around, around + 1)]
         x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
+        seen = seen[:, : 3 * self._ends[0]]
         values = seen[..., 0].reshape(len(seen), -1, 3)
         slopes = markers.channel.slopes_of(x, self.shape_functions, self.moving, seen[..., 1:])
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
         markers = markers.later(since_s)
         residual, slope = markers.linearised(values, slopes, self.phi, model.size)
-        return residual[0] - reading.tracks_m / markers.sigmas[:, None], slope[0]
+        return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
 
     def _at(self, back: float) -> tuple[Array, Array]:
         """X and what the markers have so many rows before the last; the start before the start."""
@@ -385,17 +423,17 @@ class LiveSweep:
         return np.tensordot(weights, [k.x for k in kept], 1), np.tensordot(weights, seen, 1)
 
     def take(self, said: Sequence[Said]) -> None:
-        """Add what markers say, of those that are there."""
+        """Add what readings say, of those that are there."""
         self.information = self.added(self.information, said)
 
     def added(self, known: LeastSquares, said: Sequence[Said]) -> LeastSquares:
-        """What is known, and what markers say besides, with the loss's weights."""
+        """What is known, and what readings say besides, with the loss's weights."""
         if not said:
             return known
-        at_zero, slope = (np.concatenate(part) for part in zip(*said, strict=True))
-        here = np.isfinite(at_zero[:, 0])
-        slopes = slope[here]
-        rows, slopes = as_squares(
-            at_zero[here] + slopes @ self.flat, slopes, self.model.collocation.huber
-        )
-        return known.add(rows.ravel(), slopes.reshape(-1, slopes.shape[2]), self.flat)
+        at_zero = np.concatenate([each.at_zero for each in said])
+        there = np.isfinite(at_zero)
+        here = there.any(axis=1)
+        slopes, there = np.concatenate([each.slope for each in said])[here], there[here]
+        residual = np.where(there, at_zero[here] + slopes @ self.flat, 0.0)
+        rows, slopes = as_squares(residual, slopes, self.model.collocation.huber)
+        return known.add(rows[there], slopes[there], self.flat)

@@ -219,5 +219,5 @@ class JoinedPasses(NamedTuple):
         return cls(track.sweep.added(again.information, rest), [*done, *rest], points)
 
     def scatter(self, flat: Array) -> Scatter:
-        """Of the residuals, to first order."""
-        return Scatter.of([said.at(flat) for said in self.said])
+        """Of the markers' residuals, to first order."""
+        return Scatter.of([said.at(flat) for said in self.said if not said.of])

@@ -44,8 +44,14 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
         smooth = grasps[number].poses.interpolation
         poses = PoseSequence.from_matrices(t_s, matrices, smooth)
         grasps[number] = replace(grasps[number], poses=poses)
-    markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
-    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers)
+    markers, readings = replace(experiment.markers, t_s=t_s, positions_m=tracks_m), []
+    for number, gauge in enumerate(experiment.readings, 1):
+        told = {when: values for of, when, values in intake.told(log) if of == number}
+        inside = [when for when in sorted(told) if when <= len(t_s) - 1]
+        if len(inside) >= FEWEST:
+            own_s = t_s[0] + model.interval_s * np.array(inside)
+            readings.append(replace(gauge, t_s=own_s, values=np.array([told[w] for w in inside])))
+    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
 
 
 def solved(problem: Problem, recording: Experiment) -> Run:

@@ -6,7 +6,7 @@ These are those of the polynomial through the five times around a sample.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -78,6 +78,16 @@ class GaugeReading(Reading):
             at_s=at_s,
             static=static,
         )
+
+    def of_one(self, at_s: Array, t_s: float, numbers: Array) -> GaugeReading:
+        """That of one sample (m,), of a channel that is known at some times."""
+        measured = np.full((1, 1, self.measured.shape[2]), np.nan)
+        measured[0, 0, : len(numbers)] = numbers
+        there = np.isfinite(measured).reshape(1, -1, GROUP)
+        told = {"measured": measured, "components": there}
+        other = replace(self, t_s=np.array([t_s]), at_s=at_s, **told)
+        vars(other)["_instruments"] = self._instruments
+        return other
 
     @cached_property
     def _window(self) -> Window:
@@ -165,7 +175,7 @@ def gauge_readings(
     found = []
     for number, gauge in enumerate(experiment.readings):
         if gauge.grasp is None:
-            channel, at_s = _points(experiment, gauge, len(t_s)), t_s
+            channel, at_s = points_of(experiment, gauge, len(t_s)), t_s
         else:
             grasp, origin = experiment.grasps[gauge.grasp], np.zeros(3)
             channel = GraspWrench.of(experiment, grasp, gauge.frame, origin, grid, nuisance)
@@ -175,7 +185,7 @@ def gauge_readings(
     return tuple(found)
 
 
-def _points(experiment: Experiment, gauge: Gauge, rows: int) -> Points:
+def points_of(experiment: Experiment, gauge: Gauge, rows: int) -> Points:
     """The places that a gauge looks at in all rows."""
     body, points = experiment.body, np.asarray(gauge.points_m)
     names = [f"{gauge.name} {k + 1}" for k in range(len(points))]
