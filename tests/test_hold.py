@@ -80,7 +80,10 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
 def test_a_grasp_is_told_with_its_nodes_its_size_and_where_it_is():
     found = held(CORNER)
     assert (found.nodes, found.share) == (8, 8 / 216)
-    assert hold_sentence(found) == ("8 nodes, 4% of all, in 20 × 20 × 20 mm from (0, 0, 80) mm on")
+    assert hold_sentence(found) == (
+        "8 nodes, 4% of all, in a box of 20 × 20 × 20 mm at (0, 0, 80) mm"
+    )
     assert hold_sentence(held(TOP, axes="xz")) == (
-        "72 nodes, 33% of all, in 100 × 100 × 20 mm from (0, 0, 80) mm on, along x and z only"
+        "72 nodes, 33% of all, in a box of 100 × 100 × 20 mm at (0, 0, 80) mm, "
+        "held along x and z only"
     )

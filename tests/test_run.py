@@ -176,7 +176,7 @@ def test_the_terminal_shows_nuisance_verdicts_and_residuals(two, tmp_path, monke
     assert outcome.code == 0
     assert "also estimated for 'swing': " in outcome.out
     assert "mm (prior 3)" in outcome.out
-    assert "the data fix" in outcome.out
+    assert "the data determine" in outcome.out
     assert "residuals: swing/" in outcome.out
     stored = json.loads((tmp_path / "run" / "result.json").read_text())
     assert stored["rollout"]["experiments"]["turn"]["nuisance"]

@@ -28,17 +28,18 @@ class Design(OfProblem, Told):
     Attributes
     ----------
     duration : SECONDS
-        How long it takes.
+        How long the motion takes.
     limits : FILE
-        What the robot may do and cameras see (TOML).
+        A file (TOML) with what the robot may do and what cameras see.
     criterion : str
-        worst: the largest error bar; A: their mean square; D: their ellipsoid.
+        What is made small: worst, the largest error bar; A, their mean square; D, the volume of
+        their ellipsoid.
     for_ : A,B,…
         Parameters and moduli that count; all by default.
     over : str
-        mean or worst over the draws of the prior.
+        Over draws from the prior: their mean, or the worst.
     add : bool
-        Complement the problem's recordings, which are fitted first.
+        Complement the problem's recordings; they are fitted first.
     film : bool
         Film the motion.
     """

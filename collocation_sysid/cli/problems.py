@@ -29,7 +29,7 @@ class Solve(OfProblem, Told):
     Attributes
     ----------
     method : str
-        Method, instead of the problem's.
+        The method, in place of the problem's.
     start : RUN
         Start from the answer in this run folder.
     scheduler : ADDRESS
@@ -39,7 +39,7 @@ class Solve(OfProblem, Told):
     strict : bool
         Exit code 1 if the verdict is doubtful.
     budget : bool
-        What the variance of each estimate is made of, whole.
+        Show all that the variance of each estimate is made of.
     probe : bool
         Look harder: refit parts of the data, and with each assumption freed.
     """
@@ -143,7 +143,7 @@ class Check(OfProblem, Told):
     Attributes
     ----------
     full : bool
-        Simulate all samples, however long that takes.
+        Simulate whole recordings, however long that takes.
     """
 
     full: bool = False
@@ -158,8 +158,8 @@ class Check(OfProblem, Told):
 def check(options: Check) -> None:
     """Say what is wrong with a problem before solving it.
 
-    Bodies, recordings and grasps are shown at once; derivatives, costs and the simulation at the
-    guess follow, of the first samples where the whole takes more than some ten seconds.
+    Bodies, recordings and grasps are shown at once. Derivatives, costs and the simulation at the
+    guess follow, of the first samples only where whole recordings take more than ten seconds.
     """
     from ..result.check_sections import closer_table, glance_table
     from ..result.progress import Progress

@@ -39,9 +39,9 @@ class Refine(OfRun, Told):
 def refine(options: Refine) -> None:
     """Solve again with half the step and a finer mesh: the numerical error.
 
-    Each starts from the run's answer. The folder gets refinement.json, and result.json the
-    numerical error of each parameter, with an interval for noise and discretisation. What was
-    solved before, as of a call that was interrupted, is not solved again.
+    Each starts from the run's answer. The folder gets refinement.json, and result.json gets the
+    numerical error of each parameter, with an interval for noise and discretisation. After an
+    interruption the same command goes on where it stopped.
     """
     from ..result.refined import refine_run
     from ..result.run_sections import refinement_table, verdict_of
@@ -72,7 +72,7 @@ class Export(OfRun):
     to : TARGET
         mujoco, newton, sofa, febio, calculix or json.
     verify : bool
-        Predict in the target what was exported, and compare.
+        Simulate the exported body in the target, and compare.
     """
 
     to: str
@@ -89,7 +89,7 @@ class Export(OfRun):
 def export(options: Export) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
-    Says what the target cannot express. By default in a folder export-TARGET of the run.
+    It says what the target cannot express. The files go to a folder export-TARGET in the run's.
     """
     from ..result.export import (
         Identified,
@@ -183,7 +183,7 @@ class Animate(OfRun):
     fps : float
         Frames a second.
     slow : float
-        How many times slower than it was.
+        How many times slower than in reality.
     """
 
     to: Path | None = None
@@ -216,9 +216,9 @@ class View(OfRun):
     Attributes
     ----------
     field : str
-        Field of the frames that colours the body: von_mises_pa; on a page, strain.
+        The field of the frames that colours the body; von_mises_pa, or on a page strain.
     html : FILE
-        Write a web page, open no window.
+        Write a web page; no window opens.
     """
 
     field: str | None = None
@@ -230,7 +230,7 @@ class View(OfRun):
 def view(options: View) -> None:
     """Look at a run in 3-D.
 
-    In a window (needs pyvista), or as a web page that needs nothing.
+    In a window, which needs pyvista, or as a web page, which needs nothing.
     """
     from ..result.view import FIELD, export_page
     from ..result.view import view as opened

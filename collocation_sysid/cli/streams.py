@@ -30,9 +30,9 @@ class Estimating(Options):
     Attributes
     ----------
     budget_ms : float
-        Time a frame may take; 80 % of a sample by default.
+        Time that a frame may take; by default 80 % of the time between samples.
     window_s : float
-        How far back frames are gone over again.
+        How far back earlier frames are revisited.
     """
 
     budget_ms: Positive | None = None
@@ -115,7 +115,7 @@ class Replay(Estimating, Told):
     recording : RUN_OR_PROBLEM
         A problem file, or a run's folder.
     rate : HZ
-        Frames a second; as recorded by default, 0: at once.
+        Frames a second: by default as recorded, with 0 without a pause.
     film : FILE
         Write the estimates as a .gif.
     """

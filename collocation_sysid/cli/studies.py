@@ -58,15 +58,15 @@ class Compare(Many):
     Attributes
     ----------
     methods : A,B,…
-        Methods, each with its options of the file.
+        Methods to compare, each with its options in the file.
     materials : A,B,…
-        Materials, instead of the object's.
+        Materials to compare, in place of the object's.
     prony : 0,1,…
-        Numbers of branches of memory.
+        Numbers of viscoelastic branches to compare.
     region : NAME
-        Region that these are for; by default the whole body.
+        The region that has these materials and branches; by default the whole body.
     with_ : FILE
-        Another problem of the same recordings.
+        Another problem file of the same recordings, as a model.
     truth : FILE|NAME=VALUE
         True parameters: a TOML file, or values.
     within : float
@@ -143,7 +143,7 @@ class SweepOptions(Many):
     over : KEY=VALUES
         Key and its values: a,b,c or first:last:count or first:last:log:count.
     method : str
-        Method, instead of the problem's.
+        The method, in place of the problem's.
     """
 
     over: list[str]

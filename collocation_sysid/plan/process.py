@@ -202,7 +202,7 @@ class RunOptions(Options):
     Attributes
     ----------
     workers : int
-        Runs at once; as many as there are cores by default.
+        How many runs at once; by default as many as there are cores.
     scheduler : ADDRESS
         A dask.distributed scheduler to run on; its workers see the same files.
     time_limit_s : --time-limit SECONDS

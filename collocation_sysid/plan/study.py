@@ -92,11 +92,11 @@ class Starts(Options):
     Attributes
     ----------
     starts : int
-        Starts; the first is the file's guess.
+        How many starts; the first is the file's guess.
     spread : float
         Starts lie within this factor of the guess.
     seed : int
-        Seed of the starts.
+        Seed by which starts are drawn.
 
     Raises
     ------

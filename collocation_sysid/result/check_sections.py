@@ -128,20 +128,20 @@ def _solve_section(findings: Findings) -> Table:
     }
     if findings.overstresses:
         rows["memory"] = (
-            f"{findings.overstresses:,} more variables and constraints for interior-point, the "
-            "viscoelastic stress of every point, in these nonzeros"
+            f"{findings.overstresses:,} more variables and constraints in interior-point, for the "
+            "viscoelastic stress of every point; the nonzeros count them"
         )
     if findings.wrenches:
         rows["wrenches"] = (
-            f"{findings.wrenches:,} more variables and constraints for interior-point, what grasps "
-            "with a sensor give, in these nonzeros"
+            f"{findings.wrenches:,} more variables and constraints in interior-point, for the "
+            "wrenches of grasps with a sensor; the nonzeros count them"
         )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         rows[cost.method] = f"about {duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"
     rows["derivatives"] = (
         f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
-        f"{findings.hessian_error:.0e} of differences"
+        f"{findings.hessian_error:.0e} of finite differences"
     )
     return labelled("Solve", rows)
 

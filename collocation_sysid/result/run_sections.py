@@ -189,7 +189,7 @@ def _most_assumed(result: Result) -> list[str]:
     for name in names:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
         sources = ", ".join(f"{worded(s)} {share:.0%}" for s, share in shares if share > LITTLE)
-        said.append(f"{symbol_of(name)}'s whole interval is mostly {sources}")
+        said.append(f"{symbol_of(name)}'s whole interval comes mostly from {sources}")
     return said
 
 

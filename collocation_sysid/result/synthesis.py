@@ -35,9 +35,9 @@ class Recipe(Options):
     integrator : str
         newmark, or a scheme: midpoint, backward-euler, bdf2.
     timestep_s : float
-        Newmark's step.
+        The step of newmark.
     noise_m : float
-        Standard deviation of the noise.
+        Standard deviation of the markers' noise.
     noise_n : float
         The same of measured forces.
     noise_nm : float

@@ -1,4 +1,4 @@
-"""What the data fix, and what they leave open, in words.
+"""What the data determine, and what they leave open, in words.
 
 Directions are those of the marginal covariance of the parameters' logarithms. Scaled to unit
 variances it is the correlation matrix; an eigenvalue ε ≪ 1 belongs to a combination Σ w_k q_k, that
@@ -48,7 +48,7 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
     well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
     badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]
     parts = [listed(part) for part in (well, badly) if part]
-    return [f"the data fix {'; '.join(parts)} (95 %)"] if parts else []
+    return [f"the data determine {'; '.join(parts)} (95 %)"] if parts else []
 
 
 def _combinations(uncertainty: Uncertainty) -> list[str]:

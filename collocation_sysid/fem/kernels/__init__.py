@@ -3,6 +3,11 @@
 An `EvaluatorChoice` takes the SIMD evaluator where llvmlite can be imported and knows all of a
 material's operations, and CasADi's ``Function.map`` otherwise; ``COLLOCATION_SYSID_EVALUATOR`` or
 the argument forces either.
+
+What is not in the cache is compiled at once, however small the body: it costs as much as CasADi
+takes for some 10,000 points (elements times points times states), which a solve of 72 elements and
+9 samples evaluates many times over. Begun with CasADi and compiled after 500 or after 10,000 points
+that solve, from an empty cache, took 3.3 and 3.1 s of processor time in place of 3.1 s.
 """
 
 from __future__ import annotations

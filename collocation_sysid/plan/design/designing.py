@@ -49,13 +49,13 @@ class DesignOptions(Options):
     Attributes
     ----------
     evaluations : int
-        Motions that are simulated; ten times as many are tried to first order before.
+        How many motions are simulated; ten times as many are tried to first order before.
     pairs : int
-        Pairs of draws from the prior, about the guesses.
+        How many pairs of draws from the prior.
     spread : float
         Factor by which guesses without a prior may be wrong.
     waves : int
-        Waves of each of the six coordinates.
+        How many waves each of the six coordinates has.
     seed : int
         Seed of the search and of the draws.
     """

@@ -301,8 +301,10 @@ def hold_sentence(hold: Hold) -> str:
     """What a grasp holds."""
     size = " × ".join(f"{1e3 * (b - a):.4g}" for a, b in zip(hold.low_m, hold.high_m, strict=True))
     low = ", ".join(f"{1e3 * x:.4g}" for x in hold.low_m)
-    along = "" if hold.axes == "xyz" else f", along {' and '.join(hold.axes)} only"
-    return f"{hold.nodes} nodes, {hold.share:.0%} of all, in {size} mm from ({low}) mm on{along}"
+    along = "" if hold.axes == "xyz" else f", held along {' and '.join(hold.axes)} only"
+    return (
+        f"{hold.nodes} nodes, {hold.share:.0%} of all, in a box of {size} mm at ({low}) mm{along}"
+    )
 
 
 def hold_concerns(hold: Hold) -> list[Concern]:
