@@ -45,6 +45,16 @@ class ByForm:
         return "<first>" if isinstance(value, self.first) else "<second>"
 
 
+@dataclass(frozen=True)
+class Among:
+    """A word of a table of the package."""
+
+    words: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(Literal[self.words])
+
+
 class Section(BaseModel):
     """A table of the problem file.
 

@@ -12,7 +12,7 @@ from typing import Any
 import tomli_w
 from pydantic import ValidationError
 
-from ..errors import InputError, excerpt
+from ..errors import InputError, excerpt, located
 from ..files import require_regular
 from .explaining import explain
 from .schema import ProblemFile
@@ -52,8 +52,9 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
     path = Path(path)
     text = read_text(path)
     content = parse_toml(text, path)
-    for override in overrides:
-        _apply(content, override)
+    with located("--set"):
+        for override in overrides:
+            _apply(content, override)
     if overrides:
         text = tomli_w.dumps(content)
     try:
@@ -96,7 +97,7 @@ def _depth(content: Any) -> int:
 def _beyond_limits(error: Exception) -> str:
     if isinstance(error, RecursionError):
         return "nests tables or lists too deeply; expected a few levels"
-    return "holds a whole number of too many digits; expected a number that can be"
+    return "holds a whole number of too many digits; expected fewer than 4,300"
 
 
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
@@ -136,32 +137,25 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, value = override.partition("=")
-    parts = key.strip().split(".")
+    key = key.strip()
+    parts = key.split(".")
     if len(parts) > DEEPEST:
-        raise InputError(f"found a key of {len(parts)} parts; expected a few", "--set")
+        raise InputError(f"found a key of {len(parts)} parts; expected a few")
     if not equals or not all(parts):
-        raise InputError(
-            f"found {override!r}, expected key=value such as parameters.mu_pa.guess=200", "--set"
-        )
+        expected = "expected key=value such as parameters.mu_pa.guess=200"
+        raise InputError(f"found {override!r}, {expected}")
     place: Any = content
+    shared: Any = content.get("experiment_defaults")
     *leading, last = _as_written(content, parts)
     for depth, part in enumerate(leading):
-        if depth == 2 and leading[0] == "experiment" and isinstance(place, dict):
-            _take_default(content, place, part)
-        place = _descend(place, part, key)
-    if isinstance(place, list):
-        place[_index(place, last, key)] = _value(value, key)
-    elif isinstance(place, dict):
-        place[last] = _value(value, key)
-    else:
-        raise _no_table(place, key)
-
-
-def _take_default(content: dict[str, Any], experiment: dict[str, Any], key: str) -> None:
-    """Give an experiment a default of its own, a part of which is to be overridden."""
-    shared = content.get("experiment_defaults")
-    if isinstance(shared, dict) and key in shared and key not in experiment:
-        experiment[key] = deepcopy(shared[key])
+        at: Any = _place(place, part, key)
+        if isinstance(place, dict):
+            # An experiment gets a default of its own, a part of which is to be overridden.
+            usual = depth == 2 and leading[0] == "experiment" and isinstance(shared, dict)
+            place.setdefault(at, deepcopy(shared[at]) if usual and at in shared else {})
+        place = place[at]
+    at = _place(place, last, key)
+    place[at] = _value(value, key)
 
 
 def _as_written(content: Any, parts: list[str]) -> list[str]:
@@ -178,31 +172,20 @@ def _as_written(content: Any, parts: list[str]) -> list[str]:
     return joined
 
 
-def _descend(place: Any, part: str, key: str) -> Any:
+def _place(place: Any, part: str, key: str) -> str | int:
+    """The key of a table, or the place in a list, that a part of a key stands for."""
     if isinstance(place, dict):
-        return place.setdefault(part, {})
-    if isinstance(place, list):
-        return place[_index(place, part, key)]
-    raise _no_table(place, key)
-
-
-def _no_table(place: Any, key: str) -> InputError:
-    return InputError(
-        f"{key.strip()} leads into the plain value {place!r}; expected a key of a table", "--set"
-    )
-
-
-def _index(items: list[Any], part: str, key: str) -> int:
-    names = [item.get("name") if isinstance(item, dict) else None for item in items]
+        return part
+    if not isinstance(place, list):
+        raise InputError(f"{key} leads into the plain value {place!r}; expected a key of a table")
+    names = [item.get("name") if isinstance(item, dict) else None for item in place]
     if part in names:
         return names.index(part)
-    if part.isascii() and part.isdecimal() and int(part) < len(items):
+    if part.isascii() and part.isdecimal() and int(part) < len(place):
         return int(part)
-    known = "".join(f" or {name}" for name in names if name)
-    raise InputError(
-        f"found {part!r} in {key.strip()}; expected a number from 0 to {len(items) - 1}{known}",
-        "--set",
-    )
+    expected = f"a number from 0 to {len(place) - 1}"
+    expected += "".join(f" or {name}" for name in names if name)
+    raise InputError(f"found {part!r} in {key}; expected {expected}")
 
 
 def _value(text: str, key: str) -> Any:
@@ -210,11 +193,9 @@ def _value(text: str, key: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         if text.strip().startswith(("[", "{", '"', "'")):
-            raise InputError(
-                f"found {text.strip()} for {key.strip()}; expected a value as in a TOML file, such "
-                'as 0.5, [0, 0, -9.81], {guess = 0.5} or "text"',
-                "--set",
-            ) from None
+            example = 'such as 0.5, [0, 0, -9.81], {guess = 0.5} or "text"'
+            message = f"found {text.strip()} for {key}; expected a value as in a TOML file"
+            raise InputError(f"{message}, {example}") from None
         return text.strip()
     except (RecursionError, ValueError) as error:
-        raise InputError(_beyond_limits(error), "--set", key.strip()) from error
+        raise InputError(_beyond_limits(error), where=key) from error

@@ -293,9 +293,9 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     window_s : list, optional
         First and last time to use [start, end].
     resample_hz : float, optional
-        Put the markers on this rate; their own times by default.
+        Resample the markers at this rate; their own times by default.
     every : int
-        Use every so-manieth sample of the markers.
+        Use every n-th sample of the markers.
     reading : list of ReadingSection
         [[experiment.reading]] tables: instruments of the user's own.
     nuisance : NuisanceOrNone

@@ -12,19 +12,18 @@ from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.selected import Nodes
-from ..section import ByForm, Section, Unit, given_keys, require_one, section_of
+from ..section import Among, ByForm, Section, Unit, given_keys, require_one, section_of
 from .options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
 
+MaterialName = Annotated[str, Among(tuple(MATERIALS))]
+DampingName = Annotated[str, Among(tuple(DAMPINGS))]
+ElementName = Annotated[str, Among(tuple(ELEMENTS))]
+SchemeName = Annotated[str, Among(tuple(SCHEMES))]
 if TYPE_CHECKING:
-    MaterialName = DampingName = ElementName = SchemeName = str
     RolloutSection = UncertaintySection = Section
 else:
-    MaterialName = Literal[tuple(MATERIALS)]
-    DampingName = Literal[tuple(DAMPINGS)]
-    ElementName = Literal[tuple(ELEMENTS)]
-    SchemeName = Literal[tuple(SCHEMES)]
     RolloutSection = section_of(RolloutOptions, "RolloutSection")
     UncertaintySection = section_of(UncertaintyOptions, "UncertaintySection")
 
@@ -127,7 +126,7 @@ class ObjectSection(Section):
     box_m : list, optional
         Lengths [x, y, z] of a box to mesh, with a corner at the origin.
     edge_length_m : float, optional
-        Wanted edge length of a surface, cylinder or box.
+        Edge length wanted of the mesh of a surface, cylinder or box.
     length_unit : {"m", "cm", "mm", "in"}
         Unit of the coordinates in the file.
     mass_kg : float, optional
@@ -177,10 +176,9 @@ class ObjectSection(Section):
         regions = [region.name for region in self.region]
         for branch in self.prony:
             if branch.region is not None and branch.region not in regions:
-                there = ", ".join(regions) or "none"
-                raise ValueError(
-                    f"prony '{branch.name}' is of region {branch.region!r}; there are: {there}"
-                )
+                one = f"one of {', '.join(regions)}" if regions else "none, as there are no regions"
+                found = f"prony '{branch.name}' is of region {branch.region!r}"
+                raise ValueError(f"{found}; expected {one}")
         return self
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field, create_model, model_validator
 from pydantic_core.core_schema import no_info_plain_validator_function
@@ -16,7 +16,7 @@ from ..methods import METHODS, options_schema
 from ..methods.comparison.casadi_nlp import why_not
 from ..methods.options import built
 from ..methods.solution import Method
-from ..section import Section
+from ..section import Among, Section
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"
@@ -29,10 +29,7 @@ def _offered(name: Any) -> Any:
     return name
 
 
-if TYPE_CHECKING:
-    MethodName = str
-else:
-    MethodName = Annotated[Literal[tuple(METHODS)], BeforeValidator(_offered)]
+MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_offered)]
 
 
 class MethodSection(Section):

@@ -69,7 +69,7 @@ def align(
     resample_hz : float, optional
         Rate of the new grid, which starts at the first sample left.
     every : int
-        Only every so-manieth sample of the markers is used.
+        Use every n-th sample of the markers.
     held_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not go beyond. Throughout by
         default.

@@ -394,9 +394,8 @@ class Experiment:
         if self.readings or self.sensed:
             return
         if not self.markers.names:
-            raise InputError(
-                "nothing is measured: there are no markers, no wrench and no reading; expected any"
-            )
+            message = "nothing is measured: there are no markers, no wrench and no reading"
+            raise InputError(f"{message}; expected one of them at least")
         raise InputError("no marker sample is present; check the marker file and window_s")
 
     def _check_nodes(self) -> None:

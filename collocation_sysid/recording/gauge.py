@@ -130,7 +130,7 @@ class Gauge:
         if np.isinf(values).any():
             raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
         if not np.isfinite(values).any():
-            raise InputError(f"{where} has no sample; expected some, or to be left out")
+            raise InputError(f"{where} has no sample; leave it out, or check its file")
         if values.shape[1] != count:
             raise InputError(
                 f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
