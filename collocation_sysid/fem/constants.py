@@ -7,7 +7,7 @@ constant of a named region has the region in front, ``core.mu_pa``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Scale = Literal["log", "linear"]
@@ -91,6 +91,10 @@ TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
 DENSITY = Constant("density_kg_m3", "ρ", "density", (1.0, 1e5))
 # In place of the densities of all parts, which keep their ratios.
 MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
+# Of an obstacle; names end with it, ``table_friction``.
+FRICTION = Constant(
+    "friction", "friction", "coefficient of friction", (0.0, 2.0), "linear", 0.1, 0.3, at_least=0.0
+)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
 )
@@ -116,6 +120,7 @@ KNOWN: Mapping[str, Constant] = {
         TAU,
         DENSITY,
         MASS,
+        FRICTION,
         INSTANTANEOUS,
     )
 }
@@ -145,7 +150,10 @@ def with_unit(name: str) -> str:
 
 def constant_named(name: str) -> Constant:
     """The known constant of this name, or one of which nothing but the name is known."""
-    return KNOWN.get(bare(name), Constant(bare(name)))
+    own = bare(name)
+    if own not in KNOWN and own.endswith(f"_{FRICTION.name}"):
+        return replace(FRICTION, name=own, symbol=own.replace("_", " "))
+    return KNOWN.get(own, Constant(own))
 
 
 def is_modulus(name: str) -> bool:

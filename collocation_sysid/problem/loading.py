@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import constant_named
+from ..fem.constants import Constant, constant_named
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
@@ -49,9 +49,10 @@ def contents_of(
         body = body.with_free_densities(body.weighed_by(unknowns))
         odd = [oddity.sentence for oddity in oddities(body)]
     with _in_table(path, "parameters"):
-        stated = guessed(unknowns, body)
+        rubbed = body.with_frames(0, frictions=_frictions(file))
+        stated = guessed(unknowns, rubbed)
         parameters = Parameters.of({name: _stated(name, each) for name, each in stated.items()})
-        parameters.fit([body])
+        parameters.fit([rubbed])
     experiments, notes = [], []
     for section in file.experiment:
         reader = RecordingReader(section, folder, body, parameters, simulation, code)
@@ -83,7 +84,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
         names += [section.markers.file, *(reading.file for reading in section.reading)]
-        for grasp in section.grasps:
+        for grasp in section.moved:
             moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
             names += [grasp.poses or moved, sensed]
         for _, word, kind in tables_of(Experiment):
@@ -153,6 +154,12 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
         forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         evaluator=section.evaluator,
     )
+
+
+def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
+    """Those of obstacles that are parameters."""
+    stated = (each.friction for section in file.experiment for each in section.obstacle)
+    return tuple(dict.fromkeys(constant_named(one) for one in stated if isinstance(one, str)))
 
 
 def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | float:

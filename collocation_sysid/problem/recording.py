@@ -21,6 +21,7 @@ from ..recording import (
     Grasp,
     Markers,
     MarkerTable,
+    Obstacle,
     PoseSequence,
     Wrench,
     align,
@@ -42,11 +43,14 @@ from .nuisance_schema import nuisance_of
 from .recording_schema import (
     ExperimentSection,
     GraspSection,
+    ObstacleSection,
     ReadingSection,
     TableSection,
     WrenchSection,
 )
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
+
+Moved = GraspSection | ObstacleSection
 
 # Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
 LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
@@ -73,7 +77,7 @@ class RecordingReader:
             Naming the file and line, or the key within the experiment's table.
         """
         section = self.section
-        t_s, poses, table = self._align([*map(self._poses, range(len(section.grasps)))])
+        t_s, poses, table = self._align([*map(self._poses, range(len(section.moved)))])
         grasps = [self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)]
         if len(held_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
@@ -131,11 +135,13 @@ class RecordingReader:
     # Grasps ---------------------------------------------------------------------------------------
 
     def _grasp_key(self, k: int, key: str = "") -> str:
-        one = f"grasp.{k}" if len(self.section.grasps) > 1 else "grasp"
+        grasps = len(self.section.grasps)
+        one = f"grasp.{k}" if grasps > 1 else "grasp"
+        one = one if k < grasps else f"obstacle.{k - grasps}"
         return f"{one}.{key}" if key else one
 
     def _poses(self, k: int) -> PoseSequence:
-        grasp = self.section.grasps[k]
+        grasp = self.section.moved[k]
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.displacement is not None:
@@ -152,7 +158,7 @@ class RecordingReader:
                 poses = poses.after(first)
         return replace(poses, interpolation=grasp.interpolation)
 
-    def _poses_from_markers(self, grasp: GraspSection, key: str) -> PoseSequence:
+    def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
         if self._recorded is None:
             message = "there are no tracks to fit the poses to; expected markers.file, or poses"
             raise InputError(message, where=key)
@@ -163,14 +169,20 @@ class RecordingReader:
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
-        section, zero = self.section.grasps[k], ""
+        section, zero = self.section.moved[k], ""
         if (table := section.displacement) is not None:
             file = self._file(table, self._grasp_key(k, "displacement"))
             zero = displaced_axes(file, table.columns, table.axis, table.length_m)
-        said = stated_in(section, Grasp, self._grasp_key(k))
-        wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, "wrench"), t_s)
+        is_obstacle = isinstance(section, ObstacleSection)
+        kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
+        number = k + 1 - len(self.section.grasps)
+        usual = {"name": f"obstacle {number}"} if is_obstacle else {}
+        said: dict[str, Any] = usual | stated_in(section, kind, self._grasp_key(k))
+        wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, word), t_s)
         with located(where=self._grasp_key(k)):
-            made = Grasp(**said, poses=poses, zero=zero, wrench=wrench)
+            made = kind(**said, poses=poses, zero=zero, wrench=wrench)
+        if is_obstacle:
+            return made
         with located(where=self._grasp_key(k, "nodes")):
             return made.on(self.body, t_s)
 
@@ -267,7 +279,7 @@ class RecordingReader:
     def _times(self, poses: Sequence[PoseSequence]) -> Array:
         """Those of the wrench where there are no markers, else of the poses."""
         section = self.section
-        sensed = [(k, grasp.wrench) for k, grasp in enumerate(section.grasps) if grasp.wrench]
+        sensed = [(k, grasp.wrench) for k, grasp in enumerate(section.moved) if grasp.wrench]
         if not (sensed or section.marked or section.reading):
             message = "nothing is measured: expected markers, the wrench of a grasp, or a reading"
             raise InputError(message, where="markers")
@@ -311,9 +323,12 @@ class RecordingReader:
     ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
         """Times, poses and tracks on one clock."""
         section, table, static = self.section, self._table(poses), self._static
-        said = [stated_in(grasp, Grasp, "grasp") for grasp in section.grasps]
-        held_s = [(each.get("from_s", -np.inf), each.get("until_s", np.inf)) for each in said]
-        moved = [grasp.poses or section.file_of(grasp.displacement) for grasp in section.grasps]
+        said = [each.model_dump(include={"from_s", "until_s"}) for each in section.moved]
+        held_s = [
+            (-np.inf if first is None else first, np.inf if last is None else last)
+            for first, last in (each.values() for each in said)
+        ]
+        moved = [grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved]
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
@@ -389,7 +404,7 @@ def _other_scale(experiment: Experiment) -> str | None:
             f"at t = {experiment.t_s[k]:.6g} s the markers span {span_m:.3g} m, but the body "
             f"{body_m:.3g} m; check length_unit of the markers and of the object"
         )
-    if not experiment.grasps:
+    if not experiment.gripping:
         return None
     carried = markers.observe(experiment.rigid_positions(experiment.t_s[[k]]))[0, seen]
     miss_m = np.linalg.norm(measured - carried, axis=1)

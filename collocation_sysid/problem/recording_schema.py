@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
-from ..recording import Experiment, Gauge, Grasp, Markers, Wrench
+from ..recording import Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
 from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
@@ -100,8 +100,8 @@ else:
     ]
 
 
-class GraspSection(section_of(Grasp, "GraspSection")):
-    """Nodes held by a gripper or a test bench, and how it moves.
+class MovedSection(Section):
+    """What moves on a path of its own.
 
     Attributes
     ----------
@@ -126,8 +126,6 @@ class GraspSection(section_of(Grasp, "GraspSection")):
         quaternion_xyzw.
     interpolation : {"smooth", "linear", "hold"}
         Motion between the samples of poses.
-    wrench : WrenchSection, optional
-        What it was measured to give the body: file, sigma_n, sigma_nm, …
     """
 
     poses: Text | None = None
@@ -139,10 +137,9 @@ class GraspSection(section_of(Grasp, "GraspSection")):
     max_residual_m: Positive | None = None
     gripper_to_body: TransformSection | None = None
     interpolation: Literal["smooth", "linear", "hold"] = "smooth"
-    wrench: WrenchSection | None = None
 
     @model_validator(mode="after")
-    def _one_source_of_poses(self) -> GraspSection:
+    def _one_source_of_poses(self) -> MovedSection:
         sources = given_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
             raise ValueError(f"found {' and '.join(sources)}; expected one of them")
@@ -165,6 +162,35 @@ class GraspSection(section_of(Grasp, "GraspSection")):
                     f"found {name!r} in weights; expected names among {', '.join(names)}"
                 )
         return self
+
+
+class GraspSection(section_of(Grasp, "GraspSection", MovedSection)):
+    """Nodes held by a gripper or a test bench, and how it moves.
+
+    Attributes
+    ----------
+    wrench : WrenchSection, optional
+        What it was measured to give the body: file, sigma_n, sigma_nm, …
+    """
+
+    wrench: WrenchSection | None = None
+
+
+class ObstacleSection(section_of(Obstacle, "ObstacleSection", MovedSection)):
+    """A rigid solid that the body may touch, and how it moves.
+
+    Attributes
+    ----------
+    force : WrenchSection, optional
+        The force that it was measured to give the body: file, sigma_n, …
+    """
+
+    force: WrenchSection | None = None
+
+    @property
+    def wrench(self) -> WrenchSection | None:
+        """The same, as of a grasp."""
+        return self.force
 
 
 # For each marker by name, or for all.
@@ -288,6 +314,8 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         writes it.
     grasp : Grasps
         A table of nodes and poses, or a list of them.
+    obstacle : list of ObstacleSection
+        [[experiment.obstacle]] tables: what the body may touch.
     markers : MarkersSection
         Tracked points; none are needed where the wrench of a grasp is measured.
     window_s : list, optional
@@ -304,6 +332,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
     file: Text | None = None
     grasp: Grasps = Field(default_factory=list)
+    obstacle: list[ObstacleSection] = Field(default_factory=list)
     markers: MarkersSection = Field(default_factory=lambda: MarkersSection.model_construct())
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     window_s: tuple[Boundless, Boundless] | None = None
@@ -325,6 +354,11 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     def grasps(self) -> list[GraspSection]:
         """The grasps, however they are written."""
         return self.grasp if isinstance(self.grasp, list) else [self.grasp]
+
+    @property
+    def moved(self) -> list[GraspSection | ObstacleSection]:
+        """The grasps, then the obstacles."""
+        return [*self.grasps, *self.obstacle]
 
     @model_validator(mode="after")
     def _window(self) -> ExperimentSection:

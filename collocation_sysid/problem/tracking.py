@@ -11,7 +11,7 @@ from ..arrays import Array
 from ..errors import InputError
 from ..recording import MarkerTable, PoseSequence, align_to_template, fit_poses, read_markers
 from ..recording.rigid import loosest_marker
-from .recording_schema import ExperimentSection, GraspSection, MarkersSection
+from .recording_schema import ExperimentSection, MarkersSection, MovedSection
 
 # A frame is reported when its residual is this many times the usual one, and above rounding.
 UNUSUAL, ROUNDING = 3.0, 1e-6
@@ -19,7 +19,7 @@ UNUSUAL, ROUNDING = 3.0, 1e-6
 
 def gripper_markers(section: ExperimentSection) -> set[str]:
     """Names of the markers that grasps are driven by."""
-    return {name for grasp in section.grasps for name in grasp.markers or ()}
+    return {name for moved in section.moved for name in moved.markers or ()}
 
 
 def read_recorded(section: ExperimentSection, file: Path) -> MarkerTable:
@@ -65,7 +65,7 @@ def into_body_frame(markers: MarkersSection, table: MarkerTable) -> tuple[Marker
 
 
 def poses_from_markers(
-    grasp: GraspSection, table: MarkerTable, window_s: tuple[float, float] | None
+    grasp: MovedSection, table: MarkerTable, window_s: tuple[float, float] | None
 ) -> tuple[PoseSequence, list[str]]:
     """Fit the poses of a grasp to its markers' tracks, and tell where they are not rigid.
 

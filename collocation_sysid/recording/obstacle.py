@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array, Index
 from ..checked import NotNegative, Positive, Text
 from ..errors import InputError
-from ..fem.constants import Constant
+from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.selection import Selection
 from ..fem.touching import Touching
 from ..stated import key, stated
@@ -24,8 +24,6 @@ from .solids import KINDS, Solid, SolidSection, solid_of
 
 if TYPE_CHECKING:
     from ..fem.body import Body
-
-LARGEST_FRICTION = 2.0
 
 
 def _shape(shape: Any) -> Solid:
@@ -93,9 +91,15 @@ class Obstacle(Grasp):
         self._begin()
         if self.axes != "xyz":
             raise InputError(f"axes of {self.name} is {self.axes!r}; expected none: it is rigid")
-        if isinstance(self.friction, float) and self.friction > LARGEST_FRICTION:
+        least, largest = FRICTION.bounds
+        if isinstance(self.friction, float) and self.friction > largest:
             raise InputError(
-                f"friction of {self.name} is {self.friction:g}; expected 0 to {LARGEST_FRICTION:g}"
+                f"friction of {self.name} is {self.friction:g}; expected {least:g} to {largest:g}"
+            )
+        if (named := self.coefficient) and not named.name.endswith(FRICTION.name):
+            raise InputError(
+                f"friction of {self.name} is {named.name!r}; expected a number, or the name of a "
+                f"parameter that ends with {FRICTION.name}, such as table_friction"
             )
 
     def framed(self, frame: Index, t_s: Array) -> Obstacle:
@@ -137,18 +141,12 @@ class Obstacle(Grasp):
     @cached_property
     def coefficient(self) -> Constant | None:
         """Its friction as a parameter; None where it is a number."""
-        return friction_named(self.friction) if isinstance(self.friction, str) else None
+        return constant_named(self.friction) if isinstance(self.friction, str) else None
 
 
 @lru_cache(maxsize=32)
 def _touching(body: Body, obstacle: Obstacle) -> Touching:
     return Touching.of(body, obstacle.nodes, obstacle.faces)
-
-
-def friction_named(name: str) -> Constant:
-    """A coefficient of friction as a parameter."""
-    bounds = 0.0, LARGEST_FRICTION
-    return Constant(name, "μ_f", "friction", bounds, "linear", 0.1, 0.3, at_least=0.0)
 
 
 def with_frames_of(body: Body, obstacles: Sequence[Obstacle]) -> Body:

@@ -273,13 +273,15 @@ def _grip(at: Fitted, _: int) -> Effect | None:
 
     What holds along some axes only is a platen or a plane of symmetry, and no grip.
     """
-    held, holding = at.part.setting.held, at.part.segment.experiment.grasps
+    held, holding = at.part.setting.held, at.part.segment.experiment.gripping
     gripped = [grasp.dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
     if not gripped:
         return None
     area_m2 = at.body.dof_volume_m3[held.dofs] ** (2 / 3)
-    moved = -at.grasp_force_n / (at.young_pa * area_m2)
-    return Effect(moved_m=moved * np.isin(held.dofs, np.concatenate(gripped)))
+    here = np.isin(held.dofs, np.concatenate(gripped))
+    moved = np.zeros_like(at.grasp_force_n)
+    moved[:, here] = -at.grasp_force_n[:, here] / (at.young_pa * area_m2[here])
+    return Effect(moved_m=moved)
 
 
 def _driven(at: Fitted) -> NDArray[np.bool_]:
