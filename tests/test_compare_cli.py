@@ -180,7 +180,7 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
     outcome = compare("--starts", 2, "--workers", 2)
     assert outcome.code == 130
     assert outcome.out == ""
-    assert "interrupted: 1 of 2 runs are kept in out; resume with: " in outcome.err
+    assert "interrupted: 1 of 2 runs are kept in out; go on with: " in outcome.err
     assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
     assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == ["converged", "missing"]
     assert "1 of 2 runs are still to be done." in (tiny / "out" / "summary.md").read_text()

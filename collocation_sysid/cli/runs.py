@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ from rich.text import Text
 from ..files import write_whole
 from ..folders import require_possible
 from ..tree import as_json, content
-from .common import EXIT_INTERRUPTED, errors, show
+from .common import errors, interrupted, show
 from .options import AllowCode, AsJson, OfRun, OneExperiment, Out, Quiet, Told, command
 
 commands = typer.Typer()
@@ -53,10 +51,7 @@ def refine(options: Refine) -> None:
     try:
         refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
     except KeyboardInterrupt:
-        again = shlex.join(["collocation-sysid", *sys.argv[1:]])
-        said = f"interrupted: what was solved is kept in {options.run_folder}; go on with: {again}"
-        errors.print(Text(said), soft_wrap=True)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+        raise interrupted(f"what was solved is kept in {options.run_folder}") from None
     if options.as_json:
         typer.echo(as_json({**content(refinement), "trust": result.trust}))
     else:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import typer
-from rich.text import Text
 
 from ..checked import Positive
 from ..errors import InputError
@@ -30,7 +27,7 @@ from ..plan.table import Yardstick
 from ..plan.variants import models, parse_branches, parse_materials
 from ..problem import Problem
 from ..tree import as_json
-from .common import EXIT_INTERRUPTED, errors, show
+from .common import errors, interrupted, show
 from .options import OfProblem, Out, Told, command
 
 commands = typer.Typer()
@@ -190,20 +187,17 @@ def _study(
             show(plan_table(planned, finished))
         return
     require_possible(folder)
-    left, interrupted = [run for run in planned if run.key not in finished], False
+    left, ended = [run for run in planned if run.key not in finished], True
     try:
         with StudyProgress(errors, left, len(planned), options.quiet) as progress:
             run_all(left, store, limits, progress.done)
     except KeyboardInterrupt:
-        interrupted = True
+        ended = False
     report = load_report(f"{kind.capitalize()}: {name}", kind, planned, store, yardstick)
     if report.records:
         write_report(report, folder)
-    if interrupted:
-        kept = f"{len(report.records)} of {len(planned)} runs are kept in {folder}"
-        again = shlex.join(["collocation-sysid", *sys.argv[1:]])
-        errors.print(Text(f"interrupted: {kept}; resume with: {again}"), soft_wrap=True)
-        raise typer.Exit(EXIT_INTERRUPTED)
+    if not ended:
+        raise interrupted(f"{len(report.records)} of {len(planned)} runs are kept in {folder}")
     if options.as_json:
         typer.echo(as_json(report_json(report)))
     else:

@@ -128,7 +128,7 @@ def chosen(
     InputError
         If there is none of that name, or none with a trajectory.
     """
-    seen = {replay.name: replay for replay in replays if _has_shapes(replay)}
+    seen = {replay.name: replay for replay in replays if replay.has_shapes}
     if not seen:
         raise InputError("no experiment of this run has a trajectory", run)
     if experiment is None:
@@ -137,11 +137,6 @@ def chosen(
         key = None if run is None else "--experiment"
         raise InputError(f"found {experiment!r}; expected one of {', '.join(seen)}", run, key)
     return seen[experiment]
-
-
-def _has_shapes(replay: Replay) -> bool:
-    shapes = replay.shapes_m
-    return shapes is not None and bool(np.isfinite(shapes).all(axis=(1, 2)).any())
 
 
 def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ from .run_sections import how_to
 SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
 
 
-def glance_table(seen: Glance | Findings) -> list[Shown]:
+def glance_table(seen: Glance) -> list[Shown]:
     """What a check sees at once."""
     return [*map(_body_section, seen.bodies), _measurements_section(seen)]
 
@@ -76,11 +76,12 @@ def _motion_section(findings: Findings) -> list[Shown]:
         for mode in motion.modes[:SHOWN_MODES]
     )
     firsts = [f"'{m.experiment}' {m.first.frequency_hz:.3g} Hz" for m in others if m.first]
-    more = [f"  first modes elsewhere: {_listed(firsts)}"] if firsts else []
+    firsts = [*firsts[:SHOWN_RECORDINGS], *["…"] * (len(firsts) > SHOWN_RECORDINGS)]
+    more = [f"  first modes elsewhere: {', '.join(firsts)}"] if firsts else []
     return [Table(title, heads, rows, names=0), *more]
 
 
-def _measurements_section(findings: Glance | Findings) -> Table:
+def _measurements_section(findings: Glance) -> Table:
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
@@ -138,18 +139,12 @@ def _solve_section(findings: Findings) -> Table:
         )
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
-        rows[cost.method] = f"about {duration(cost.time_s)} and {_memory(cost.memory_mb)}{chosen}"
+        memory = (
+            f"{cost.memory_mb:.0f} MB" if cost.memory_mb < 1e3 else f"{cost.memory_mb / 1e3:.2g} GB"
+        )
+        rows[cost.method] = f"about {duration(cost.time_s)} and {memory}{chosen}"
     rows["derivatives"] = (
         f"Jacobian and Hessian within {findings.jacobian_error:.0e} and "
         f"{findings.hessian_error:.0e} of finite differences"
     )
     return labelled("Solve", rows)
-
-
-def _memory(memory_mb: float) -> str:
-    return f"{memory_mb / 1e3:.2g} GB" if memory_mb >= 1e3 else f"{memory_mb:.0f} MB"
-
-
-def _listed(items: list[str]) -> str:
-    shown = ", ".join(items[:SHOWN_RECORDINGS])
-    return shown if len(items) <= SHOWN_RECORDINGS else f"{shown}, …"

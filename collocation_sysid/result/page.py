@@ -106,6 +106,7 @@ def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
     low, high = np.nanmin(first, axis=(0, 1)), np.nanmax(first, axis=(0, 1))
     span = (colouring.high - colouring.low) or 1.0
     shares = {name: (x[kept] - colouring.low) / span for name, x in values.items()}
+    shares = {name: np.clip(np.nan_to_num(x), 0.0, 1.0) for name, x in shares.items()}
     there = first[np.isfinite(first).all(axis=(1, 2))]
     return {
         "t_s": replay.t_s[kept].tolist(),
@@ -115,7 +116,7 @@ def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
         "sides": _packed(nodes[:, 3:], "<i4"),
         "quantity": colouring.name,
         "ends": colouring.ends,
-        "shares": {name: _packed(_bytes(x), "u1") for name, x in shares.items()},
+        "shares": {name: _packed(np.rint(255 * x), "u1") for name, x in shares.items()},
         "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
         "held": _packed(replay.held[kept][:, outer], "u1"),
@@ -149,11 +150,6 @@ def cells_of_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.
     sides = np.sort(tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
     known = {tuple(side): k // 4 for k, side in enumerate(sides.reshape(-1, 3).tolist())}
     return np.array([known[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
-
-
-def _bytes(shares: Array) -> Array:
-    """Shares of the largest as whole numbers to 255."""
-    return np.rint(255 * np.clip(np.nan_to_num(shares), 0.0, 1.0))
 
 
 def _packed(array: NDArray[Any], kind: str) -> str:

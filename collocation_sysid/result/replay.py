@@ -158,6 +158,12 @@ class Replay:
         """(T, n, 3) positions to show where there is room for one: fitted, else simulated."""
         return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
 
+    @property
+    def has_shapes(self) -> bool:
+        """Whether there is a sample with all of them."""
+        shapes_m = self.shapes_m
+        return shapes_m is not None and bool(np.isfinite(shapes_m).all(axis=(1, 2)).any())
+
     def arrays(self, prefix: str = "") -> dict[str, Array]:
         """Arrays for a file; those of the body without the prefix, and some as single numbers."""
         stored: dict[str, Any] = {key: getattr(self, key) for key in LAYOUT}

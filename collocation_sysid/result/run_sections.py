@@ -28,7 +28,7 @@ from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import is_own
 from ..recording.nuisance import in_unit_for_people
 from ..runs.result import FoundValue, Result, SimulatedExperiment
-from ..statistics.budget import worded
+from ..statistics.budget import largest_first, worded
 from ..statistics.concern import Concern, topics_of
 from ..statistics.numerical import NumericalError
 from ..statistics.trust import Trust
@@ -200,10 +200,7 @@ def _width(interval: tuple[float, float]) -> float:
 def budget_table(result: Result) -> Table:
     """What the variance of each estimate is made of, in percent."""
     lines = result.budget
-    largest: dict[str, float] = {}
-    for source, share in (each for line in lines.values() for each in line.items()):
-        largest[source] = max(share, largest.get(source, 0.0))
-    shown = sorted((s for s in largest if largest[s] >= LITTLE), key=lambda s: -largest[s])
+    shown = largest_first(lines, LITTLE)
     rows = [(worded(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values())) for s in shown]
     return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
 

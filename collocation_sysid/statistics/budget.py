@@ -209,6 +209,14 @@ def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, A
     return slopes | dict(fit.derived.by_q)
 
 
+def largest_first(shares: Mapping[str, Mapping[str, float]], least: float) -> list[str]:
+    """The sources that have at least a share of some estimate's variance, the largest first."""
+    largest: dict[str, float] = {}
+    for source, share in (each for line in shares.values() for each in line.items()):
+        largest[source] = max(share, largest.get(source, 0.0))
+    return sorted((s for s in largest if largest[s] >= least), key=lambda s: -largest[s])
+
+
 def worded(source: str) -> str:
     """A source as people read it."""
     unit = next((u for u in ("_m_n", "_1_m2", "_rad", "_m", "_s") if source.endswith(u)), "")

@@ -19,17 +19,13 @@ from .target import Comparison, Exported, Target
 NUMBERS = "identified.json"
 
 
-def _all_of_it(body: Identified) -> Exported:
-    return Exported({}, ())
-
-
 TARGETS: dict[str, Target] = {
     "mujoco": Target("MuJoCo", mujoco.export, mujoco.verify),
     "newton": Target("Newton", newton.export),
     "sofa": Target("SOFA", sofa.export),
     "febio": Target("FEBio", febio.export),
     "calculix": Target("CalculiX", calculix.export, calculix.verify),
-    "json": Target("JSON", _all_of_it),
+    "json": Target("JSON", lambda body: Exported({}, ())),
 }
 
 

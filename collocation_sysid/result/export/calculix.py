@@ -40,7 +40,8 @@ def export(body: Identified) -> Exported:
     limits.append("damping is not exported: an equilibrium has none")
     if body.quadratic:
         limits.append("the weight of an element is spread by its shape functions, ours is lumped")
-    mesh = f"*NODE,NSET=ALL\n{_rows(body.nodes_m)}"
+    nodes = (f"{k},{_fields(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
+    mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
     kind = "C3D10" if body.quadratic else "C3D4"
     for k, region in enumerate(body.regions):
         cells = body.body.cells[region.cells] + 1
@@ -67,10 +68,6 @@ def _step(body: Identified, linear: bool) -> str:
         + (f"*CLOAD\n{loads}" if loads else "")
         + f"{weight}*NODE PRINT,NSET=ALL\nU\n*NODE FILE\nU\n*EL FILE\nS\n*END STEP\n"
     )
-
-
-def _rows(points: Array) -> str:
-    return "".join(f"{k},{_fields(*point)}\n" for k, point in enumerate(points, start=1))
 
 
 def _fields(*values: float) -> str:

@@ -14,8 +14,7 @@ from ...recording.wrench import COMPONENTS, UNITS
 from ...runs.result import Result
 from ..replay import Replay, read_run, reading_run
 from ..style import RESOLUTION_DPI
-from .budget import budget_picture
-from .confidence import Confidence, confidence_ellipses, correlation_matrix
+from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
 from .mesh import elements_picture, mesh_picture
 from .over_time import error_over_time, readings_picture, tracks
 from .search import convergence, scan_picture
@@ -72,7 +71,7 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
         count = said.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(count)] if count > 1 else [name]
         pictures[f"reading_{replay.name}_{name}"] = readings_picture(said, names)
-    if replay.shapes_m is not None and np.isfinite(replay.shapes_m).all(axis=(1, 2)).any():
+    if replay.has_shapes:
         pictures[f"shapes_{replay.name}"] = shapes(replay)
     return pictures
 

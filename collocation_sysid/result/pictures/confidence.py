@@ -1,18 +1,21 @@
-"""What the data say about pairs of parameters: confidence ellipses and correlations."""
+"""How well parameters are known: confidence ellipses, correlations, shares of each variance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
 from ...arrays import Array
+from ...fem.constants import symbol_of
 from ...runs.result import Result
+from ...statistics.budget import largest_first, worded
 from ...statistics.estimates import correlation_of
 from ..style import (
     BLACK,
@@ -181,4 +184,37 @@ def correlation_matrix(known: Confidence) -> Figure:
     bar = figure.colorbar(image, cax=beside, ticks=(-1, 0, 1))
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+    return figure
+
+
+# Sources below this share of every variance are drawn together.
+LITTLE = 0.03
+OTHERS = "others"
+
+
+def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Draw a stacked bar for each estimate.
+
+    Parameters
+    ----------
+    shares : mapping of estimate to mapping of source to its share of the variance
+    """
+    drawn = largest_first(shares, LITTLE)
+    rows = list(shares)[::-1]
+    figure = framed_figure(COLUMN_MM, 30 + 7 * len(rows), 14, 2, 10, 20)
+    axes, left = figure.subplots(), [0.0] * len(rows)
+    colours = colormaps["tab20"](range(20))
+    for source, colour in zip([*drawn, OTHERS], colours, strict=False):
+        widths = [
+            1 - sum(shares[row].get(s, 0.0) for s in drawn)
+            if source == OTHERS
+            else shares[row].get(source, 0.0)
+            for row in rows
+        ]
+        axes.barh(range(len(rows)), widths, left=left, color=colour, label=worded(source))
+        left = [a + b for a, b in zip(left, widths, strict=True)]
+    axes.set_yticks(range(len(rows)), [symbol_of(row) for row in rows])
+    axes.set_xlim(0, 1)
+    dress(axes, "", "share of the variance", "")
+    figure.legend(loc="upper center", ncols=3, frameon=False, fontsize="x-small")
     return figure

@@ -6,7 +6,7 @@ Every warning is one sentence that ends with the remedy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -61,29 +61,34 @@ CHOSEN = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Glance:
-    """What `check` sees without a simulation, see `Findings`."""
+    """What `check` sees without a simulation.
+
+    Attributes
+    ----------
+    bodies : tuple of BodyFinding
+    recordings : tuple of Recording, one for each experiment
+    holds : tuple of Hold, one for each grasp
+    """
 
     bodies: tuple[BodyFinding, ...]
     recordings: tuple[Recording, ...]
     holds: tuple[Hold, ...]
 
 
-@dataclass(frozen=True)
-class Findings:
+@dataclass(frozen=True, kw_only=True)
+class Findings(Glance):
     """What `check` reports.
 
     Attributes
     ----------
-    bodies : tuple of BodyFinding
     samples, missing : int
         Marker samples that are there and that are not, of all experiments.
     largest_marker_distance_m : float
     rms_at_guess_m : float or None
         Distance of the markers from their measurements in the simulation at the guess; None where
         that is left out.
-    recordings : tuple of Recording, one for each experiment
     motions : tuple of Motion, one for each fitted experiment that moves
     variables, constraints : int
         Of the program, without memory and wrenches.
@@ -97,7 +102,6 @@ class Findings:
     costs : tuple of Cost, one for each method of which they are known
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
-    holds : tuple of Hold, one for each grasp
     causes : tuple of Hypothesis
         What is likely described wrongly; their sentences are the first warnings.
     notes : tuple of str
@@ -107,14 +111,12 @@ class Findings:
 
     TOLD: ClassVar = ("warnings",)
 
-    bodies: tuple[BodyFinding, ...]
     experiments: int
     timesteps: int
     samples: int
     missing: int
     largest_marker_distance_m: float
     rms_at_guess_m: float | None
-    recordings: tuple[Recording, ...]
     motions: tuple[Motion, ...]
     variables: int
     constraints: int
@@ -127,7 +129,6 @@ class Findings:
     costs: tuple[Cost, ...]
     jacobian_error: float
     hessian_error: float
-    holds: tuple[Hold, ...]
     causes: tuple[Hypothesis, ...]
     notes: tuple[str, ...] = ()
     concerns: tuple[Concern, ...] = ()
@@ -155,9 +156,19 @@ class Findings:
 def glance(problem: Problem) -> Glance:
     """What is seen at once: bodies, recordings and grasps; missing guesses are usual ones."""
     usual = usual_parameters(problem.parameters, SOFT_PA)
-    bodies = _bodies(replace(problem, parameters=usual))
-    recordings = tuple(recording_of(e, None) for e in problem.experiments)
-    return Glance(bodies, recordings, _holds(problem, bodies))
+    return Glance(**_seen(replace(problem, parameters=usual), {}))
+
+
+def _seen(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
+    """Fields of `Glance`, with the motions (T, n, 3) of experiments at the guess where known."""
+    bodies = _bodies(problem)
+    edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
+    experiments = problem.experiments
+    return {
+        "bodies": bodies,
+        "recordings": tuple(recording_of(e, positions_m.get(e.name)) for e in experiments),
+        "holds": tuple(hold for e in experiments for hold in holds_of(e, edges_m[e.name])),
+    }
 
 
 def check_problem(
@@ -212,7 +223,8 @@ def check_problem(
         causes=description_causes(problem),
     )
     concerns = _concerns(problem, findings, instabilities(simulated, z))
-    notes += [*start_notes, *_notes(findings)]
+    notes += [*start_notes, *(each for m in findings.motions for each in motion_notes(m))]
+    notes += cost_notes(findings.chosen_cost, findings.costs) if findings.chosen_cost else []
     if simulated is first:
         notes.append(
             f"the recordings were not simulated at the guess but for their first samples: it would "
@@ -230,17 +242,14 @@ def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str,
     for part in collocation.parts(z):
         at_samples = part.x[part.segment.markers.grid_rows]
         positions_m[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
-    bodies = _bodies(problem)
-    recordings = [recording_of(e, positions_m.get(e.name)) for e in problem.experiments]
+    seen = _seen(problem, positions_m)
+    recordings = seen["recordings"]
     distances_m = [r.farthest.distance_m for r in recordings if r.markers]
-    return {
-        "bodies": bodies,
+    return seen | {
         "experiments": len(recordings),
         "samples": sum(recording.samples for recording in recordings),
         "missing": sum(recording.missing for recording in recordings),
         "largest_marker_distance_m": max(distances_m, default=0.0),
-        "recordings": tuple(recordings),
-        "holds": _holds(problem, bodies),
     }
 
 
@@ -303,24 +312,12 @@ def _concerns(
     )
 
 
-def _notes(findings: Findings) -> list[str]:
-    """What is worth knowing of the motions, and of the method."""
-    chosen = findings.chosen_cost
-    notes = [note for motion in findings.motions for note in motion_notes(motion)]
-    return notes + (cost_notes(chosen, findings.costs) if chosen else [])
-
-
 def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
     """Each body, with the names of the experiments that it is in."""
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     pairs = zip(problem.bodies, names, strict=True)
     return tuple(body_finding(body, body.theta(guesses), own) for body, own in pairs)
-
-
-def _holds(problem: Problem, bodies: tuple[BodyFinding, ...]) -> tuple[Hold, ...]:
-    edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
-    return tuple(hold for e in problem.experiments for hold in holds_of(e, edges_m[e.name]))
 
 
 def _of_body(body: BodyFinding, bodies: Sequence[BodyFinding]) -> Iterator[Concern]:
