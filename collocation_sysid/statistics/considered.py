@@ -88,7 +88,8 @@ def considered(
         more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
         return replace(experiment, nuisance=replace(nuisance, **more))
 
-    wide = replace(collocation, experiments=[widened(e) for e in collocation.experiments])
+    wider = [widened(experiment) for experiment in collocation.experiments]
+    wide = replace(collocation, experiments=wider, huber=None)  # whatever their weights
     p, positions = collocation.unpack(z)
     known = dict(zip(collocation.names, p.tolist(), strict=True))
     at = wide.pack(np.array([known.get(name, 0.0) for name in wide.names]), positions)

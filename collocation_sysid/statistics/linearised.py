@@ -137,6 +137,15 @@ class FitBlock:
         return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
 
     @property
+    def weight(self) -> Array:
+        """(T, M, 1) root of Huber's weights, which residuals and slopes have already."""
+        if self.misfit is None:
+            return np.ones((*self.present.shape, 1))
+        long, short = (np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual))
+        share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
+        return np.sqrt(share)[..., None]
+
+    @property
     def measurements(self) -> int:
         """Scalar measurements that are present."""
         return int(self.seen.sum())

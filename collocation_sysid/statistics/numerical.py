@@ -37,7 +37,7 @@ from ..arrays import Array
 from ..fem.constants import bare
 from ..program.least_squares import LeastSquares
 from .estimates import Estimate
-from .linearised import FitBlock, LinearisedFit
+from .linearised import LinearisedFit
 
 # Roache's factor of safety for an observed order.
 OBSERVED = 1.25
@@ -299,18 +299,8 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     for block, change in zip(fit.blocks, changes, strict=True):
         slope = block.slope[..., free].reshape(-1, len(free))
         known = known.add(np.zeros(len(slope)), slope)
-        apart = change * _weight(block)[..., None] * block.seen[..., None]
+        apart = change * block.weight[..., None] * block.seen[..., None]
         score += slope.T @ apart.reshape(len(slope), count)
     found = np.zeros((len(fit.names), count))
     found[free] = -known.root @ (known.root.T @ score)
     return found
-
-
-def _weight(block: FitBlock) -> Array:
-    """(T, M, 1) root of Huber's weights, which the slopes have already."""
-    if block.misfit is None:
-        return np.ones((*block.present.shape, 1))
-    long = np.linalg.norm(block.misfit, axis=2)
-    short = np.linalg.norm(block.residual, axis=2)
-    share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
-    return np.sqrt(share)[..., None]

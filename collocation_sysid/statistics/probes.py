@@ -236,13 +236,10 @@ def with_freedom(fit: LinearisedFit, changes: Changes, name: str) -> LinearisedF
     name : str
     """
     columns = [k for k, other in enumerate(changes.names) if other == name]
-    blocks = (
-        replace(
-            block,
-            slope=np.concatenate([block.slope, change[..., columns] * block.seen[..., None]], 3),
-        )
-        for block, change in zip(fit.blocks, changes.blocks, strict=True)
-    )
+    blocks = []
+    for block, change in zip(fit.blocks, changes.blocks, strict=True):
+        more = change[..., columns] * (block.weight * block.seen)[..., None]
+        blocks.append(replace(block, slope=np.concatenate([block.slope, more], axis=3)))
     count = len(columns)
     return replace(
         fit,
