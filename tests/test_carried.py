@@ -39,6 +39,8 @@ STRETCH = Recursion(slow_stretch, 1, 6, 1, 1)
 class Stretches(Carried):
     """That of three pairs of nodes, at all grid times."""
 
+    called = "stretch"
+
     @property
     def count(self) -> int:
         return 3 * self.segment.grid_rows

@@ -15,7 +15,6 @@ from collocation_sysid.fem.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.viscoelastic_rows import Overstress
 from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.estimates import Estimate, memory_notes
@@ -119,7 +118,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     findings = check_problem(problem)
     program = problem.collocation().made_explicit()
     assert program.explicit
-    assert findings.overstresses == program.added(Overstress)
+    assert findings.overstresses == program.added("memory")
     assert findings.variables + findings.overstresses == program.variables
     assert findings.constraints + findings.overstresses == program.constraints
     assert findings.jacobian_nonzeros == len(program.jacobian_structure[1])

@@ -60,6 +60,8 @@ class ForceTerm(ABC):
     slides : bool
         Whether its velocities are, in a static experiment, ways since the sample before; others'
         are none.
+    by_velocity : bool
+        Whether its slopes by velocities may change with these.
     carries : int
         How many numbers each of its instances carries; only one that is `Pointwise` carries any.
     """
@@ -68,6 +70,7 @@ class ForceTerm(ABC):
     couplings: SymmetricPattern | None
     slides: bool = False
     carries: int = 0
+    by_velocity: bool = False
 
     @abstractmethod
     def at(self, u: Array) -> Self:

@@ -223,7 +223,7 @@ class Forces:
     @cached_property
     def _by_velocity(self) -> bool:
         """Whether a term's slopes by velocities change with these."""
-        return any(isinstance(term, Pointwise) and term.by_velocity for term in self.further)
+        return any(term.by_velocity for term in self.further)
 
     @property
     def curvature_width(self) -> int:

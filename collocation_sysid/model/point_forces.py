@@ -66,7 +66,7 @@ class Pointwise(ForceTerm):
         """F(y, ẏ, c), or (F, h)(y, ẏ, c, h_{k−1})."""
 
     @property
-    def by_velocity(self) -> bool:
+    def by_velocity(self) -> bool:  # type: ignore[override]
         """Whether it depends on ẏ."""
         return True
 

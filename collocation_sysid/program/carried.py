@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -39,12 +40,14 @@ class Carried(ABC):
     first_phi : int
         Where in z the φ of all experiments begin.
     places : Places
+    called : what it belongs to: "memory", "force" or "wrench"
     """
 
     segment: Segment
     number: int
     first_phi: int
     places: Places
+    called: ClassVar[str]
 
     @property
     @abstractmethod

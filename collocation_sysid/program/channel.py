@@ -2,7 +2,8 @@
 
 A channel has values c (n, e, 3) at the first n of its times: places on the body, here, or the force
 and torque that a grasp gives, see `wrench_channel`. Between them and a residual stand a few lines,
-see `reading`.
+see `reading`. What is `local` depends on few positions at each time, and tells its slopes and
+curvature by them; of others programs have the values among their variables.
 """
 
 from __future__ import annotations
@@ -113,6 +114,16 @@ class Points:
     places: Index
 
     late: ClassVar[int] = 0
+
+    @property
+    def local(self) -> Points:
+        """Itself."""
+        return self
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether its slopes are always the same."""
+        return not len(self.chart.estimated)
 
     @property
     def count(self) -> int:

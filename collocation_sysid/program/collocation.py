@@ -170,16 +170,16 @@ class Collocation:
     @property
     def variables(self) -> int:
         """Length of z."""
-        return self.of_phi.stop + self.added(Carried)
+        return self.of_phi.stop + self.added()
 
     @property
     def constraints(self) -> int:
         """Length of g."""
-        return self.segments[-1].after.row + self.added(Carried)
+        return self.segments[-1].after.row + self.added()
 
-    def added(self, *kinds: type[Carried]) -> int:
-        """Number of the variables of some kinds of what is carried, and of their equations."""
-        return sum(each.count for each in self.carried if isinstance(each, kinds))
+    def added(self, called: str | None = None) -> int:
+        """Number of the variables of what is carried, or is called so, and of their equations."""
+        return sum(each.count for each in self.carried if called in (None, each.called))
 
     @property
     def carried_nonzeros(self) -> tuple[int, int]:
@@ -339,7 +339,7 @@ class Collocation:
         """Lower and upper bounds of z; equal for what is given."""
         lower, upper = self.bounds_p
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        free = np.full(self.added(Carried), np.inf)
+        free = np.full(self.added(), np.inf)
         return (
             np.concatenate([self._packed(lower, lows), -free]),
             np.concatenate([self._packed(upper, highs), free]),

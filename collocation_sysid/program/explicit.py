@@ -9,7 +9,6 @@ from .force_rows import ForceRows
 from .reaction_rows import Reactions
 from .segment import Segment
 from .viscoelastic_rows import Overstress
-from .wrench_channel import GraspWrench
 from .wrench_rows import WrenchRows
 
 
@@ -25,9 +24,9 @@ def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> t
     for number, segment in enumerate(segments):
         reactions, here = None, (segment, number, first_phi)
         wrenches = [
-            (k, reading, reading.channel)
+            (k, reading)
             for k, reading in enumerate(segment.readings)
-            if isinstance(reading.channel, GraspWrench) and reading.channel.count
+            if reading.channel.local is None and reading.channel.count
         ]
         if wrenches:
             reactions = Reactions(*here, places)

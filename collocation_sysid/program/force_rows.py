@@ -44,6 +44,7 @@ class ForceRows(Carried):
     along: int
     force_number: int
     reactions: Reactions | None = None
+    called = "force"
 
     @property
     def history(self) -> int:

@@ -123,7 +123,7 @@ class GaugeReading(Reading):
             now = by_time @ ca.substitute(weights, late, ca.SX(0))
             at.append(ca.reshape(now, GROUP, each))
             weights = ca.jacobian(weights, late)
-        if isinstance(self.channel, GraspWrench):
+        if self.gauge.grasp is not None:
             at = ca.horzsplit(at[0])
         unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own[0]][:, None])
         read = self.gauge.read(t_s, at, unknowns)

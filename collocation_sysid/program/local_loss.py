@@ -19,25 +19,27 @@ class LocalLoss:
 
     Attributes
     ----------
-    readings : those whose channel is local
+    readings : those whose channel is local, with that
     variables : int
         Number of x, all of which stand before φ.
     size : int
         Number of φ.
+    dofs : int
+        Of the body.
     """
 
     readings: tuple[tuple[Reading, Points], ...]
     variables: int
     size: int
+    dofs: int
 
     @cached_property
     def structure(self) -> tuple[Index, Index]:
         """Rows and columns of the entries, upper triangle, sorted by column."""
         none, codes = np.zeros(self.size), [np.zeros(0, dtype=np.int64)]
         for reading, points in self.readings:
-            if points.each:
-                slopes = points.slopes(None, none, self.variables)
-                codes.append(self._codes(*reading.hessian_structure(slopes)))
+            slopes = points.slopes(None, none, self.variables)
+            codes.append(self._codes(*reading.hessian_structure(slopes)))
         found = np.unique(np.concatenate(codes))
         return found % self._height, found // self._height
 
@@ -56,16 +58,12 @@ class LocalLoss:
     @property
     def _is_quadratic(self) -> bool:
         """Whether they are always the same."""
-        return all(r.is_quadratic and not len(p.chart.estimated) for r, p in self.readings)
+        return all(reading.is_quadratic and points.is_linear for reading, points in self.readings)
 
     @cached_property
     def _constant(self) -> Array:
-        shape = max((p.rows[-1] + 1 for _, p in self.readings), default=0), self._dofs
-        return self._at(np.zeros(shape), np.zeros(self.size), True)
-
-    @property
-    def _dofs(self) -> int:
-        return 3 * self.readings[0][1].node_count
+        rows = max((points.rows[-1] + 1 for _, points in self.readings), default=1)
+        return self._at(np.zeros((rows, self.dofs)), np.zeros(self.size), True)
 
     def _at(self, x: Array, phi: Array, bent: bool) -> Array:
         codes = self._codes(*self.structure)
@@ -76,10 +74,8 @@ class LocalLoss:
 
     def _entries(self, x: Array, phi: Array, bent: bool) -> Iterator[Entries]:
         for reading, points in self.readings:
-            if points.each:
-                values = points.of(x, phi)
-                slopes = points.slopes(x, phi, self.variables)
-                yield reading.hessian(values, phi, slopes, bent)
-                if bent and len(points.chart.estimated):
-                    by_values, _ = reading.loss_slopes(values, phi)
-                    yield points.curvature(x, phi, by_values, self.variables)
+            values = points.of(x, phi)
+            yield reading.hessian(values, phi, points.slopes(x, phi, self.variables), bent)
+            if bent and not points.is_linear:
+                by_values, _ = reading.loss_slopes(values, phi)
+                yield points.curvature(x, phi, by_values, self.variables)

@@ -25,6 +25,8 @@ from .segment import Segment
 class Reactions(Carried):
     """R of one experiment."""
 
+    called = "wrench"
+
     @property
     def dofs(self) -> Index:
         """(g,) which dofs."""

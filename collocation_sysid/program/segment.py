@@ -28,7 +28,6 @@ from ..model.setting import Setting
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
 from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_values
-from .channel import Points
 from .charts import Chart
 from .gauge import GaugeReading, gauge_readings
 from .local_loss import LocalLoss
@@ -162,8 +161,9 @@ class Segment:
     @cached_property
     def local_loss(self) -> LocalLoss:
         """Second derivatives of the loss by x and φ, where it has few."""
-        local = [(r, r.channel) for r in self.readings if isinstance(r.channel, Points)]
-        return LocalLoss(tuple(local), self.variables, self.nuisance.size)
+        pairs = ((reading, reading.channel.local) for reading in self.readings)
+        local = tuple((reading, points) for reading, points in pairs if points and points.each)
+        return LocalLoss(local, self.variables, self.nuisance.size, self.dofs)
 
     @cached_property
     def sensed_dofs(self) -> Index:

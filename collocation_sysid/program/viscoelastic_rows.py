@@ -64,6 +64,7 @@ class Overstress(Carried):
     """
 
     reactions: Reactions | None = None
+    called = "memory"
 
     @property
     def shape(self) -> tuple[int, int]:

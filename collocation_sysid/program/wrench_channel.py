@@ -114,6 +114,7 @@ class GraspWrench:
     held: Array
 
     each = 2
+    local = None
 
     @property
     def late(self) -> int:

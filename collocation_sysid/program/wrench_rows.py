@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -39,16 +40,19 @@ class WrenchRows(Carried):
     reading_number : int
         Of the reading among those of the segment.
     reading : Reading
-    channel : GraspWrench
-        What it looks at.
     reactions : Reactions
         R of its experiment.
     """
 
     reading_number: int
     reading: Reading
-    channel: GraspWrench
     reactions: Reactions
+    called = "wrench"
+
+    @property
+    def channel(self) -> GraspWrench:
+        """What it looks at."""
+        return cast(GraspWrench, self.reading.channel)
 
     @property
     def _each(self) -> int:

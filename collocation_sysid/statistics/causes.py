@@ -304,11 +304,11 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
 
 
 def _missed(part: Part) -> bool:
-    pairs = zip(part.segment.readings, part.looked, strict=True)
+    # They are behind the markers.
+    pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
     return any(
         float(np.sum(sensor.residuals(looked, part.phi) ** 2)) > MISFIT**2 * sensor.present.sum()
         for sensor, looked in pairs
-        if isinstance(sensor, WrenchReading)
     )
 
 

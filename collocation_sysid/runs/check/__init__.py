@@ -17,10 +17,7 @@ from ...methods.start import initial_variables
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.reaction_rows import Reactions
 from ...program.stability import Instability, instabilities
-from ...program.viscoelastic_rows import Overstress
-from ...program.wrench_rows import WrenchRows
 from ...statistics.concern import Concern
 from ...statistics.hypothesis import Hypothesis, ranked
 from ...statistics.modal import doubts
@@ -272,8 +269,8 @@ def _program(
     return {
         "variables": collocation.variables,
         "constraints": collocation.constraints,
-        "overstresses": whole.added(Overstress),
-        "wrenches": whole.added(Reactions, WrenchRows),
+        "overstresses": whole.added("memory"),
+        "wrenches": whole.added("wrench"),
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,
